@@ -194,7 +194,7 @@ def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatc
     state = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
     assert (state.done, state.failed) == (26, 1)
     rows = store.read_plan_rows(plan, tmp_path / "dead")
-    assert [row.error for row in rows.values() if row.error] == ["the process that carried it out died"]
+    assert [row.error for row in rows.values() if row.error] == ["the process that ran the record died"]
 
 
 def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):

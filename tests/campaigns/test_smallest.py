@@ -91,7 +91,7 @@ def test_without_a_term_of_the_pump_nothing_tells_it_apart() -> None:
 
 
 def test_what_is_no_command_is_refused(rig: Rig) -> None:
-    with refusal("command", "volts"):
+    with refusal("command", "voltage"):
         duty_experiment(rig, PlannedDuty("position 20 mm sin(2t)"), 20.0)
     with refusal("duty", "balance"):
         plan_recording(rig, usual=PlannedDuty("11 sin(4t)"), duties=[])

@@ -73,7 +73,7 @@ def test_a_folder_gets_a_page_of_its_machine(call, file, tmp_path):
     assert "a_2026-04-01.nc, 2026-04-01" in text  # the newest by its date, not by its name
     assert "1 file that could not be read" in text
     assert text.index("none above") > text.index("Leak: oil bypasses the piston")
-    assert "--join must not stand" in call("report", suspect, "--join", "--machine", file, "-o", page).refused()
+    assert "--join cannot be combined" in call("report", suspect, "--join", "--machine", file, "-o", page).refused()
 
 
 def test_a_recording_is_added_and_the_old_file_kept(call, file, tmp_path):
@@ -87,9 +87,9 @@ def test_a_recording_is_added_and_the_old_file_kept(call, file, tmp_path):
 
 def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
-    assert "--rig must not stand beside --machine" in refused
+    assert "--rig cannot be combined with --machine" in refused
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rate", "0").refused()
-    assert "--rate must not stand beside --machine" in refused
+    assert "--rate cannot be combined with --machine" in refused
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
         (("--find", "-1 L/min"), "--find must be a flow > 0"),
         (("--detection", "1"), "--detection must be 0.5 to below 1"),
         (("--false-alarm", "0.7"), "false-alarm probability must be"),
-        (("--command", "11 sin(4t)"), "the usual duty must have a balance"),
+        (("--command", "11 sin(4t)"), "the usual duty must give a volume balance"),
         (("--rig", "nowhere"), "nowhere"),
     ],
 )

@@ -45,7 +45,7 @@ def test_what_is_written_is_a_detector_with_an_entry_point_and_a_plan(call, tmp_
 @pytest.mark.parametrize("name", ["Stroke", "stroke-time", "1st", "class", "a" * 61, "../x"])
 def test_a_name_that_is_none_is_one_line_and_writes_nothing(call, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    assert "a detector's name must be" in call("plugin", "new", name).refused()
+    assert "a detector's name must" in call("plugin", "new", name).refused()
     assert list(tmp_path.iterdir()) == []
 
 

@@ -110,7 +110,7 @@ def test_where_no_map_can_be_kept(call, tmp_path):
     log.write_text(LOG)
     rig.write_text(RIG)
     for words in ((*MAP,), ("--rig", rig), ("--map", "auto")):
-        assert "--save-map must stand with --rig" in call("inspect", log, *words, "--save-map").refused(2)
+        assert "--save-map needs --rig" in call("inspect", log, *words, "--save-map").refused(2)
     assert "packaged rig thesis" in call("inspect", log, *MAP, "--rig", "thesis", "--save-map").refused(2)
     assert call("inspect", log, "--map", "p_A=Nichts", "--rig", rig, "--save-map").status == 1
     assert rig.read_text() == RIG

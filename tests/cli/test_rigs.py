@@ -75,9 +75,9 @@ def test_a_rod_on_both_sides_needs_one_area(call, tmp_path):
 @pytest.mark.parametrize(
     ("words", "rule"),
     [
-        (("--bore", "50", "--rod", "50"), "rod must be 0 to below the bore, 50 mm, got 50 mm"),
-        (("--bore", "50", "--valve", "9"), "--valve must stand with --kind valve, got --kind pump"),
-        (("--kind", "valve", "--bore", "50"), "--displacement must stand with --kind pump, got --kind valve"),
+        (("--bore", "50", "--rod", "50"), "rod must be >= 0 mm and below the bore, 50 mm, got 50 mm"),
+        (("--bore", "50", "--valve", "9"), "--valve needs --kind valve, got --kind pump"),
+        (("--kind", "valve", "--bore", "50"), "--displacement needs --kind pump, got --kind valve"),
     ],
 )
 def test_what_does_not_fit_a_kind_is_one_line(call, words, rule):
@@ -122,7 +122,7 @@ def test_a_file_that_exists_is_kept(call, tmp_path):
     words = ("--area-A", "500", "--area-B", "500", *SIZES, "-o", path)
     assert call("rigs", "new", "press", *words).refused().endswith("which exists")
     assert path.read_text() == "mine"
-    assert "name of a rig must be of letters" in call("rigs", "new", 'a"b', *words).refused()
+    assert "name of a rig must consist of letters" in call("rigs", "new", 'a"b', *words).refused()
 
 
 def test_margins_of_an_unknown_controller_are_refused(call):

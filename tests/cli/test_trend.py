@@ -95,7 +95,7 @@ def test_files_without_a_time_have_that_of_their_last_change(call, days: Path, t
         (("--every", "-1d"), "every must be > 0"),
         (("--healthy", "0"), "healthy recordings must be 1 or more"),
         (("--years", "0"), "machine-years"),
-        (("-o", "trend.docx"), "a page must be a file"),
+        (("-o", "trend.docx"), "a page's name must end in"),
     ],
 )
 def test_wrong_options_are_refused_in_a_line(call, days: Path, words: tuple[str, ...], complaint: str) -> None:
@@ -122,9 +122,9 @@ def test_a_machine_s_file_states_rig_and_limit(call, days: Path, tmp_path: Path)
     options = "--rig", "thesis", "--limit", "3 mL/min"
     assert stated.status == 0 and stated.out == call("trend", days, *options, "--healthy", 3).out
     assert call("trend", days, "--machine", file, "--healthy", 1).out == call("trend", days, *options).out
-    assert "--limit must not stand beside" in call("trend", days, "--machine", file, "--limit", "5 mL/min").refused()
+    assert "--limit cannot be combined with" in call("trend", days, "--machine", file, "--limit", "5 mL/min").refused()
     assert (
-        "--set must not stand beside --machine"
+        "--set cannot be combined with --machine"
         in call("plan", "--machine", file, "--set", "pump.G_pump=1e-13").refused()
     )
 

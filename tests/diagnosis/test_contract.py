@@ -74,7 +74,7 @@ HOPELESS: dict[str, tuple[Change, str]] = {
     "10 s at zero": (lambda r: holding(r, 5000, 10000, 0.0), "p_A"),
     "a straight line": (
         lambda r: with_channels(r, p_A=np.arange(len(r)) * 1.0, p_B=np.arange(len(r)) * 2.0),
-        "p_A does not move",
+        "p_A moves along a straight line",
     ),
     "beyond floating point": (lambda r: with_channels(r, p_A=r["p_A"] * 1e200), "p_A"),
 }

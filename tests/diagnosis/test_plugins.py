@@ -139,7 +139,7 @@ BROKEN = {
     "no report": (
         re.sub(r"return Observed\(.*", 'return "no leak"', GOOD),
         {"good": "broken:Good"},
-        "must give Observed, got str",
+        "must return an Observed, got str",
     ),
     "a chance that is none": (ONE_CHANGE.replace("CHANCE", "1.5"), {"good": "broken:Good"}, "0 to 1, got 1.5"),
     "a chance without a value": (ONE_CHANGE.replace("CHANCE", "float('nan')"), {"good": "broken:Good"}, "got nan"),

@@ -298,7 +298,7 @@ def test_a_single_outlier_neither_alarms_nor_counts() -> None:
     days[14] = replace(days[14], level=3.0 * HEALTHY)
     trend = trend_of(days, healthy=5)
     assert trend.verdict == "no leak"
-    assert "apart from the recordings before and after" in trend.points[14].note
+    assert "far from the recordings before and after" in trend.points[14].note
     at_the_end = trend_of(days[:15], healthy=5)
     assert at_the_end.alarm is None  # the last recording is not confirmed by another one
     stepped = [replace(own, level=3.0 * HEALTHY) for own in days[14:17]]

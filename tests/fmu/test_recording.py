@@ -196,7 +196,7 @@ def test_what_a_unit_cannot_do_is_one_line(plant, tmp_path):
     assert "the experiment needs the input F (load against +x" in refused(load="1 kN")
     assert "an FMU must have the outputs p_A and p_B, got cap.pressure" in refused(map={"u": "drive.voltage"})
     assert "has no variable 'drive.volts'; did you mean drive.voltage?" in refused(map={"u": "drive.volts"})
-    assert "of faults and drifts an FMU can have those of sensors only" in refused(fault="friction +20 %")
+    assert "may have faults and drifts of sensors only" in refused(fault="friction +20 %")
     assert "an FMU must have a command, not a target" in refused(
         command="position 50 mm sin(2t)", rig="thesis-closed-loop"
     )

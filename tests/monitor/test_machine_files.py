@@ -68,7 +68,7 @@ def said_by(actuators: WatchedActuators) -> str:
 def test_the_samples_of_an_invalid_alarm_are_taught(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[3.0e-13])
     service.actuators.apply_mark(NAME, "invalid", text="another valve", by_whom="Ada")
-    assert said_by(service.actuators) == "press.toml: taught as healthy"
+    assert said_by(service.actuators) == "press.toml: mark stored, samples added as healthy"
     before, after = (ss.read_machine(tmp_path / f"press.toml{end}") for end in (".bak", ""))
     assert (len(before.healthy), len(after.healthy)) == (2, 3)
     (taught,) = [own for own in after.healthy if own.file == f"{NAME}-1"]
@@ -80,7 +80,9 @@ def test_the_samples_of_an_invalid_alarm_are_taught(tmp_path, commissioned):
 def test_samples_that_leak_are_not_taught_whatever_is_said(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[0.0], worn(1.0e-11))
     service.actuators.apply_mark(NAME, "invalid", text="no oil seen")
-    assert said_by(service.actuators).startswith("press.toml: not taught: a healthy recording must not leak")
+    assert said_by(service.actuators).startswith(
+        "press.toml: mark stored, samples not added: a healthy recording must not leak"
+    )
     assert len(ss.read_machine(tmp_path / "press.toml").healthy) == 2
 
 
@@ -89,7 +91,7 @@ def test_nothing_is_taught_from_the_onset_of_a_valid_alarm_on_until_the_repair(t
     file = tmp_path / "press.toml"
     service = alarmed(tmp_path, commissioned[3.0e-13])
     service.actuators.apply_mark(NAME, "valid")
-    assert said_by(service.actuators) == "press.toml: written down"
+    assert said_by(service.actuators) == "press.toml: mark stored"
     known = ss.read_machine(file)
     (alarm,) = known.alarms
     assert alarm.onset_s == pytest.approx(WORN.t[0] + 100.0, abs=2.0)
@@ -118,7 +120,7 @@ def test_the_last_word_on_an_alarm_counts(tmp_path, commissioned):
     service = alarmed(tmp_path, commissioned[3.0e-13])
     service.actuators.apply_mark(NAME, "valid")
     service.actuators.apply_mark(NAME, "invalid", text="another valve")
-    assert said_by(service.actuators) == "press.toml: taught as healthy"
+    assert said_by(service.actuators) == "press.toml: mark stored, samples added as healthy"
     known = ss.read_machine(tmp_path / "press.toml")
     assert [own.mark for own in known.alarms] == ["valid", "invalid"]
     later = known.alarms[1].date_s + 120.0
@@ -136,13 +138,15 @@ def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     service.actuators.apply_mark(NAME, "comment", text="its checkpoint takes the place of the samples")
     again = WatchedActuators([*service.actuators.settings.values()], service.store)
     again.apply_mark(NAME, "invalid", text="no oil seen")
-    assert said_by(again).startswith("press.toml: not taught: no samples of the alarm are kept: add its recording by")
+    assert said_by(again).startswith(
+        "press.toml: mark stored, samples not added: no samples of the alarm are kept: add its recording by"
+    )
     (tmp_path / "gone").mkdir()
     service = alarmed(tmp_path / "gone", commissioned[0.0])
     (tmp_path / "gone" / "press.toml").write_text("[machine]\nformat = 1\n")
     service.actuators.apply_mark(NAME, "valid")
     assert said_by(service.actuators).startswith(
-        "press.toml: not written: machine.format must be 2, got 1: commission it anew"
+        "press.toml: mark not stored: machine.format must be 2, got 1: commission it anew"
     )
 
 
@@ -152,7 +156,7 @@ def test_a_newline_in_the_name_of_an_alarm_makes_no_line(tmp_path, commissioned)
     alarm = service.actuators._actuator(NAME).judge.alarm
     lines = str(ss.read_machine(tmp_path / "press.toml")).splitlines()
     forged = replace(alarm, id="press\n  alarm         valve-1 valid", reason="a\nb\x1b[31m\u2028c")
-    assert record_mark(str(tmp_path / "press.toml"), forged, "valid", []) == "press.toml: written down"
+    assert record_mark(str(tmp_path / "press.toml"), forged, "valid", []) == "press.toml: mark stored"
     shown = str(ss.read_machine(tmp_path / "press.toml")).splitlines()
     assert len(shown) == len(lines) + 1
     assert all(line.isprintable() for line in shown)

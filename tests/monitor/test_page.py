@@ -112,7 +112,7 @@ def test_a_mark_needs_the_page_and_an_alarm(page: TestClient):
     answer = page.post(address, json={"mark": "acknowledged"}, headers=header)
     assert (answer.status_code, answer.json()) == (
         400,
-        {"error": "a healthy one must have an alarm to be acknowledged, got none"},
+        {"error": "a healthy one must have an open alarm for the mark acknowledged, got none"},
     )
     for body in (b"{", b"[]", b'{"mark": 3}', b'{"mark": "' + b"x" * 20_000 + b'"}', b'{"mark": "away"}'):
         assert page.post(address, content=body, headers=header).status_code == 400

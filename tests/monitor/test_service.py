@@ -218,7 +218,7 @@ def test_a_state_of_another_version_begins_a_new_baseline(taken, caplog):
         service.store.write_rows(connection, rows)
     again = Service(taken, once=True)
     again.close()
-    assert f"press 1: its state has version 1, not {STATE_VERSION}, begins anew" in caplog.text
+    assert f"press 1: starts anew, as its state has version 1, not {STATE_VERSION}" in caplog.text
     _, state, pending = again.store.checkpoint("press 1")
     assert (state["watch"]["version"], state["watch"]["baseline_version"], pending) == (STATE_VERSION, 4, [])
     assert state["watch"]["blocks"] == max(row[1] for row in before)

@@ -130,7 +130,7 @@ def test_a_rule_across_values_names_the_file_that_was_asked_for(tmp_path: Path) 
             '[rig]\nextends = "thesys"',
             f"extends must be a packaged rig ({PACKAGED}) or a .toml file, got 'thesys'",
         ),
-        ('[rig]\nextends = "lab.toml"', "extends must end at a rig of its own, got a circle"),
+        ('[rig]\nextends = "lab.toml"', "extends must lead to a file that extends none, got a circle"),
         (
             '[rig]\nextends = "a\\u0000b.toml"',
             f"extends must be a packaged rig ({PACKAGED}) or a .toml file, got ",

@@ -165,7 +165,7 @@ ACROSS = (
     "relief valves must have an accumulator",
     'when volumes = "position"',
     "must be in a line",
-    "must stand with a filter",
+    "must belong to a filter",
     "must be within the spool's stroke",
 )
 

@@ -116,18 +116,19 @@ def test_milliseconds_that_are_no_part_of_the_seconds_are_left_out(tmp_path: Pat
     for many in (50, 500):
         rows = [f"12:00:{1 + int(k / 50 + 0.5):02d},{20 * k}" for k in range(many)]
         recording = read(saved(tmp_path, "Time,ms", rows))
-        assert "ms beside column Time not used: no parts of its seconds" in recording.history
+        assert "ms not used: not parts of the seconds in column Time" in recording.history
         assert np.all(np.diff(recording.t) < 1.5)
     assert recording.rate == pytest.approx(50.0, rel=0.02)
     within = [f"{k / 50:.2f},{(k * 7) % 90}" for k in range(100)]
     recording = read(saved(tmp_path, "t [s],ms", within))
     assert recording.t == pytest.approx(np.arange(100) / 50, abs=1e-9)
-    assert "ms beside column t [s] not used: no parts of its seconds" in recording.history
+    assert "ms not used: not parts of the seconds in column t [s]" in recording.history
 
 
 def test_hours_minutes_and_seconds_must_be_those_of_a_clock(tmp_path: Path) -> None:
     assert refused(saved(tmp_path, "h,m,s", [f"0,{k},0" for k in range(80)])) == (
-        "time must be whole hours below 24, whole minutes and seconds below 60, got others in columns h, m, s (FILE)"
+        "a time must have whole hours below 24, and whole minutes and seconds below 60, "
+        "got others in columns h, m, s (FILE)"
     )
     # the time since the start in three units: that in seconds is read, as without the others
     recording = read(saved(tmp_path, "hours,minutes,seconds", [f"{k / 1.8e6},{k / 3e4},{k / 500}" for k in range(80)]))
@@ -234,7 +235,7 @@ def with_cells(folder: Path, **cells: str) -> Path:
 def test_a_unit_in_the_cells_is_the_same_in_the_whole_column(tmp_path: Path) -> None:
     for cell in ("300 psi", "200 kPa", "17"):
         assert refused(with_cells(tmp_path, p9=cell)) == (
-            f"a cell must be in bar, as others of its column, got '{cell}' (line 11, column p_A, FILE)"
+            f"a cell must be in bar, like others in its column, got '{cell}' (line 11, column p_A, FILE)"
         )
     recording = read(with_cells(tmp_path, p9="OVERLOAD", p10="", p11="0", p12="-3 bar"))
     assert recording["p_A"][8:13] == pytest.approx([22.5e5, np.nan, np.nan, 0.0, -3e5], nan_ok=True)

@@ -86,7 +86,7 @@ def test_archives_lie_three_deep_in_each_other_at_most(tmp_path: Path) -> None:
     path.write_bytes(content)
     assert len(read(path)) == 3
     path.write_bytes(gzip.compress(content))
-    assert refused(path).startswith("at most 3 archives may lie in each other")
+    assert refused(path).startswith("archives must be nested at most 3 deep")
 
 
 def test_a_sparse_archive_that_claims_12_gib(tmp_path: Path) -> None:

@@ -295,7 +295,7 @@ def test_a_folder_that_is_not_there_is_one_clear_line(tmp_path, recording, make_
 
 @pytest.mark.parametrize("name", ["page.svg", "page.html.gz", "page"])
 def test_a_page_is_a_page_and_nothing_else(tmp_path, recording, make_diagnosis, name):
-    with pytest.raises(InputError, match=rf"^a page must be a file \.html, \.htm, \.pdf, \.png, got .*{name}$"):
+    with pytest.raises(InputError, match=rf"^a page's name must end in \.html, \.htm, \.pdf, \.png, got .*{name}$"):
         report(recording, tmp_path / name, make_diagnosis())
     assert list(tmp_path.iterdir()) == []
     assert report(recording, tmp_path / "page.HTM", make_diagnosis()).is_file()

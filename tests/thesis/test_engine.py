@@ -168,7 +168,7 @@ def test_only_the_asked_items_and_their_needs_are_made(fakes: Path, tmp_path: Pa
 def test_a_maker_may_ask_only_for_what_it_named(fakes: Path, tmp_path: Path) -> None:
     items = (item("t-1", "table"), item("t-2", "unknown_need"))
     outcome = reproduce(["all"], "out", items=items, jobs=1)
-    assert outcome["t-2"].reason == "t-2 must name t-1 among its needs to ask for its products"
+    assert outcome["t-2"].reason == "t-2 must list t-1 in `needs` to use the products of t-1"
 
 
 def test_a_folder_in_use_is_refused(fakes: Path, tmp_path: Path) -> None:

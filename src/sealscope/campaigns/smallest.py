@@ -176,7 +176,7 @@ def duty_experiment(rig: Rig, duty: PlannedDuty, duration: float, seed: int = 0)
     """
     command = command_or_target(duty.command)
     if isinstance(command, Position):
-        raise InputError(f"a plan must be of a command in volts ('3 sin(4t)'), got a target ({command})")
+        raise InputError(f"a plan's command must be a voltage ('3 sin(4t)'), got a target ({command})")
     start = centred_start(rig, command, min(duration, _MAX_CENTRING_SECONDS))
     load = parse_force(duty.load) if duty.load else None
     return Experiment(rig=rig, command=command, duration=duration, x_0=start, load=load, seed=seed)
@@ -215,7 +215,7 @@ def _detectable_steps(
         raise InputError(f"no balance: {reason}")
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
-        raise InputError("no balance: too short, or no block says anything of a leak")
+        raise InputError("no balance: the recording is too short, or no block tells anything about a leak")
     # if the healthy leakage is known, a part of the false-alarm probability is reserved for a comparison with it
     level_fraction: float = DECISION.questions.within
     step_false_alarm = false_alarm * (1.0 - level_fraction if healthy_leakage(rig) > 0.0 else 1.0)
@@ -264,7 +264,9 @@ def plan_recording(
 ) -> RecordingPlan:
     """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
 
-    All duties (command and load) are compared in recordings of `COMPARISON_SECONDS`; the best is tried for `DURATIONS`.
+    All duties (command and load) are compared in recordings of `COMPARISON_SECONDS`. The best duty is then tried for
+    rising `DURATIONS`, from half of the predicted one, until the leak is detected; and likewise for telling it from a
+    leak of the pump.
 
     - `find`: flow at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
     - `duties`: duties to compare with the usual one, by default all combinations of `COMMANDS` and `LOADS`
@@ -281,7 +283,7 @@ def plan_recording(
     for k, duty in enumerate(compared_duties):
         compared.append(detectable_leak(rig, duty, COMPARISON_SECONDS, false_alarm=false_alarm, detection=detection))
         if compared[0].note:
-            raise InputError(f"the usual duty must have a balance, got none of {usual}: {compared[0].note}")
+            raise InputError(f"the usual duty must give a volume balance, got none for {usual}: {compared[0].note}")
         progress("duties compared", (k + 1) / len(compared_duties))
     usual_pressure = compared[0].pressure
     target = None if find is None else find / usual_pressure

@@ -41,7 +41,7 @@ FolderOption = Annotated[Path | None, Option("--output", "-o", help=_FOLDER)]
 _DATA = "Folder of the recordings, for plans over recordings."
 DataOption = Annotated[Path | None, Option("--data", help=_DATA)]
 _CLUSTER = "A Dask scheduler, e.g. tcp://host:8786."
-_BATCH = "Simulate side by side; for detectors of the details' RMS on both sides."
+_BATCH = "Simulate side by side; for detectors that need only the RMS of wavelet details before and after the onset."
 _TRUST = "Run the controllers that the plan names (FILE.py:NAME): read them first."
 
 
@@ -96,7 +96,7 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     if isinstance(loaded_plan, SimulatedPlan):
         echo(_format_progress(read_progress(loaded_plan, _campaign_folder(loaded_plan, folder))))
     else:
-        echo("a campaign over measured data has nothing to wait for; report it")
+        echo("a campaign over recordings has no progress: its records are judged by `campaign report`")
 
 
 @campaign.command()
@@ -123,7 +123,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, the core time per record, and that for the remaining records."""
+    """Format the numbers of records done and failed, and the processor time of a record and of the remaining ones."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"

@@ -47,14 +47,14 @@ def commission(
     if output.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {output}")
     if since is not None and not add:
-        raise InputError("--since must stand with --add, for a machine that is known")
+        raise InputError("--since needs --add: it drops recordings from the file of a known machine")
     check_folder(output)
     if add:
         if keep:
-            raise InputError("--keep must not stand beside --add: added recordings are confirmed healthy")
+            raise InputError("--keep cannot be combined with --add: added recordings are confirmed healthy")
         if stated != StatedMachine():
             raise InputError(
-                "--rig, --area and other options of the machine must not stand beside --add: its file states them"
+                "--rig, --area and other options of the machine cannot be combined with --add: its file states them"
             )
         repair_s = None if since is None else _parse_date(since)
         paths = recordings_in(files)

@@ -94,9 +94,9 @@ AssumeOption = Annotated[
         autocompletion=complete_rigs,
     ),
 ]
-_AREA = "Area of the piston, '633 mm^2', which L/min rests on; twice for sides A and B."
+_AREA = "Area of the piston, '633 mm^2', from which L/min is computed; twice for sides A and B."
 AreaOption = Annotated[list[str] | None, Option("--area", metavar="AREA[unit]", help=_AREA)]
-_DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', which L/min rests on where no area is stated."
+_DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', from which L/min is computed if no area is stated."
 DisplacementOption = Annotated[str | None, Option("--displacement", metavar="VOLUME[unit]", help=_DISPLACEMENT)]
 _LIMIT = "Leak to be repaired: a flow, '5 mL/min', or a speed of creep. [default: 8 mm/min]"
 LimitOption = Annotated[str | None, Option("--limit", metavar="LEAK[unit]", help=_LIMIT)]
@@ -179,7 +179,7 @@ class StatedMachine:
             options |= {"--area": area, "--displacement": displacement, "--limit": limit}
             for name, value in options.items():
                 if value is not None and value != []:
-                    raise InputError(f"{name} must not stand beside --machine, whose file states it")
+                    raise InputError(f"{name} cannot be combined with --machine, whose file states it")
             known_machine = read_machine(machine)
             return cls(known_machine, rig=known_machine.rig, limit=known_machine.limit)
         stated_machine = cls(
@@ -193,7 +193,7 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """Channel map in the rig's file, which states the columns of channels; empty if `--map` replaces it."""
+        """Channel map in the rig's file, i.e. the column of each channel; empty without a rig or if `--map` is used."""
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
@@ -205,7 +205,8 @@ class StatedMachine:
         """Read the recording in a file, or on standard input for the file `-`.
 
         If the machine is commissioned, the channel map and rate in its file apply, otherwise the options of the call.
-        Without `--map`, the rig's map is used for files with its columns. Raises UnreadableFile, also for a folder.
+        Without `--map`, the rig's map is used for files that have the columns it names. Raises UnreadableFile, also for
+        a folder.
         """
         if self.commissioned is not None:
             return self.commissioned.read(file)
@@ -266,7 +267,11 @@ class StatedMachine:
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces a command's parameter `stated` by the options `names`, by default all."""
+    """Build a decorator that replaces the parameter `stated` of a command by the options of a machine.
+
+    The command gets the `StatedMachine` that these options describe. `names`: the options, given as names of parameters
+    of `StatedMachine.of`; by default all.
+    """
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
@@ -274,7 +279,8 @@ def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callabl
 def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:
     """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`.
 
-    The argument `drifts` is left out, as it cannot be written as text.
+    The command gets the experiment that these options describe. The argument `drifts` is left out, as it cannot be
+    written as text.
     """
     special_options = {
         "rig": RigOption,

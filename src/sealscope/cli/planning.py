@@ -49,12 +49,12 @@ def plan(
     if machine is not None:
         commissioned_machine = read_machine(machine)
         if overrides:
-            raise InputError(f"--set must not stand beside --machine, whose file states the rig ({machine})")
+            raise InputError(f"--set cannot be combined with --machine, whose file states the rig ({machine})")
         # the mass shows whether a whole rig was stated, as nobody states the mass alone
         if commissioned_machine.rig is None or not commissioned_machine.rig.states("cylinder.M_eq"):
             smallest = commissioned_machine.summary.smallest
             hint = "" if smallest is None else f"; another recording like the healthy ones shows {smallest}"
-            raise InputError(f"a plan simulates a machine: commission it by --rig ({machine}){hint}")
+            raise InputError(f"a plan simulates the machine, so it must be commissioned with --rig ({machine}){hint}")
         planned_rig = commissioned_machine.rig
     with opt.progress() as update:
         recording_plan = plan_recording(

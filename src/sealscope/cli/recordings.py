@@ -112,8 +112,9 @@ def _diagnose_in_parallel(
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
     """Diagnose files in parallel processes; yield a pair (messages, dated diagnoses) for each file, in their order.
 
-    `work`: function that yields the dated diagnoses of files, None for an unreadable one. If the process of a file
-    dies, its diagnoses are [None]. On a single core, one pair contains all files.
+    `work`: function that yields the dated diagnoses of files, None for an unreadable one. The messages are the text
+    that it printed on standard error. If the process of a file dies, its diagnoses are [None]. On a single core, one
+    pair contains all files.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -253,7 +254,7 @@ def report(
     check_probability(false_alarm)
     if stated.commissioned is not None and any(path.is_dir() for path in files):
         if join:
-            raise InputError("--join must not stand beside a folder, whose recordings are judged each for itself")
+            raise InputError("--join cannot be combined with a folder, whose recordings are judged separately")
         _report_machine(files, stated, output, false_alarm)
         return
     has_folder = (len(files) > 1 and not join) or output.is_dir()
@@ -340,7 +341,7 @@ def inspect(
     _reads_standard_input(files)
     stated = opt.StatedMachine.of(maps=maps, rate=rate, rig=rig)
     if save_map and (rig is None or not stated.channel_map):
-        raise InputError("--save-map must stand with --rig and its file, and with the --map options to be saved")
+        raise InputError("--save-map needs --rig with a file, and the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
     is_complete = True
     columns: dict[str, str] | None = None  # column of each channel; `auto` is resolved by the first readable file

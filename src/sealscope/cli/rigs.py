@@ -56,7 +56,7 @@ def new(
         ("--supply", supply, "valve"),
     ):  # fmt: skip
         if value is not None and kind != required_kind:
-            raise InputError(f"{option} must stand with --kind {required_kind}, got --kind {kind}")
+            raise InputError(f"{option} needs --kind {required_kind}, got --kind {kind}")
     if bore is not None:
         bore_m = _parse_size(bore, "m", "mm", "--bore")
         rod_m = _parse_size(rod or "0", "m", "mm", "--rod")
@@ -88,8 +88,8 @@ def new(
 def _parse_size(text: str | None, si_unit: str, default_unit: str, option: str, label: str = "") -> float:
     """Parse the text of an option to a number in `si_unit`; a text without a unit is in `default_unit`.
 
-    Without a text, the user is asked for the size `label`, if stated, at the terminal. Raises InputError if the text
-    does not begin with a finite number, or has a unit of another dimension.
+    If `text` is missing and a `label` is stated, the user is asked for the value at the terminal, with this label.
+    Raises InputError if the text does not begin with a finite number, or has a unit of another dimension.
     """
     from sealscope.units import parse_quantity
 

@@ -44,9 +44,9 @@ def simulate(
         if truth.resolve() == output.resolve():
             raise InputError(f"recording and truth must be two files, got {output} for both")
     if fmu is not None and (truth is not None or prove):
-        raise InputError("--truth and --prove are of the rig, got them with --fmu")
+        raise InputError("--truth and --prove need a simulated rig and cannot be combined with --fmu")
     if fmu is None and maps:
-        raise InputError("--map names the variables of a unit, got it without --fmu")
+        raise InputError("--map names the variables of an FMU and needs --fmu")
     with opt.progress() as report:
         if fmu is None:
             run = simulate_experiment(experiment, report, prove=prove)

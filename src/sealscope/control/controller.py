@@ -37,10 +37,11 @@ measured_at = record_view(record_dtype(*Measured._fields))
 class CompiledLaw(NamedTuple):
     """A controller's control law as machine code, with its memory at the start of a run.
 
-    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler,
-    that returns the voltage [V] for the numbers of a `Measured`. `memory` (n,): parameters and state of the control
-    law, which each call updates; memory[0] is the leakage flow [m^3/s] that the controller compensates, or NaN if it
-    reports none. `kept`: an object that the law needs, such as the `CompiledLaw` that it calls, or None.
+    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler.
+    It returns the voltage [V]; `measured` points to the fields of a `Measured` in their order. `memory` (n,):
+    parameters and state of the control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the
+    controller compensates, or NaN if it reports none. `kept`: an object that the law needs, such as the `CompiledLaw`
+    that it calls, or None.
     """
 
     address: int
@@ -77,7 +78,7 @@ LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _PythonLaw:
-    """A controller written in Python, its function `voltage`, that compiled code can call by the address of `law`."""
+    """Adapter by which compiled code calls `voltage`, the function of a controller written in Python, through `law`."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
         self._voltage, self._memory = voltage, np.full(1, math.nan)
@@ -105,7 +106,11 @@ class _PythonLaw:
 
 
 def start_law(controller: Controller) -> CompiledLaw:
-    """Start a controller for one run; return its machine code, or else a law that calls its Python function."""
+    """Start a controller for one run; return its control law in the form that compiled code can call.
+
+    It is the controller's machine code or, if its method `compiled` is missing or returns None, a law that calls the
+    Python function of its method `start`.
+    """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law
 

@@ -36,9 +36,9 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 
     `m`: a record `DRIVE`, the parameters and the filter state of the drive.
 
-    A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))); the pressure drop p_s -
-    sign(flow) dp is taken as at least 10 % of p_s. To pass the edges' overlap, 4 u is then added to u, at most
-    +-`dead_volts`.
+    A servo valve (Q_N > 0) needs u = u_N flow/(Q_N sqrt((p_s - sign(flow) dp)/(2 dp_N))), with the parameters of
+    `ValveDrive`. The pressure drop p_s - sign(flow) dp is taken as at least 10 % of p_s. To pass the overlap of the
+    valve's edges, 4 u is then added to u, limited to +-`dead_volts`.
 
     A pump needs u = (omega + shortfall H(omega + droop dp))/omega_per_volt, with omega = flow/displacement and the
     parameters of `Drive`. The second term makes up for the motor's speed falling short of its command after a change.
@@ -92,7 +92,8 @@ class _Invertible(ABC):
     def inverse(self, rate: float) -> Callable[[float, float], float]:
         """Build a function that computes the voltage [V] for a flow [m^3/s] at p_A - p_B [Pa].
 
-        It must be called at the `rate` [Hz], as a filter in it advances by a sample with each call.
+        The function must be called once per sample, `rate` [Hz] times a second: each call advances a filter by one
+        sample.
         """
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))

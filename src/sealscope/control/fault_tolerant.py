@@ -43,11 +43,12 @@ _memory_at = record_view(_MEMORY)
 
 @entry
 def _tolerant_law(memory: Any, sample: Any) -> Any:
-    """Compute the voltage [V] of a sample: the inner controller's, plus the one at which the pump feeds the leak.
+    """Compute the voltage [V] of a sample: the inner controller's, plus the one for the leakage flow.
 
-    The leak's flow is G times the averaged p_A - p_B. G is the conductance that the observer estimates, minus the
-    assumed one; it stays 0 until it is significant, and changes slowly. While G is not 0, the sum is limited to
-    +-u_max. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The leakage flow is G times the averaged p_A - p_B; it is stored as `compensated`. If the leak is not known
+    (`is_known` = 0), G slowly follows a target: the conductance that the observer estimates minus the assumed one, or 0
+    while this difference is not significant. While G is not 0, the voltage is limited to +-u_max. `memory`, `sample`:
+    addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
@@ -85,15 +86,15 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 class FaultTolerant:
     """A controller that compensates the leakage across the piston, in addition to another controller.
 
-    The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp,
-    with p_A - p_B averaged over some milliseconds as dp. A Kalman filter (`update_observer`, with the model `balance`)
+    The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp.
+    Here dp is p_A - p_B, averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
     estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed
-    leakage conductance of the pump. G stays 0 until it exceeds 4 standard errors and would move the piston by half an
-    encoder count a second: without a leak the voltages are exactly those of `inner`. The voltage is limited to
-    +-`u_max` [V] while a leak is compensated.
+    leakage conductance of the pump. G stays 0 until this difference exceeds 4 standard errors and the leak would move
+    the piston by half an encoder count a second. Without a leak the voltages are therefore exactly those of `inner`.
+    The voltage is limited to +-`u_max` [V] while a leak is compensated.
 
-    `known` >= 0 [m^3/(s Pa)], if not None, replaces the estimated G: the ideal controller, which knows the leak. The
-    compensated flow [m^3/s] is reported as `compensated`.
+    `known` >= 0 [m^3/(s Pa)], if not None, is taken as G instead of an estimate: an ideal controller that knows the
+    leak. The compensated flow [m^3/s] is reported as `compensated`.
     """
 
     inner: Controller

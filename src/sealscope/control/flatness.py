@@ -35,8 +35,8 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
     The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against the pressure
-    difference dp that the load and the target's speed v and acceleration a require. `memory`, `sample`: addresses of a
-    record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    difference dp that the load and the target's speed v and acceleration a require. At the first sample a and d(dp)/dt
+    are 0. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
@@ -70,7 +70,8 @@ class Flatness:
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
     averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
-    are assumed. A speed of the target above `v_max` [m/s] is taken as a jump of the target, and is not fed forward.
+    are assumed; V is the volume of a chamber and K the bulk modulus of the oil. A speed of the target above `v_max`
+    [m/s] is taken as a jump of the target, and is not fed forward.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """

@@ -52,9 +52,10 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
     A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
     seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other. For chamber A,
     D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B the signs are
-    opposite. dtheta and dx are the rotation and the travel in the block. dtheta_in is the rotation that pumps oil into
-    the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter also estimates the
-    relative errors of 1/K and of the area. Friction and load do not enter.
+    opposite. D is the displacement of the pump, A the piston area, V(x) the volume of the chamber, and K the bulk
+    modulus. dtheta, dx and dp_A are the changes of angle, position and p_A in the block. dtheta_in is the rotation that
+    pumps oil into the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter also
+    estimates the relative errors of 1/K and of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means  # `means`: moving averages of the same four signals
     if m.count == 0.0:
@@ -84,9 +85,10 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     the first and the last count half. The block is left out if
 
     - the mean of p_A - p_B is within +-`MIN_DP`;
-    - p_A - p_B changes its sign, or is too small to shut a check valve;
-    - its innovation (measured minus predicted leakage) exceeds `_OUTLIER_SDS` standard deviations. If the block before
-      was such an outlier with the same sign, a leak may have opened: the block is used, with a larger variance of G.
+    - p_A - p_B changes its sign, or is at times too small to shut a check valve;
+    - its innovation (measured minus predicted leakage) exceeds `_OUTLIER_SDS` standard deviations. If the last block
+      before it that passed the other tests was an outlier, too, and implied a change of the conductance G in the same
+      direction, a leak may have opened. The block is then used, with a larger variance of G.
     """
     dp_integral = dp_sum / m.rate
     if abs(dp_integral) < MIN_DP * m.length / m.rate or m.min_dp * m.max_dp <= 0.0:
@@ -139,7 +141,10 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @law
 def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the conductance in an observer's memory m, its standard error [m^3/(s Pa)] and its number of blocks."""
+    """Return the estimated conductance and its standard error [m^3/(s Pa)], and the number of blocks used.
+
+    `m`: record `OBSERVER`, the memory of the observer.
+    """
     return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
 
 

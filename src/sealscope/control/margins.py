@@ -132,7 +132,10 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def find_moving_state(u: float) -> tuple[Array, float]:
-            """Simulate the rig at u [V] from standstill; return its last state and its settled mean speed [m/s]."""
+            """Simulate the rig from standstill at u [V], in two parts of `_SETTLING` seconds each.
+
+            Returns the last state, and the piston's mean speed [m/s] in the second part.
+            """
             first_state = advance_state(y, u, samples)
             last_state = advance_state(first_state, u, samples)
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
@@ -146,7 +149,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             else:  # the piston does not follow
                 u *= 1.5
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
-            raise InputError(f"speed must be one that the drive can give, got {speed:g} m/s")
+            raise InputError(f"speed must be one that the drive can reach, got {speed:g} m/s")
         y = state
         y[VELOCITY], y[POSITION] = speed, 0.0
     columns: list[Array] = []

@@ -31,8 +31,9 @@ def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
     At this voltage the drive delivers the flow A v_c. A is the piston area of the chamber with the higher pressure. The
-    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the error e = target - x. `m`: a record
-    `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
+    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the target's speed v_target and the error
+    e = target - x. `m`: a record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a
+    `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
@@ -64,7 +65,8 @@ class PositionPI:
     overlap of the valve's edges.
 
     The integral is frozen within `dead_band` [m] of the target, where it would oscillate against static friction or
-    between two encoder counts, and while the voltage is at its limit `u_max` [V].
+    between two encoder counts. It is also frozen while the voltage is at its limit `u_max` [V], unless the error has
+    the opposite sign.
 
     `rate` [Hz]: sampling rate; `delay`: whole samples from a measurement to the voltage computed from it; `k_v` [1/s]
     and `k_i` [1/s^2]: gains; `area_A`, `area_B` [m^2]: piston areas of the two chambers.

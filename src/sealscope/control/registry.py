@@ -51,7 +51,10 @@ def is_installed(name: str) -> bool:
 
 
 def check_controller_name(name: str) -> None:
-    """Raise InputError unless `name` is a known controller, or has the form ``MODULE:NAME`` or ``FILE.py:NAME``."""
+    """Raise InputError unless `name` is a known controller, or has the form ``MODULE:NAME`` or ``FILE.py:NAME``.
+
+    Whether such a module or file exists is not checked.
+    """
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):
         names = (*CONTROLLERS, *_installed())
@@ -92,14 +95,14 @@ def controller_named(name: str, rig: Rig) -> Controller:
         raise InputError(f"controller {name} could not be made: {type(error).__name__}: {error}") from error
     missing_parts = [part for part in ("rate", "delay", "start") if not hasattr(controller, part)]
     if missing_parts:
-        raise InputError(f"a controller must have rate, delay and start, got {name} without {', '.join(missing_parts)}")
+        raise InputError(f"a controller must have rate, delay and start; {name} lacks {', '.join(missing_parts)}")
     return controller  # type: ignore[no-any-return]
 
 
 def find_controller_source(name: str) -> Path | None:
     """Find the source file of a controller without importing it; return None for a built-in one.
 
-    Raises InputError if there is no such file.
+    Raises InputError for an unknown name, and if the file does not exist.
     """
     if name in CONTROLLERS:
         return None

@@ -64,7 +64,7 @@ class Examination:
     refusal : str or None
         Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
     share, judged_until : float
-        Fraction of the original samples that `recording` contains, and fraction of them up to its last time.
+        Fractions of the original samples: those that `recording` contains, and those up to its last time.
     """
 
     recording: Recording
@@ -79,7 +79,10 @@ class Examination:
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)
 
     def with_channels(self, channels: Iterable[str]) -> Examination:
-        """Return a copy in which all recordings have only the given channels; healthy summaries are dropped."""
+        """Return a copy in which all recordings have only the given channels.
+
+        Healthy recordings of which only summaries are stored are left out.
+        """
         names = set(channels)
 
         def select_channels(recording: Recording) -> Recording:
@@ -89,7 +92,10 @@ class Examination:
         return replace(self, recording=select_channels(self.recording), baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Run the detector called `name` once, and return its observations; raise KeyError if there is none."""
+        """Return the observations of the detector called `name`, which runs at the first call only.
+
+        Raises KeyError if there is no such detector.
+        """
         if name not in self._reports:
             rig = load_rig(self.rig)
             self._reports[name] = run_detector(name, self.recording, self.baseline, rig, distrust=self.distrust)
@@ -125,7 +131,7 @@ class Examination:
         run. The verdict cannot be "no leak" if a measuring detector failed, or if there is a `refusal`.
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
-        # whichever detector decides, the test results in these reports may show another cause of a change than a leak
+        # the test results in these reports may show causes other than a leak, whichever detector decides
         reports = [self.signals, *(self.report(name) for name in names if name not in ORDER)]
         decisions = dict[str, Evidence]()
         for name in names:
@@ -160,7 +166,7 @@ def diagnose(
     limit: str | None = None,
     file: str | os.PathLike[str] | None = None,
 ) -> Diagnosis:
-    """Decide whether oil bypasses the piston in a recording.
+    """Decide if oil bypasses the piston in a recording.
 
     Four methods are asked in this order: the balance of volumes, the response of the pressures, plug-ins, and the
     change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict. The results of
@@ -244,6 +250,6 @@ def _list_baseline(recording: object, baseline: Recording | Sequence[Healthy]) -
         arguments.append(("baseline" if is_single else f"baseline[{k}]", entry, Recording | SummarisedRecording))
     for name, value, allowed_type in arguments:
         if not isinstance(value, allowed_type):
-            hint = "; sealscope.read makes one of a file" if isinstance(value, str | os.PathLike) else ""
+            hint = "; sealscope.read makes one from a file" if isinstance(value, str | os.PathLike) else ""
             raise InputError(f"{name} must be a Recording, got {type(value).__name__} {value!r:.40}{hint}")
     return healthy

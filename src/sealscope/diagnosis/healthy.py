@@ -33,9 +33,9 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect the `detector`'s summaries of healthy recordings: stored ones, and those that `detector.learn` computes.
+    """Collect the `detector`'s summaries of healthy recordings, either stored or computed by `detector.learn`.
 
-    Recordings without a summary are skipped.
+    Recordings without a summary by this detector are skipped.
     """
     summaries = (
         recording.summaries.get(detector.name)

@@ -70,11 +70,12 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted.
 
-    It cannot if a chamber pressure is constant or stuck, or if all are mostly clipped, mostly beyond what any sensor
-    reads, or implausible for hydraulics.
+    A recording cannot be trusted if a chamber pressure is constant or stuck, or if the readings of all chamber
+    pressures are mostly clipped, mostly impossible, or implausible for hydraulics.
     """
     chambers = chambers_of(recording)
-    part, corrections, stuck, share = correct_samples(recording)  # `stuck`: names of channels that repeat one value
+    # `stuck`: names of chamber pressures that repeat one value for too long
+    part, corrections, stuck, share = correct_samples(recording)
     findings = (*inspect(recording.only(names)), *corrections)
     chamber_findings = [finding for finding in findings if finding.channel in chambers]
     defects = [finding for finding in chamber_findings if finding.code == "constant"]
@@ -106,7 +107,8 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     A baseline is left out if it cannot be trusted, if it lacks a chamber pressure of the judged recording or has it in
     another unit, or if its samples are those of the judged recording. Of baselines with the same samples, the one with
     the most channels is kept. Differences of speed, load and temperature are accepted, as the detectors allow for them.
-    Channels that only the judged recording has are left out, because other channels give other estimates.
+    From the judged recording, channels that no comparable baseline has are left out, unless they change slowly, such as
+    the oil temperature: estimates from different channels would not be comparable.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest
@@ -144,7 +146,10 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
-    """Find why the baseline `entry` cannot be compared with `judged`: severity and text of a finding, or None."""
+    """Find the reason why the baseline `entry` cannot be compared with `judged`; None if it can.
+
+    The reason is the severity and the text of a finding.
+    """
     if isinstance(entry, Inspection) and entry.defect is not None:
         return "warning", entry.defect
     if entry.digest == judged.digest:

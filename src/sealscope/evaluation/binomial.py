@@ -42,10 +42,11 @@ def _check_count(k: int, n: int) -> None:
 def clopper_pearson(k: int, n: int, confidence: float = 0.95) -> tuple[float, float]:
     """Compute the exact confidence interval (low, high) of a probability from `k` successes in `n` trials.
 
-    It contains the true probability with at least the probability `confidence`. With B the quantile of the beta
-    distribution and alpha = 1 - confidence, ``low = B(alpha/2; k, n-k+1)`` and ``high = B(1-alpha/2; k+1, n-k)``; low
-    is 0 if k = 0, and high is 1 if k = n. Raises InputError for an impossible count or confidence. Source: Clopper and
-    Pearson, Biometrika 26 (1934) 404-413, doi 10.1093/biomet/26.4.404.
+    The interval contains the true probability with at least the probability `confidence`. With B(p; a, b) the
+    p-quantile of the beta distribution with parameters a and b, and alpha = 1 - confidence, ``low = B(alpha/2; k,
+    n-k+1)`` and ``high = B(1-alpha/2; k+1, n-k)``; low is 0 if k = 0, and high is 1 if k = n. Raises InputError for an
+    impossible count or confidence. Source: Clopper and Pearson, Biometrika 26 (1934) 404-413, doi
+    10.1093/biomet/26.4.404.
     """
     from scipy.special import betaincinv
 
@@ -72,8 +73,9 @@ def proportion(k: int, n: int, confidence: float = 0.95) -> Proportion:
 def lower_bound(k: int, n: int, confidence: float = 0.95) -> float:
     """Compute the exact one-sided lower confidence bound of a probability from `k` successes in `n` trials.
 
-    It is ``B(1 - confidence; k, n-k+1)`` with B the quantile of the beta distribution, and 0 for k = 0. For example, 29
-    of 29 prove 90 % at 95 % confidence. Raises InputError for an impossible count or confidence.
+    It is ``B(1 - confidence; k, n-k+1)``, with B(p; a, b) the p-quantile of the beta distribution with parameters a and
+    b, or 0 if k = 0. For example, 29 successes in 29 trials prove a probability of at least 90 % at 95 % confidence.
+    Raises InputError for an impossible count or confidence.
     """
     from scipy.special import betaincinv
 
@@ -99,9 +101,9 @@ def upper_tail(k: int, n: int, p: float = 0.5) -> float:
 def sign_test(k: int, n: int) -> float:
     """Compute the two-sided exact p-value of `k` positive changes out of `n`, if both signs are equally likely.
 
-    It is ``min(1, 2 P(X >= max(k, n-k)))``; changes of exactly zero must not be counted in `n`. Raises InputError for
-    an impossible count. Source: Arbuthnot, Phil. Trans. 27 (1710) 186-190; Conover, Practical Nonparametric Statistics,
-    3rd ed. (1999), section 3.4.
+    It is ``min(1, 2 P(X >= max(k, n-k)))``, where X is binomial with n trials and probability 1/2. Changes of exactly
+    zero must not be counted in `n`. Raises InputError for an impossible count. Source: Arbuthnot, Phil. Trans. 27
+    (1710) 186-190; Conover, Practical Nonparametric Statistics, 3rd ed. (1999), section 3.4.
     """
     _check_count(k, n)
     return min(1.0, 2.0 * upper_tail(max(k, n - k), n))

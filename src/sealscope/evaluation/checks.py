@@ -19,7 +19,7 @@ def as_numbers(values: npt.ArrayLike, what: str) -> Array:
     if array.ndim != 1:
         raise InputError(f"{what} must be one flat list, got {array.ndim} dimensions")
     if array.size < 1:
-        raise InputError(f"{what} must be at least 1, got {array.size}")
+        raise InputError(f"{what} must be at least one number, got none")
     wrong = np.flatnonzero(~np.isfinite(array))
     if wrong.size:
         raise InputError(f"{what} must be finite, got {array[wrong[0]]} (number {wrong[0] + 1} of {array.size})")
@@ -51,7 +51,7 @@ MIN_PROBABILITY = 1e-15
 
 
 def as_probability(value: float, what: str) -> float:
-    """Convert a probability to a float; raise InputError unless it is 1e-15 to below 1. `what`: name in messages."""
+    """Convert a probability to a float; raise InputError unless 1e-15 <= `value` < 1. `what`: name in messages."""
     if not 0.0 < value < 1.0:
         raise InputError(f"{what} must be between 0 and 1, got {value}")
     if value < MIN_PROBABILITY:

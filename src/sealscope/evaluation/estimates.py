@@ -52,7 +52,7 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     as_probability(order, "the order of a quantile")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    p_at_least_k = betainc(k, n + 1 - k, order)  # falls with k, so that a count of values is the largest k
+    p_at_least_k = betainc(k, n + 1 - k, order)  # falls with k: counting its large values finds the last of them
     r = int(np.count_nonzero(1.0 - p_at_least_k <= tail))
     s = int(np.count_nonzero(p_at_least_k > tail)) + 1
     return r, s
@@ -62,8 +62,8 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
     """Estimate a quantile of the distribution that a sample `values` (n,) comes from, with a confidence interval.
 
     The estimate is the sorted value ``x_(ceil(n order))``, with `order` such as 0.9, and the ends of the interval are
-    sorted values, too (`order_ranks`). It is valid for any distribution, and infinite if the sample is too small.
-    `values` may contain inf for values beyond all others. Raises InputError for an empty sample or nan.
+    sorted values, too (`order_ranks`). The interval is valid for any distribution; an end is infinite if the sample is
+    too small. `values` may contain inf for values beyond all others. Raises InputError for an empty sample or nan.
     """
     array = np.sort(np.asarray(values, dtype=np.float64).ravel())
     if array.size == 0 or np.isnan(array).any():
@@ -78,8 +78,9 @@ def estimate_quantile(values: npt.ArrayLike, order: float, confidence: float = 0
 def estimate_mean(values: npt.ArrayLike, confidence: float = 0.95) -> IntervalEstimate:
     """Estimate the mean of the distribution that a sample `values` comes from, with Student's confidence interval.
 
-    The interval is ``mean -+ t s/sqrt(n)``, and infinite for a single value; without values all results are nan. Raises
-    InputError for a value that is not finite.
+    The interval is ``mean -+ t s/sqrt(n)``, with the standard deviation s of the n values and Student's quantile t for
+    n - 1 degrees of freedom. It is infinite for a single value; without values all results are nan. Raises InputError
+    for a value that is not finite.
     """
     from scipy.special import stdtrit
 
@@ -116,8 +117,9 @@ def estimate_errors(
     """Compute the errors of estimates, such as leaks [L/min] or onsets [s], with confidence intervals.
 
     `estimates`, `truth` and the ends `low` and `high` of the stated intervals, all (n,), have the same unit. A missing
-    estimate or interval is nan. The confidence interval of the rmse is the square root of Student's interval of the
-    mean square error, cut off at 0. Raises InputError if no record has an estimate.
+    estimate or interval is nan; without `low` or `high` there are no intervals, and the coverage is nan. The confidence
+    interval of the rmse is the square root of Student's interval of the mean square error, cut off at 0. Raises
+    InputError if no record has an estimate.
     """
     true_values = as_numbers(truth, "true values")
     n_records = true_values.size

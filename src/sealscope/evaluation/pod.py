@@ -74,7 +74,8 @@ def _information(design: Array, n: Array, eta: Array) -> Array:
 
     `design` (m, 2): columns 1 and logarithm of size; `n` (m,): numbers of trials; `eta` (m,): log odds of detection.
     """
-    odds = np.exp(-np.abs(eta))  # does not overflow; p (1 - p) is even in eta
+    # with p the probability of a hit, p (1 - p) is the same for eta and -eta, and exp(-|eta|) does not overflow
+    odds = np.exp(-np.abs(eta))
     weight = n * odds / (1.0 + odds) ** 2  # n p (1 - p)
     return np.asarray(design.T @ (design * weight[:, None]), dtype=np.float64)
 
@@ -95,7 +96,7 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: boo
 def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Array:
     """Find intercept and slope of the logistic curve by maximum likelihood, or with `firth` by penalised likelihood.
 
-    `design` (m, 2) has the columns 1 and logarithm of size; `n` trials and `k` hits (m,) are counted for each size.
+    `design` (m, 2) has the columns 1 and logarithm of size; `n`, `k` (m,): numbers of trials and of hits at each size.
     """
     from scipy.optimize import minimize
     from scipy.special import expit
@@ -110,7 +111,8 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
 
-    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])  # slope 0; 0.5: never 0 or 1
+    # slope 0 and the overall fraction of hits; 0.5 and 1.0 keep it from being 0 or 1
+    start = np.array([_log_odds((k.sum() + 0.5) / (n.sum() + 1.0)), 0.0])
     return np.asarray(minimize(loss, start, jac=True, method="BFGS", options={"gtol": 1e-9}).x, dtype=np.float64)
 
 
@@ -177,7 +179,8 @@ class HitMiss:
     def size_at(self, detection: float) -> float:
         """Compute the size that is detected with the probability p = `detection`, such as a90 for 0.9.
 
-        It is ``ln(size) = (ln(p/(1-p)) - intercept)/slope``, and infinite if the detection does not rise with the size.
+        Its logarithm is ``(ln(p/(1-p)) - intercept)/slope``. The size is infinite if the detection does not rise with
+        it (slope <= 0).
         """
         as_probability(detection, "the probability of detection")
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
@@ -185,11 +188,11 @@ class HitMiss:
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
         """Compute the one-sided upper confidence bound of the size detected with the probability `detection`.
 
-        By default it is a90/95. It is the largest size whose profile log-likelihood is within ``z^2/2`` of the maximum,
-        with z the normal quantile of `confidence` (chi square with one degree of freedom), and infinite if there is no
-        such size, or if the detection does not rise with the size. Raises InputError unless `confidence` is from 0.5 to
-        below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles, Technometrics 25 (1983) 77-86, doi
-        10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
+        By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
+        maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). It is infinite if
+        this holds for arbitrarily large sizes, or if the detection does not rise with the size. Raises InputError
+        unless `confidence` is from 0.5 to below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
+        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
@@ -265,11 +268,11 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
     `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised. If
-    the size separates hits from misses, it has no finite maximum, and Firth's penalised likelihood is used, also in
-    `HitMiss.size_bound`; `HitMiss.estimator` names the method. The curve goes to 0 for small leaks, as it does not
-    include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source: MIL-HDBK-1823A
-    (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med.
-    21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    the size separates hits from misses, the likelihood has no finite maximum, and Firth's penalised likelihood is used,
+    also in `HitMiss.size_bound`; `HitMiss.estimator` names the method. The curve goes to 0 for small leaks, as it does
+    not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
+    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
+    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
     x = np.log(as_sizes(leaks))
     is_hit = as_flags(hits, x.size, "hits")

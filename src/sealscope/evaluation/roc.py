@@ -71,10 +71,10 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     """Compute the ROC curve of a score that is high for leaks, from the scores of leak-free and of leaky records.
 
     If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole true
-    curve with at least the probability `confidence`: it is the envelope of the curve's points, each moved by +-d in
-    false alarms and by +-e in detections, the `kolmogorov_margin` of the leak-free and of the leaky scores at the
-    confidence sqrt(`confidence`). Raises InputError unless there are scores of both groups. Source: Campbell, Stat.
-    Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
+    curve with at least the probability `confidence`: at each point it reaches from the lowest detection minus e to the
+    highest detection plus e among the points of the curve whose false alarms differ by at most d. Here d and e are the
+    `kolmogorov_margin` of the leak-free and of the leaky scores at the confidence sqrt(`confidence`). Raises InputError
+    unless there are scores of both groups. Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
     a, b = _as_scores(leak_free, leaky)
     as_probability(confidence, "confidence")
@@ -107,8 +107,8 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
 
     Its ends are the solutions t of ``|t - A| = z SE(t)``, with Hanley and McNeil's standard error ``SE(t)^2 = t (1 - t)
     (1 + (N - 1) q)/(n m)``, where ``q = (1 - t)/(2 - t) + t/(1 + t)`` and N is the mean of the numbers n and m of
-    leak-free and of leaky scores; `z`: normal quantile. It has a width even if A is 0 or 1. Source: Newcombe, Stat.
-    Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
+    leak-free and of leaky scores; `z`: normal quantile of the confidence. The interval has a width even if A is 0 or 1.
+    Source: Newcombe, Stat. Med. 25 (2006) 559-573, doi 10.1002/sim.2324, method 5.
     """
     from scipy.optimize import brentq
 
@@ -119,7 +119,7 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (n * m)
 
-    # at A itself the excess is negative; 1e-9: the search ends just beside A
+    # at A itself the excess is negative, so each search ends just short of A, by 1e-9
     low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
     high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
     return float(low), float(high)
@@ -130,8 +130,8 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
 
     With scores a (n,) of leak-free and b (m,) of leaky records, high for leaks, the area is ``sum of (b > a) + (b =
     a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1, or
-    Newcombe's if that has no width (scores completely separated or all equal). Raises InputError for fewer
-    than 2 records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi
+    Newcombe's if DeLong's has no width (scores completely separated or all equal). Raises InputError for fewer than 2
+    records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi
     10.2307/2531595, eq. (5)-(8).
     """
     from scipy.special import ndtri

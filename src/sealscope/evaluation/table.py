@@ -37,7 +37,8 @@ def poisson_interval(count: int, confidence: float = 0.95) -> tuple[float, float
 def events_per_hour(count: int, hours: float, confidence: float = 0.95) -> IntervalEstimate:
     """Compute the rate of events per operating hour with its exact confidence interval.
 
-    Raises InputError unless `hours` is positive and `count` a whole number that is not negative.
+    In the result, `n` is the `count` of events. Raises InputError unless `hours` is positive and `count` a whole number
+    that is not negative.
     """
     if not (math.isfinite(hours) and hours > 0.0):
         raise InputError(f"operating hours must be > 0, got {hours}")
@@ -78,7 +79,7 @@ def confusion_matrix(
     if len(truth) != len(verdicts) or not truth:
         raise InputError(f"verdicts must be as many as the true faults, got {len(verdicts)} for {len(truth)}")
     if CANNOT_TELL in truth or CANNOT_TELL in faults:
-        raise InputError(f"{CANNOT_TELL!r} is a verdict and no fault")
+        raise InputError(f"{CANNOT_TELL!r} is a verdict, not a fault")
     rows = tuple(dict.fromkeys(faults))
     columns = (*rows, CANNOT_TELL)
     unknown = [name for name in truth if name not in rows] + [name for name in verdicts if name not in columns]

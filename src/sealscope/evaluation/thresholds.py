@@ -59,7 +59,7 @@ def records_needed(false_alarm: float, confidence: float | None = None) -> int:
     """
     as_probability(false_alarm, "the false-alarm probability")
     if confidence is None:
-        return max(1, math.ceil(1.0 / false_alarm * (1.0 - 1e-12)) - 1)  # 1e-12, here and below: rounding
+        return max(1, math.ceil(1.0 / false_alarm * (1.0 - 1e-12)) - 1)  # 1e-12, here and below: for rounding errors
     ratio = math.log1p(-as_probability(confidence, "confidence")) / math.log1p(-false_alarm)
     return max(1, math.ceil(ratio * (1.0 - 1e-12)))
 
@@ -74,9 +74,9 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
     from scipy.special import betainc
 
     if promise == "average":
-        return min(n, math.floor(false_alarm * (n + 1) * (1.0 + 1e-12)))  # 1e-12, here and below: rounding
+        return min(n, math.floor(false_alarm * (n + 1) * (1.0 + 1e-12)))  # 1e-12, here and below: for rounding errors
     ranks = np.arange(1, n + 1)
-    p_kept = betainc(ranks, n + 1 - ranks, false_alarm)  # falls with the rank, so that the count is the largest rank
+    p_kept = betainc(ranks, n + 1 - ranks, false_alarm)  # falls with the rank: the count is the largest such rank
     return int(np.count_nonzero(p_kept >= confidence * (1.0 - 1e-12)))
 
 

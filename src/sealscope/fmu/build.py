@@ -33,7 +33,7 @@ from sealscope.storage.plain_values import convert_type
 Version = Literal[2, 3]
 #: Methods of a soft sensor: the volume balance, from chamber pressures, pump's angle and piston's position.
 Sensor = Literal["volume"]
-#: Default limit [Pa] of the rms error of a pressure, to which the solver's step in an FMU is chosen.
+#: Default limit [Pa] of the rms error of a pressure; the solver's step in an FMU is chosen to keep it.
 ERROR = 1.0
 #: Commands of the runs by which this step is chosen.
 STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
@@ -49,7 +49,7 @@ class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run.
 
     `triple`, `target`: its names for LLVM and for the C compiler; `folders`: by FMI version, folder of the library in
-    the FMU's archive; `suffix`: of the library's file.
+    the FMU's archive; `suffix`: ending of the library's file name.
     """
 
     triple: str
@@ -71,12 +71,12 @@ def this_platform() -> str:
     name = {"linux": "linux", "win32": "windows", "darwin": "macos"}.get(sys.platform, sys.platform)
     name += "-arm" if is_arm else ""
     if name not in PLATFORMS:
-        raise InputError(f"platform must be one of {', '.join(PLATFORMS)}, got {name}; name it")
+        raise InputError(f"platform must be one of {', '.join(PLATFORMS)}, got {name}; state the FMU's platforms")
     return name
 
 
 class Compiler(NamedTuple):
-    """A C compiler: program with first arguments, and whether it also compiles for other systems."""
+    """A C compiler: its command with the first arguments, and True if it also compiles for other systems."""
 
     command: list[str]
     cross_compiles: bool
@@ -91,7 +91,7 @@ def find_compiler() -> Compiler:
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
             return Compiler([path], cross_compiles=False)
-    raise InputError("an FMU needs a C compiler, and there is none here; pip install 'sealscope[fmu]' brings it")
+    raise InputError("an FMU needs a C compiler, and none was found; pip install 'sealscope[fmu]' installs one")
 
 
 def fmi_headers() -> Path:
@@ -100,15 +100,15 @@ def fmi_headers() -> Path:
 
     package = find_spec("fmpy")
     if package is None or package.origin is None:
-        raise InputError("an FMU needs the headers of FMI, which FMPy carries: pip install 'sealscope[fmu]'")
+        raise InputError("an FMU needs the headers of FMI, which FMPy contains: pip install 'sealscope[fmu]'")
     return Path(package.origin).parent / "c-code"
 
 
 def choose_step(rig: Rig, error: float) -> tuple[float, float]:
     """Choose the solver's step with which the rms error of the pressures is at most `error` [Pa].
 
-    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`. Returns the shortest of their steps [s],
-    and the largest of their estimated errors [Pa].
+    A run of 4 s from mid-stroke is simulated under each of `STEP_COMMANDS`. Returns the shortest step [s] that these
+    runs chose, and the largest of their estimated errors [Pa].
     """
     from sealscope.simulation.experiment import Experiment
     from sealscope.simulation.integrate import integrate_run

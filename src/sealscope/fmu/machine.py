@@ -66,15 +66,15 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = {
 
 @law
 def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
-    """Compute an input a + b s at the three times s [s] that a Runge-Kutta step from t over h [s] needs."""
-    n = RK4_NODES  # as fractions of the step
+    """Compute an input a + b s at the three times s [s] that a Runge-Kutta step from t to t + h needs."""
+    n = RK4_NODES  # the times after t as fractions of h
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
-    """Compute an input a + b s at the six times s [s] that an implicit-explicit step from t over h [s] needs."""
-    n = IMEX_NODES  # as fractions of the step
+    """Compute an input a + b s at the six times s [s] that an implicit-explicit step from t to t + h needs."""
+    n = IMEX_NODES  # the times after t as fractions of h
     at_0, at_1, at_2 = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     at_3, at_4, at_5 = a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
     return at_0, at_1, at_2, at_3, at_4, at_5

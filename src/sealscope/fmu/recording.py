@@ -125,7 +125,7 @@ def record_fmu(
 def _check_experiment(experiment: Experiment) -> None:
     """Raise InputError for an experiment that an FMU cannot run.
 
-    These have a position target, a fault or drift of the machine, or a leak that is stated as a flow.
+    Such an experiment has a position target, a fault or drift of the machine, or a leak that is stated as a flow.
     """
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
@@ -179,8 +179,8 @@ def _build_input_table(
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
     accuracy. `path`: the FMU's file, for messages; `names`: name of the FMU's variable for each channel and input;
-    `variables`: FMPy's description of each variable, by name. Raises InputError if the FMU lacks an input, or if the
-    load is a function of position or velocity.
+    `variables`: FMPy's description of each variable, by name. Raises InputError if the FMU lacks an input that the
+    experiment needs, or if the load is a function of position or velocity.
     """
     half_step = 0.5 * (t[1] - t[0])
     # in each step, the inputs are needed at one time only, its middle

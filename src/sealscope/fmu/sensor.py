@@ -149,7 +149,8 @@ class SensorChoice(NamedTuple):
 def _count_samples(rate: float) -> tuple[int, int, int]:
     """Compute the samples in a stride, the strides in a block, and the samples in half a difference, at `rate` [Hz].
 
-    A stride is the time between two rows of the volume balance; a central difference shows the direction of motion.
+    A stride is the time between two rows of the volume balance. The direction of motion is the sign of a central
+    difference of the position.
     """
     return stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate))
 

@@ -33,7 +33,7 @@ _VALVE_OUTPUTS = ("x_s", "v_s")
 
 
 class Variable(NamedTuple):
-    """A variable of an FMU in terms of the FMI standard; `unit`: of SI; `start`: initial value, None for outputs."""
+    """A variable of an FMU as in the FMI standard; `unit`: an SI unit; `start`: initial value, None for outputs."""
 
     reference: int
     name: str

@@ -63,10 +63,10 @@ class _Actuator:
     `watch`, `judge`: decide on the leak and on the alarm; `pending`, `bytes`: number and size of the blocks of samples
     since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over
     the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
-    unknown; `judged_s` [s]: end of the last judged samples; `verdict`: on the last recording, None if whole recordings
-    are not judged; `alarm_samples`: last samples during an
-    alarm, which may become a healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings,
-    None for files and other actuators.
+    unknown; `judged_s` [s]: end of the last judged samples; `verdict`: verdict on the last recording, None if there is
+    none or newer results replace it; `alarm_samples`: last samples during an alarm, which may become a healthy
+    recording; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other
+    actuators.
     """
 
     settings: ActuatorSettings
@@ -89,9 +89,9 @@ class _Actuator:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
         `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the recording that ends
-        with these samples, None for none. For a file, that recording is these samples: a verdict that decides
-        (`RecordingVerdict.decides`) replaces the leak in the estimates, and alone updates the alarm. For a stream, it
-        is the last minutes, and the estimates update the alarm, too.
+        with these samples, None for none. For a file, the recording consists of these samples: a verdict that decides
+        (`RecordingVerdict.decides`) replaces the leak in the estimates, and alone updates the alarm. For a stream, the
+        recording has the last minutes, and both the estimates and the verdict update the alarm.
         """
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []
@@ -124,7 +124,9 @@ class _Actuator:
     def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
         """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
 
-        For a stream, the verdict `no leak` is dropped if the leak of the alarm is below its bound.
+        For a stream, a verdict that does not decide is dropped once there is an estimate of a block, which tells more.
+        Also for a stream, the verdict `no leak` is dropped if its bound does not exclude the leak of the alarm.
+        Otherwise `no leak` also makes the detector withdraw its leak.
         """
         earlier_verdict, self.verdict = self.verdict, verdict
         is_stream, alarm = self.recorder is not None, self.judge.alarm
@@ -248,6 +250,7 @@ class WatchedActuators:
     """The watched actuators of a monitor, restored from its `store`; `keep_days`: how long estimates are stored [d]."""
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
+        """Restore the actuator of each of the `settings` from the database, or create it if it is not stored."""
         self.store, self.settings = store, {setting.name: setting for setting in settings}
         self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())  # arrival of the last block of each [s]
         self._keep_s = keep_days * 86_400.0
@@ -290,7 +293,7 @@ class WatchedActuators:
         fresh, state = actuator.watch, stored.state
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
         if (version := require_part(state["watch"], "version", int)) != STATE_VERSION:
-            _log.warning("%s: its state has version %s, not %d, begins anew", name, version, STATE_VERSION)
+            _log.warning("%s: starts anew, as its state has version %s, not %d", name, version, STATE_VERSION)
             baseline_version = require_part(state["watch"], "baseline_version", int)
             n_blocks = self.store.last_number(self.store.tables.estimates, name)
             fresh.continue_from(n_blocks, baseline_version)
@@ -317,7 +320,7 @@ class WatchedActuators:
         is_same_rig = rig == stored_rig or is_remeasured(rig, stored_rig)
         if is_same_rig and learning_settings == stored_learning_settings:
             return stored_settings != settings.watched_with
-        _log.warning("%s: its rig or learn_hours are others than it learned with, begins anew", name)
+        _log.warning("%s: starts anew, as its rig or learn_hours have changed", name)
         fresh.continue_from(actuator.watch.blocks, actuator.watch.baseline_version)
         actuator.watch = fresh
         return True
@@ -419,7 +422,10 @@ class WatchedActuators:
             rows.add_pending(name, number, samples, follows, verdict)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old ones for deletion."""
+        """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion.
+
+        The number and size of its pending samples become 0.
+        """
         settings = actuator.settings
         state, recorder = actuator.state(), actuator.recorder
         first_kept = recorder.first if recorder is not None and recorder.first else actuator.n_stored + 1
@@ -458,7 +464,7 @@ class WatchedActuators:
             raise InputError(f"an alarm must be shelved for > 0 h, got {hours:g}")
         with self._lock:
             if name not in self.settings:
-                raise InputError(f"the settings must have the actuator {name[:60]!r}, got none")
+                raise InputError(f"the settings have no actuator {name[:60]!r}")
             actuator, rows = self._actuator(name), StoredRows()
             open_alarm = actuator.judge.alarm
             t = 0.0 if open_alarm is None else open_alarm.updated_s  # without an open alarm, the mark is refused below

@@ -145,7 +145,6 @@ class AlarmJudge:
         lpm = estimate.leak_lpm
         is_warning = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
         is_error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
-        # numbers of successive blocks above the thresholds of a warning and of an error
         self.above = self.above + 1 if is_warning or is_error else 0
         self.error = self.error + 1 if is_error else 0
         if self.alarm is None or not self.alarm.active:
@@ -204,12 +203,13 @@ class AlarmJudge:
         return self.alarm
 
     def add_evidence(self, verdict: RecordingVerdict) -> None:
-        """Add the verdict on a recording of a stream to the `evidence` M of a leak: M <- (1 + M) e, with its e-value e.
+        """Add the verdict on a recording of a stream to the `evidence` M of a leak: M <- (1 + M) e.
 
-        M sums the products of e-values since each recording (Shiryaev-Roberts; J. Shin, A. Ramdas, A. Rinaldo, arXiv
-        2203.03532). Without a leak it exceeds 1/alpha at most once in 1/alpha recordings on average.
+        e is the e-value of the verdict; a verdict that does not decide is ignored. M is the sum, over all recordings so
+        far, of the product of the e-values from that recording on (Shiryaev-Roberts; J. Shin, A. Ramdas, A. Rinaldo,
+        arXiv 2203.03532). Without a leak M exceeds 1/alpha at most once in 1/alpha recordings on average.
         """
-        if verdict.decides:  # of another, neither its evidence nor its chance of a false alarm is known
+        if verdict.decides:  # the e-value of another verdict is not known
             self.evidence = min((1.0 + self.evidence) * verdict.e_value, _MAX_EVIDENCE)
 
     def update_from_verdict(
@@ -224,12 +224,14 @@ class AlarmJudge:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
         A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
-        none) was `leak`, too, or if leak-free recordings get such a verdict seldom enough for the allowed rate of false
-        alarms; of a stream (`is_stream`), if the `evidence` of its recordings is enough. The verdict `no leak`, or a
-        leak below the warning threshold, ends the alarm. `baseline`: version of the healthy baseline; `settings`:
-        thresholds and the allowed rate. The event is "raised", "error" or "warning" (a change of the level), "returned"
-        (the leak has ended), or "" for none of these. Returns None for the verdict `cannot tell`, or if no alarm was
-        active and none is raised.
+        none) was `leak`, too, or if the verdict is rare enough by itself (`RecordingVerdict.is_rare`). For a recording
+        of a stream (`is_stream`), the `evidence` must instead reach 1/alpha, with alpha the probability of a false
+        alarm that the stream's recordings are allowed. The verdict `no leak`, or a leak below the warning threshold,
+        ends the alarm. `baseline`: version of the healthy baseline; `settings`: thresholds and the allowed rate of
+        false alarms.
+
+        The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for
+        none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -275,8 +277,8 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        An alarm whose cause has ended stays open until a person has seen it. `over_s` becomes the time of the last
-        update at which an alarm was no longer active.
+        An alarm whose cause has ended stays open until a person has seen it. If the alarm is not active, `over_s`
+        becomes the time of its last change.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s
@@ -292,16 +294,16 @@ class AlarmJudge:
         mark or a mark that the alarm has already, if there is no open alarm, or if ``invalid`` has no reason.
         """
         if mark not in MARKS:
-            raise InputError(f"an alarm must be marked {', '.join(MARKS)}, got {mark[:40]!r}")
+            raise InputError(f"the mark of an alarm must be one of {', '.join(MARKS)}, got {mark[:40]!r}")
         alarm = self.alarm
         if alarm is None:
-            raise InputError(f"{self.actuator} must have an alarm to be {mark}, got none")
+            raise InputError(f"{self.actuator} must have an open alarm for the mark {mark}, got none")
         if mark == "comment":
             return alarm
         if mark == alarm.state or (mark == "acknowledged" and alarm.state == "valid"):
             raise InputError(f"{alarm.id} is {alarm.state} already")
         if mark == "invalid" and not reason.strip():
-            raise InputError(f"{alarm.id} must be invalid for a reason, got none: state it as the comment")
+            raise InputError(f"the mark invalid of {alarm.id} must have a reason, got none: state it as the comment")
         open_state: AlarmState = "valid" if mark == "valid" else "acknowledged"
         changes: dict[str, dict[str, Any]] = {  # by mark
             "shelved": {"shelved_until_s": until},
@@ -329,6 +331,7 @@ def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
+        """Build the sorting key of a summary, the lowest for the most urgent one."""
         low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         evidence = math.inf if by_chance is None else by_chance

@@ -29,9 +29,10 @@ def check_mqtt() -> None:
 class MqttLink:
     """A connection to a broker by MQTT 5; the caller must acknowledge the received messages.
 
-    `will`: function, called before each connection, that returns topic and payload of the last will: the broker
-    publishes it when the connection is lost, and `close` before it disconnects; `retain`: True if the broker keeps the
-    will for later subscribers; `client`: object of the library paho.
+    `client_id`: name of the client at the broker; `password`: for the user in the settings `broker`, None for none.
+    `will`: function, called before each connection, that returns topic and payload of the last will, None for no will.
+    The broker publishes this message when the connection is lost, and `close` publishes it before it disconnects.
+    `retain`: True if the broker keeps the will for later subscribers; `client`: object of the library paho.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class MqttLink:
         will: Callable[[], _Message] | None = None,
         retain: bool = False,
     ) -> None:
+        """Build the client of the library paho, which `open` connects; the class describes the parameters."""
         check_mqtt()
         from paho.mqtt.client import Client
         from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion

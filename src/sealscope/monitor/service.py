@@ -64,18 +64,19 @@ class Service:
         stdout: TextIO | None = None,
         sources: Iterable[Source] = (),
     ) -> None:
+        """Lock and open the database, restore the actuators from it, and start the page; `run` starts all else."""
         self.settings, self.once = settings, once
         self._queue: BoundedQueue[SourceBlock | RefusedMessage | None] = BoundedQueue(_QUEUE_BLOCKS, _QUEUE_BYTES)
         self._unstored: list[SourceBlock | RefusedMessage | None] = []
         self._stdin = stdin or (sys.stdin.buffer if sys.stdin is not None else BytesIO())
         self._extra_sources = [*sources]
         self._refused = self._n_waits = self._n_sources = 0
-        self._is_database_blocked = False  # the database has refused the blocks under way
+        self._is_database_blocked = False  # True while it refuses the blocks that are to be stored
         self._resources = ExitStack()
         if "://" not in settings.database:
             if not Path(settings.database).parent.is_dir():
                 raise InputError(f"the monitor's database must be in a folder that exists, got {settings.database}")
-            busy = f"the database must belong to one monitor, got another at work ({settings.database})"
+            busy = f"the database must belong to one monitor, but another one is running ({settings.database})"
             self._resources.enter_context(lock_file(Path(settings.database + ".lock"), busy))
         try:
             self.store = MonitorStore(settings.database)
@@ -118,7 +119,7 @@ class Service:
                 _log.warning("a source waits: %d blocks are to be stored, %.1f MB", load.n_blocks, load.n_bytes / 1e6)
 
     def queue_load(self) -> QueueLoad:
-        """Count the blocks and bytes that are not stored yet, in the queue and in the present transaction."""
+        """Count the blocks and bytes in the queue and in the present transaction, and the waits of sources so far."""
         unstored = [*self._unstored]
         n_blocks, n_bytes = self._queue.size()
         n_bytes += sum(block.bytes for block in unstored if block is not None)
@@ -127,7 +128,8 @@ class Service:
     def run(self) -> None:
         """Store blocks of samples until `stop` is called or, if there is no web page, until all sources have ended.
 
-        Linear algebra runs in one thread: the matrices are small, and on a busy machine several would mostly wait.
+        Linear algebra runs in one thread: the matrices are small, and on a busy machine several threads would mostly
+        wait.
         """
         self._resources.enter_context(threadpool_limits(limits=1))
         sources, threads = self._all_sources(), list[threading.Thread]()
@@ -223,7 +225,10 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events of alarms to the output stream; end the outage of the database, unless it refuses blocks."""
+        """Write new events of alarms to the output stream.
+
+        The events are read from the database, so its outage ends, unless the database still refuses blocks.
+        """
         self._lines.deliver()
         if not self._is_database_blocked:  # otherwise the database can be read, but not written
             self._database.end_outage()

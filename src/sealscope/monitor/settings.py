@@ -29,7 +29,8 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
     """Resolve `place`, a path in the settings, relative to the folder of the settings file.
 
-    `info`: its `context` has this folder. URLs, names of packaged rigs, and paths not from a file are left unchanged.
+    `info`: its `context` has this folder. URLs and names of packaged rigs are returned unchanged, and so are all paths
+    if the settings do not come from a file (no `context`).
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -39,7 +40,10 @@ _File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
 def _check_recording_length(seconds: float) -> float:
-    """Return the length of a stream's recordings [s]; raise ValueError unless it is 0 or in `recording.lengths`."""
+    """Return the length of a stream's recordings [s]; raise ValueError unless it is 0 or within the allowed range.
+
+    The range is `recording.lengths` of the live watch's `priors.toml`.
+    """
     shortest, longest = LIVE.recording.lengths
     if seconds != 0.0 and not shortest <= seconds <= longest:
         raise ValueError(f"must be 0 or {shortest:g} to {longest:g} s, got {seconds:g}")
@@ -280,12 +284,12 @@ class MonitorSettings(_Table):
             _check_channels(actuator, has_opcua=self.opcua is not None)
         publishes = self.sparkplug is not None or (mqtt is not None and mqtt.alarms_topic is not None)
         if publishes and len({topic_level(actuator.name) for actuator in actuators}) < len(actuators):
-            raise ValueError("actuators must have names that differ in more than the letters + # / as topics")
+            raise ValueError("actuators must have names that still differ with _ in place of + # / in topics")
         node_path = None if self.sparkplug is None else [self.sparkplug.group, self.sparkplug.node]
         if any(path.split("/")[:2] == node_path for path in paths):  # "group/node" or "group/node/device"
-            raise ValueError("the node of the alarms must be none of the actuators' nodes")
+            raise ValueError("the node of the alarms must not be one of the actuators' nodes")
         if page is not None and page.host not in ("127.0.0.1", "localhost", "::1") and page.token_file is None:
-            raise ValueError(f"a page beyond this machine needs page.token_file, got host {page.host!r} without")
+            raise ValueError(f"a page for other computers needs page.token_file, got host {page.host!r} without it")
         return self
 
 
@@ -295,15 +299,15 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
     `has_opcua`: True if the settings have a table [opcua], which nodes need.
     """
     if actuator.nodes and (not has_opcua or actuator.rate is None):
-        raise ValueError(f"an actuator with nodes needs the table [opcua] and its rate, got {actuator.name!r}")
+        raise ValueError(f"an actuator with nodes needs the table [opcua] and a rate, got {actuator.name!r}")
     for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):
         for channel in channels:
             if channel not in CHANNELS:
-                raise ValueError(f"{table} must be of {', '.join(CHANNELS)}, got {channel[:40]!r}")
+                raise ValueError(f"{table} must be stated for {', '.join(CHANNELS)} only, got {channel[:40]!r}")
     for channel, unit in actuator.units.items():  # raises if the unit has another dimension
         to_si(0.0, unit, CHANNEL_UNITS[channel], name=f"units.{channel}", place=actuator.name)
     if actuator.units and actuator.folder is not None:
-        raise ValueError(f"units of files stand in their headings, got units of {actuator.name!r}, a folder")
+        raise ValueError(f"the headings of files state their units, got units for the folder of {actuator.name!r}")
     if not actuator.nodes:
         return
     watched, nodes = load_watched(actuator.rig), actuator.nodes.keys()
@@ -314,7 +318,10 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
 
 
 def _column_unit(channel: str, column: str) -> str | None:
-    """Find the unit in the heading of a channel's column; return None if it has no unit of the right dimension."""
+    """Find the unit in the heading of a channel's column; return None if it has no unit of the right dimension.
+
+    The result is also None for a channel that is not watched in live samples.
+    """
     label = Label.parse(column)
     _, unit_in_name = split_unit(label.name)
     unit = label.unit or unit_in_name

@@ -41,10 +41,12 @@ class SupervisedPart:
     """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
     `since` [s since 1970], `reason`: start of the present outage, None if there is none, and its reason; `count`:
-    number of outages so far; `seconds` [s]: length of the ended ones. Only one thread at a time may call `attempt`.
+    number of outages so far; `seconds` [s]: total length of the outages that have ended. Only one thread at a time may
+    call `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
+        """Begin without an outage or a pause; `name`: name of the part in the log, on the page and in metrics."""
         self.name, self._supervisor = name, supervisor
         self.since: float | None = None
         self.reason, self.count, self.seconds, self._began = "", 0, 0.0, 0.0
@@ -85,8 +87,9 @@ class SupervisedPart:
     def attempt(self, work: _Work, *, at_once: bool = False) -> bool:
         """Run the function `work` unless the part pauses after an error; return True if it ran without an error.
 
-        An error begins a pause, twice the last one up to a limit, and an outage of the part, or of the database if the
-        error comes from there. Success ends the outage of the part. `at_once`: True to ignore a pause.
+        An error begins an outage of the part, or of the database if the error comes from the database. It also begins a
+        pause, twice as long as the last one up to a limit. Success ends the outage of the part. `at_once`: True to
+        ignore a pause.
         """
         if self.pause_s and not at_once:
             return False
@@ -138,7 +141,10 @@ class Supervisor:
         return [{"part": part.name, "since": part.since, "reason": part.reason} for part in parts if part.since]
 
     def outage_totals(self) -> dict[str, tuple[bool, int, float]]:
-        """Summarise the outages of each part, by its name: (True if there is none now, number, total length [s])."""
+        """Summarise the outages of each part by its name.
+
+        A summary is a tuple: True if the part has no outage now, number of its outages, and their total length [s].
+        """
         parts = [*self._parts.values()]
         return {part.name: (part.since is None, part.count, part.seconds + part.outage_s) for part in parts}
 
@@ -160,6 +166,7 @@ class Supervisor:
                 timer.cancel()
 
         def run_until_success() -> None:
+            """Run `work` as the part, again after an error if `restart`, and call `on_end` at the end."""
             while not part.attempt(work_with_timer) and restart and not self.stopping.wait(part.pause_s):
                 pass
             on_end()
@@ -167,10 +174,14 @@ class Supervisor:
         return _start_thread(run_until_success, name)
 
     def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
-        """Start a thread that runs `step` every `every_s` [s] as the part `name`, and `last` when the monitor stops."""
+        """Start a thread that runs `step` every `every_s` [s] as the part `name`, and `last` when the monitor stops.
+
+        After an error, `step` runs again when the pause of the part has ended.
+        """
         part = self.part(name)
 
         def run_steps() -> None:
+            """Run `step` again and again until the monitor stops, and then `last`, if there is one."""
             while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
             if last is not None:

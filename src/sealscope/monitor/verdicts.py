@@ -110,7 +110,7 @@ class RecordingVerdict:
         return bool(self.verdict == NO_LEAK)
 
     def excludes(self, leak_lpm: float | None) -> bool:
-        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if one of both is not known."""
+        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if the flow or the bound is not known."""
         return self.bound_lpm is None or leak_lpm is None or self.bound_lpm < leak_lpm
 
     @property
@@ -122,36 +122,36 @@ class RecordingVerdict:
         return self.leaks or self.clears or self.mark != ""
 
     def allowed_chance(self, false_alarms_per_1000_h: float) -> float:
-        """Compute the probability of a false alarm per recording of this length that this rate allows."""
+        """Compute the probability of a false alarm that a rate allows for one recording of this length."""
         return false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
 
-        `chance`, unless it is None, must not exceed the `allowed_chance`, or `rarest` of `priors.toml`, the smallest
-        probability that can be known, if that is larger.
+        It is rare if `chance` is at most `allowed_chance`, or at most `rarest` of `priors.toml`, the smallest
+        probability that can be known. A verdict with unknown `chance` (None) also counts as rare.
         """
         allowed_chance = self.allowed_chance(false_alarms_per_1000_h)
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
 
     @property
     def e_value(self) -> float:
-        """Evidence of a leak whose mean over leak-free recordings is at most 1; multiplied over recordings.
+        """E-value of this verdict: evidence of a leak with a mean of at most 1 over leak-free recordings.
 
-        With p = `chance` of a leak, at least `rarest` of `priors.toml`, it is (1 - p + p ln p)/(p (ln p)^2), the mean
-        of kappa p^(kappa - 1) over kappa from 0 to 1 (V. Vovk, R. Wang, Ann. Statist. 49 (2021) 1736). Without a leak p
-        is 1, which gives 1/2; for an unknown p it is 1.
+        With p = `chance`, at least `rarest` of `priors.toml`, the e-value is (1 - p + p ln p)/(p (ln p)^2), the mean of
+        kappa p^(kappa - 1) over kappa from 0 to 1 (V. Vovk, R. Wang, Ann. Statist. 49 (2021) 1736). Without a leak p is
+        1, which gives 1/2; for an unknown p the e-value is 1. The e-values of successive recordings are multiplied.
         """
         if not self.leaks:
             return 0.5
         if self.chance is None:
             return 1.0
-        p = min(max(_FALSE_ALARM.rarest, self.chance), 0.99)  # 0.99: where both terms of the fraction are not yet 0
+        p = min(max(_FALSE_ALARM.rarest, self.chance), 0.99)  # at 1 the fraction is 0/0
         return (1.0 - p + p * math.log(p)) / (p * math.log(p) ** 2)
 
     @property
     def by_chance_per_1000_h(self) -> float | None:
-        """Expected number of equally high scores in 1000 h of healthy recordings, None if it is not known."""
+        """Expected number of scores as high as this in 1000 h of healthy recordings, None if it is not known."""
         hours = (self.end_s - self.start_s) / 3600.0
         return None if self.chance is None or hours <= 0.0 else 1000.0 * self.chance / hours
 
@@ -164,7 +164,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or without a leak, the block gets no leak; its interval is 0 to `bound_lpm`, None if unknown.
+        Before the onset, or without a leak, the block gets no leak. The interval of its leak is then 0 to `bound_lpm`,
+        or None if the bound is unknown.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:
@@ -195,15 +196,16 @@ def judge_recording(
 
 
 def judge_stream(rig: str, recording: Recording, *, limit_lpm: float | None = None) -> RecordingVerdict | None:
-    """Judge a recording of an actuator's stream by its machine's healthy recordings; `rig`: the machine's file.
+    """Judge a recording of an actuator's stream by comparison with its machine's healthy recordings.
 
-    `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in the machine's file. Returns None if that
-    file has no healthy recordings; raises InputError if it cannot be read.
+    `rig`: the machine's file; `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in this file.
+    Returns None if the file has no healthy recordings; raises InputError if it cannot be read.
     """
     watched = load_watched(rig)  # read anew, as the file may have changed
     if watched.machine is None:
         return None
     start, end = (float(recording.t[k]) for k in (0, -1))
     name = f"stream from {clock_text(start)} to {clock_text(end)}"
+    # None: the limit in the machine's file is used, in its own unit (a limit of creep is compared with the creep)
     limit_lpm = None if limit_lpm == watched.limit_lpm else limit_lpm
     return judge_recording(watched.machine, replace(recording, t=recording.t - start), name, start, limit_lpm=limit_lpm)

@@ -104,9 +104,10 @@ CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
-    """Raise InputError unless a rig's circuit has a property, the bool attribute `flag`, such as "pump_is_measured".
+    """Raise InputError unless a rig's `circuit` has the property `flag`, a bool attribute such as "pump_is_measured".
 
-    For the message, `subject` names what needs the property, such as "a simulation".
+    The message names `subject`, which needs this property of the circuit (such as "a simulation"), the name `rig`, and
+    the circuits that have the property.
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))

@@ -118,7 +118,7 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
     rig or cannot be written; the file is then unchanged.
     """
     if os.fspath(path) in rig_names():
-        raise InputError(f"a map is saved beside a rig of your own, a .toml file, got the packaged rig {path}")
+        raise InputError(f"a map must be saved in your own rig's file (.toml), got the packaged rig {path}")
     file = Path(path)
     load_rig(file)  # raises if this is not a rig's file
     lines = file.read_text(encoding="utf-8-sig").splitlines()
@@ -146,15 +146,16 @@ class _RigFile(NamedTuple):
 def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
     """Read a rig's file together with the files that it extends.
 
-    Its parameters replace those of an extended file, and its table `[map]` replaces the whole other map. Tables of a
-    commissioned machine that do not describe a rig (`MACHINE_TABLES`) are left out. `place`: the file in messages;
-    `visited`: the files that extend it. Raises InputError for a wrong table or key, for files that extend each other in
-    a circle, or for more than `_MAX_LAYERS` files.
+    A parameter of the file replaces that of an extended file. A table `[map]` that is not empty replaces the whole map
+    of an extended file. If the file describes a commissioned machine, its tables `MACHINE_TABLES`, which are no part of
+    a rig, are left out. `place`: name of the file in messages; `visited`: the files that extend it, directly or
+    indirectly. Raises InputError for a wrong table or key, for files that extend each other in a circle, or for more
+    than `_MAX_LAYERS` files.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:
         raise InputError(
-            f"extends must end at a rig of its own, got a circle or more than {_MAX_LAYERS} files ({place})"
+            f"extends must lead to a file that extends none, got a circle or more than {_MAX_LAYERS} files ({place})"
         )
     tree = read_toml(path, "a rig file", place)
     if "machine" in tree:

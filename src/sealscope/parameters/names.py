@@ -40,7 +40,7 @@ def resolve_name(name: str, dotted: Sequence[str]) -> str:
 
 
 def parse_override(text: str) -> tuple[str, str]:
-    """Split an override `NAME=VALUE[unit]` into name and value, a text; raise InputError if a part is missing."""
+    """Split an override `NAME=VALUE[unit]` into the texts `NAME` and `VALUE[unit]`; InputError if one is missing."""
     name, equals, value = text.partition("=")
     name, value = name.strip(), value.strip()
     if not (name and equals and value):
@@ -49,7 +49,10 @@ def parse_override(text: str) -> tuple[str, str]:
 
 
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
-    """Split overrides `NAME=VALUE[unit]` to name -> value; raise InputError for a name with two different values."""
+    """Parse overrides `NAME=VALUE[unit]` to a mapping from `NAME` to the text `VALUE[unit]`.
+
+    Raises InputError for a text of another form, or for a name with two different values.
+    """
     overrides: dict[str, str] = {}
     for text in texts:
         name, value = parse_override(text)

@@ -25,10 +25,10 @@ _STATED = "stated when this file was written: replace by drawing or data sheet"
 def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[float, float]:
     """Compute the piston areas [m^2] of sides A and B from the diameters of bore and rod [m].
 
-    The rod is on side B, with `double_rod` on both. Raises InputError if the rod is not thinner than the bore.
+    The rod is on side B only, or on both sides with `double_rod`. Raises InputError unless 0 <= rod < bore.
     """
     if not (math.isfinite(bore) and 0.0 <= rod < bore):
-        raise InputError(f"rod must be 0 to below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
+        raise InputError(f"rod must be >= 0 mm and below the bore, {1e3 * bore:g} mm, got {1e3 * rod:g} mm")
     ring_area = 0.25 * math.pi * (bore**2 - rod**2)
     return (ring_area if double_rod else 0.25 * math.pi * bore**2), ring_area
 
@@ -38,6 +38,7 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
 
     All other parameters are taken from the rig `thesis` if the areas are equal, else from `single-rod-eha`. Some of
     them are scaled to the machine's size, such as friction with the bore or area, and the moving mass with the volume.
+    A table `[makeup]`, for the oil that the rod displaces, is written only if the areas differ.
 
     Parameters
     ----------
@@ -49,7 +50,8 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
     Raises
     ------
     InputError
-        A number is not > 0, or the name has more than letters, digits, `-`, `_` and blanks.
+        A number is not finite and > 0, or the name is blank or contains a character other than a letter, a digit,
+        `-`, `_` or a blank.
     """
     _check_arguments(name, {"area-A": area_A, "area-B": area_B, "stroke": stroke, "displacement": displacement})
     is_single_rod = area_A != area_B
@@ -93,7 +95,8 @@ def valve_rig_text(
     Raises
     ------
     InputError
-        A number is not > 0, or the name has more than letters, digits, `-`, `_` and blanks.
+        A number is not finite and > 0, or the name is blank or contains a character other than a letter, a digit,
+        `-`, `_` or a blank.
     """
     base = load_rig("servo-valve")
     drop = base.valve.dp_N if rated_drop is None else rated_drop
@@ -129,7 +132,7 @@ def _check_arguments(name: str, sizes: dict[str, float]) -> None:
         if not (math.isfinite(value) and value > 0):
             raise InputError(f"{argument} must be > 0, got {value:g}")
     if not name.strip() or not all(letter.isalnum() or letter in "-_ " for letter in name):
-        raise InputError(f"name of a rig must be of letters, digits, '-', '_' and blanks, got {name!r}")
+        raise InputError(f"name of a rig must consist of letters, digits, '-', '_' and blanks, got {name!r}")
 
 
 def _read_template(file: str) -> Template:

@@ -40,7 +40,7 @@ class ParameterEntry(NamedTuple):
     place: str
 
     def text(self) -> str:
-        """Format the parameter's value and unit as they were stated."""
+        """Format the parameter's value and unit as they were stated, without the unit "1"."""
         return str(self.value) if self.unit in ("", "1") else f"{self.value} {self.unit}"
 
 
@@ -151,8 +151,8 @@ class Rig(Part):
             )
         if friction.law != "stribeck" and (friction.coulomb_pressure != "sum" or friction.F_pr <= 0):
             raise ValueError(
-                f'friction.law = "{friction.law}" must have coulomb_pressure = "sum" and F_pr > 0, for its force must '
-                f"be > 0, got {friction.coulomb_pressure} and {with_unit(friction.F_pr, 'N')}"
+                f'friction.law = "{friction.law}" must have coulomb_pressure = "sum" and F_pr > 0, so that its force '
+                f"is > 0, got {friction.coulomb_pressure} and {with_unit(friction.F_pr, 'N')}"
             )
         return self
 
@@ -180,12 +180,13 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Raise ValueError unless shut-off valves and filters fit the lines, and the viscosities each other.
+        """Raise ValueError for a valve or filter without the part that it needs, or for conflicting viscosities.
 
-        Valves and filters need a line; clogging and a bypass need a filter; the oil must be thinner when warm.
+        Shut-off valves and filters need a line (`line.orifices`), clogging and a bypass valve need a filter. The
+        viscosity must be lower at 100 deg C than at 40 deg C.
         """
         line, oil = self.line, self.fluid
-        # `absent`: the value that means that there is no such valve or filter
+        # `absent`: the value of a rig without such a valve or filter
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
             if getattr(line, name) != absent and line.orifices == "absent":
                 raise ValueError(
@@ -193,10 +194,14 @@ class Rig(Part):
                     f"got line.{name} = {getattr(line, name):g} and line.orifices = absent"
                 )
         R_A, R_B = line.R_A, line.R_B
-        for name, R_name, R in (("k_clog_A", "R_A", R_A), ("k_clog_B", "R_B", R_B), ("G_bypass", "R_A", max(R_A, R_B))):
+        for name, R_name, R in (
+            ("k_clog_A", "R_A", R_A),
+            ("k_clog_B", "R_B", R_B),
+            ("G_bypass", "R_A or R_B", max(R_A, R_B)),
+        ):
             if getattr(line, name) > 0.0 and R == 0.0:
                 raise ValueError(
-                    f"line.{name} must stand with a filter ({R_name} > 0), got line.{name} = "
+                    f"line.{name} must belong to a filter ({R_name} > 0), got line.{name} = "
                     f"{getattr(line, name):g} and none"
                 )
         if not oil.nu_100 < oil.nu_40:
@@ -300,8 +305,10 @@ class Rig(Part):
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
         """Return the same rig with other piston areas [m^2] from `source`, and with volumes that suit these areas.
 
-        The dead volume of chambers whose volume depends on the position, and the gas of an accumulator, are scaled with
-        the larger area; the gas is at least `GAS_OVER_ROD` times the rod's volume. Scaled values are marked as assumed.
+        If the chambers' volumes depend on the position, they are computed anew, with a dead volume that is scaled with
+        the larger area. The gas of an accumulator, if the rig has one, is scaled likewise, and is at least
+        `GAS_OVER_ROD` times the oil that the rod displaces in a stroke. These values are marked as assumed. All other
+        parameters stay the same.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -358,7 +365,7 @@ class Rig(Part):
 
     @classmethod
     def from_dict(cls, tree: Mapping[str, Any], *, place: str) -> Rig:
-        """Build the rig from the values of `as_dict`, found in `place`; raise InputError for invalid values."""
+        """Build the rig from the values of `as_dict`; raise InputError for invalid values, stating their `place`."""
         table = tree.get("rig")
         name, title = (table.get("name", ""), table.get("title", "")) if isinstance(table, Mapping) else ("", "")
         parts = ((key, item) for key, item in tree.items() if key != "rig")
@@ -368,7 +375,8 @@ class Rig(Part):
     def from_entries(cls, entries: Mapping[str, ParameterEntry], *, name: str, title: str = "", place: str) -> Rig:
         """Build a rig from the entries of its parameters by dotted name; `place`: where they come from, for messages.
 
-        A missing entry gets its `absent` value. Raises InputError if it has none, or for a wrong name or value.
+        A parameter without an entry gets its `absent` value. Raises InputError if it has no such value, or if an entry
+        has an unknown name or a wrong value.
         """
         entries = {**_absent_entries(place), **entries}
         names = declared_names()

@@ -41,7 +41,7 @@ class ServoValve(Part):
 
     @model_validator(mode="after")
     def _check_overlaps(self) -> Self:
-        """Raise ValueError, as pydantic requires, unless every edge opens or closes within the spool's stroke."""
+        """Raise ValueError, as pydantic requires, unless the overlap of each edge is within +- the spool's stroke."""
         for name in ("o_PA", "o_AT", "o_PB", "o_BT"):
             overlap = getattr(self, name)
             if not abs(overlap) < self.x_max:

@@ -14,7 +14,11 @@ from sealscope.units import P_ATM
 
 @law
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of sides A and B at mid-stroke; `c`: object with chamber, rod and hose volumes."""
+    """Compute the oil volumes [m^3] of sides A and B at mid-stroke, each with its hose.
+
+    `c`: object with the chamber volume `V` of either side, the volume `V_rod` of the rod in side B, and the hose
+    volumes `V_hose_A` and `V_hose_B`, all in m^3.
+    """
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 
@@ -24,8 +28,8 @@ def chamber_volumes(
 ) -> tuple[float, float]:
     """Compute the oil volumes of sides A and B [m^3] at piston position x [m] from mid-stroke.
 
-    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else the mid-stroke volumes V_A and V_B (Table 4.1 of
-    the thesis). `A_A`, `A_B`: piston areas [m^2].
+    They are V_A + A_A x and V_B - A_B x if `position_dependent`, else V_A and V_B (Table 4.1 of the thesis). `V_A`,
+    `V_B` [m^3]: volumes at mid-stroke; `A_A`, `A_B` [m^2]: piston areas.
     """
     if position_dependent:
         return V_A + A_A * x, V_B - A_B * x
@@ -91,8 +95,9 @@ def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
 
     The second cylinder, of piston area `A_opp` [m^2], moves at the piston's velocity `v` [m/s]. It is fed at the
     pressure `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)], and its oil is taken as
-    incompressible. Its pressure is p = p_opp + v |v| (A_opp/C_opp)^2, but at least vacuum (Merritt, Hydraulic Control
-    Systems, 1967, section 3.4, orifice).
+    incompressible. Its pressure p [Pa gauge] is p_opp + v |v| (A_opp/C_opp)^2, but at least -P_ATM, vacuum.
+
+    Source: Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice.
     """
     drop_coefficient = A_opp / C_opp
     return A_opp * max(p_opp + v * abs(v) * drop_coefficient * drop_coefficient, -P_ATM)

@@ -62,7 +62,11 @@ def accumulator_compliance(p: float, p_pre: float, V_gas: float, n_acc: float) -
 
 @contracted
 def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
-    """Compute the flow [m^3/s] of a check valve of conductance G_check [m^3/(s Pa)] open above dp = p_crack [Pa]."""
+    """Compute the flow G_check (dp - p_crack) [m^3/s] through a check valve, or 0 while it is shut, dp < p_crack.
+
+    `dp` [Pa]: pressure drop in the direction in which the valve opens; `p_crack` [Pa]: drop at which it opens;
+    `G_check` [m^3/(s Pa)]: conductance of the open valve.
+    """
     return G_check * max(dp - p_crack, 0.0)
 
 
@@ -71,9 +75,10 @@ def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_
     """Compute the opening of a pilot-operated check valve: (dp + k_pilot dp_pilot - p_crack)/p_open, limited to 0..1.
 
     - `dp` [Pa]: pressure drop across the valve in its free direction.
-    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure, which counts only if it is positive.
+    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure; a negative value acts like 0.
     - `k_pilot`: pilot ratio, the piston area of the pilot over the area of the valve's seat.
-    - `p_crack`, `p_open` [Pa]: pressure at which the valve begins to open, and further pressure until it is fully open.
+    - `p_crack` [Pa]: pressure at which the valve begins to open.
+    - `p_open` [Pa]: increase of the pressure from there until the valve is fully open.
 
     Oil flows backwards (dp < 0) while k_pilot dp_pilot > p_crack - dp.
 

@@ -25,13 +25,14 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
 
     K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the modulus `K_oil` [Pa] of the oil without air, the polytropic
     exponent n = `n_air` of the air, and the volume r of air over the volume of oil at this pressure
-    (`air_volume_ratio`). `air`: the same ratio at atmospheric pressure. Air does not dissolve.
+    (`air_volume_ratio`). `air`: the same ratio at atmospheric pressure, 0 for oil without air, whose modulus is K_oil.
+    Air does not dissolve. The absolute pressure p_abs is taken as at least 100 Pa.
 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas). The Simscape library, from which the thesis took its friction law, has the same formula.
     """
     if not any_lane(air > 0.0):
-        return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
+        return K_oil + 0.0 * p  # + 0.0 * p gives the result p's type: a number, or a vector of numbers (lanes)
     p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
     r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))
@@ -51,7 +52,8 @@ def oil_density_ratio(dp: float, K_oil: float) -> float:
 def air_volume_ratio(p: float, air: float, n_air: float) -> float:
     """Compute the volume of free air over the volume of oil at the pressure `p` [Pa gauge].
 
-    It is air (p_atm/p_abs)^(1/n): `air` is the ratio at atmospheric pressure, `n_air` the polytropic exponent n.
+    It is air (p_atm/p_abs)^(1/n): `air` is the ratio at atmospheric pressure, `n_air` the polytropic exponent n. The
+    absolute pressure p_abs is taken as at least 100 Pa.
     """
     return air * math.pow(P_ATM / max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE), 1.0 / n_air)
 

@@ -185,11 +185,11 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 
 
 def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
-    """Make a Python function of `arity` arguments callable in compiled code; the decorated function builds its code.
+    """Make a decorator for the function that builds the LLVM code of calls of the Python function `function`.
 
-    `infer_type(arg_types)` returns the type of the result, or None if the function does not take arguments of these
-    types. The decorated function takes numba's context, LLVM's builder, and types and values of the arguments, and
-    returns the value of the result.
+    It makes `function` callable in compiled code. `arity`: number of its arguments; `infer_type(arg_types)`: returns
+    the type of its result, or None if it does not take arguments of these types. The decorated function takes numba's
+    context, LLVM's builder, and the types and values of the arguments; it returns the value of the result.
     """
 
     @infer_global(function)
@@ -212,7 +212,10 @@ def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` if the condition is true, else `no`, in each lane of a vector; both values are computed."""
+    """Choose `yes` if the condition is true, else `no`, in each lane of a vector or for one number.
+
+    Unlike with `if`, both values have been computed before.
+    """
     return yes if condition else no
 
 
@@ -257,7 +260,10 @@ def _float_constant(value_type: Any, value: float) -> Any:
 
 
 def nearest_integer(x: Any) -> Any:
-    """Round x, |x| < 2^51 (single precision: 2^22), by adding and subtracting a constant too large for fractions."""
+    """Round x to the nearest whole number, for |x| < 2^51 (in single precision |x| < 2^22).
+
+    It adds and subtracts a constant so large that its sum with x has no bits for a fraction.
+    """
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
 

@@ -56,7 +56,10 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 @contracted
 def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose a one-way throttle's flow coefficient by the pressure drop `dp` [Pa] in its forward direction."""
+    """Choose a one-way throttle's flow coefficient: `c_forward` for a pressure drop dp > 0, else `c_reverse`.
+
+    `dp` [Pa]: pressure drop in the throttle's forward direction.
+    """
     return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
 
 
@@ -64,9 +67,10 @@ def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
 def _solve_scaled_flow(b: float, a: float) -> float:
     """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) >= 0 of an orifice, with a >= 0 and b >= 0.
 
-    w r(w) with r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1 is the orifice's pressure difference over dp_0: `orifice_flow`
-    inverted. a w is a pressure difference that grows linearly with the flow, over dp_0; b is the sum of both. The left
-    side rises and is convex, so the root is unique. Halley's method finds it to a relative error of 1e-12.
+    All three terms are pressure differences divided by dp_0. The first is that of the orifice, w r(w) with
+    r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1, which is `orifice_flow` solved for dp. The second, a w, grows linearly with
+    the flow. Their sum is b. The left side rises and is convex, so the root is unique. Halley's method finds it to a
+    relative error of 1e-12.
     """
     w = b / (a + 1.0)  # first guess, with r = 1
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w

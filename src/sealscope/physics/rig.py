@@ -208,7 +208,10 @@ def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
 
 
 def pack_numbers(p: RigNumbers) -> Any:
-    """Pack a rig's numbers into one record, to pass it by its address; return `p` itself if it has tables of a load."""
+    """Pack a rig's numbers `p` into one NumPy record, which compiled code takes by its address.
+
+    If `p` has the tables of a load (`pushed`), which a record of numbers cannot contain, `p` itself is returned.
+    """
     if len(p.pushed) > 1:
         return p
     lengths = tuple(len(getattr(p, name)) for name in LAWS)
@@ -260,7 +263,10 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s], set speed (by the command `u` [V], or a supply's `omega_P`) - speed."""
+    """Compute the motor's speed error [rad/s], the set speed minus the speed in the state `y`.
+
+    The command `u` [V] sets the speed. In a rig with a servo valve the set speed is `omega_P`, that of the supply.
+    """
     if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -277,11 +283,11 @@ def pump_difference(y: State, p: RigNumbers) -> float:
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect, or 0.
+    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
 
-    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law. The friction of a motion along
-    -x is multiplied by the rig's parameter `backward`. `applied` [N]: sum of all other forces on the piston. In `p`, an
-    optional law, such as `sticking` (Karnopp's), is an empty tuple if absent.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law; the rate is 0 unless it has
+    LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied` [N]: sum of
+    all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an empty tuple if absent.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -455,7 +461,11 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and the make-up flow [m^3/s]."""
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and the make-up flow [m^3/s].
+
+    The make-up flow is counted where it leaves the accumulator, < 0 if oil returns. The make-up feeds the pump's ports,
+    or the chambers in a rig without lines. Without lines and servo valve p_1 = p_A and p_2 = p_B.
+    """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
     makeup_1, makeup_2 = make_up_flows(y, p)
@@ -506,7 +516,11 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
 
 @contracted
 def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
-    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by a servo valve and the pump's flow `Q_1` into its supply."""
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by a servo valve and the flows into and out of its supply.
+
+    `Q_1` [m^3/s]: flow of the pump into the supply. The relief valve takes oil from the supply while p_1 - p_2 is above
+    its set pressure. The pressure p_2 of the return is constant.
+    """
     p_A, p_B, p_P, p_T = y[P_A], y[P_B], y[P_1], y[P_2]
     Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
     V_A, V_B = volumes_at(y[POSITION], p)

@@ -24,7 +24,10 @@ BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 @law
 def standstill_force(x: float, p: RigNumbers) -> float:
-    """Compute the load [N] on a piston at rest at x [m] that the pressures must carry, minus an end stop's force."""
+    """Compute the force [N] along +x with which the chamber pressures must hold the piston at rest at x [m].
+
+    It balances the rig's load, the opposing cylinder and, if the piston touches one, the end stop.
+    """
     # at rest, v = 0, the flow coefficient of the opposing cylinder's orifice does not matter: it is set to 1
     load = load_force(x, p.F_l, p.k_load) + opposing_force(0.0, p.A_opp, p.p_opp, 1.0)
     return load - hard_stop_force(x, 0.0, p.L, p.k_stop, p.d_stop)  # type: ignore[no-any-return]
@@ -38,7 +41,7 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted by the oil volumes
     of the two sides, is therefore the charge pressure.
     """
-    if p.made_up:  # each pressure for the case that the other one is the charge pressure
+    if p.made_up:  # each line: this pressure if the other one is the charge pressure, at least the charge pressure
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
@@ -87,7 +90,8 @@ def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
-    `force` [N]: load against +x; `x` [m]: position. dp_1/dt falls with rising p_1: bisection finds its root.
+    `force` [N]: load against +x; `x` [m]: position. At rest dp_1/dt = 0. As dp_1/dt falls with rising p_1, bisection
+    finds this p_1 between the return's pressure and one at which the relief valve takes more than the pump delivers.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
@@ -141,8 +145,8 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
     """Fill the state `y` (14,), all zeros, with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the pressures cannot carry the force, or if
-    the drive cannot hold the supply.
+    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the force would need a chamber pressure that
+    is not between those of return and supply, or if the motor cannot drive the supply's pump.
     """
     m = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)

@@ -30,7 +30,7 @@ def state_of(y: np.ndarray) -> State:
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute y + h dy, element by element, for rates `dy` and a state `y` (or rates `y`, to sum rates)."""
+    """Compute y + h dy, element by element, where `dy` are rates of change, and `y` is a state or also rates."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -51,6 +51,9 @@ def add_step(y: State, h: float, dy: State) -> State:
 
 @contracted
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
-    """Add h s to p_A, p_B, p_1, p_2 of a state `y`, or to their rates in rates `y`; return the whole tuple."""
+    """Add h `s` to the four pressures in the state `y`; return the whole state.
+
+    `s`: rates of p_A, p_B, p_1 and p_2. `y` may also be the rates of a state, of which those of the pressures change.
+    """
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

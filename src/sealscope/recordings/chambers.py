@@ -13,5 +13,5 @@ DISPLAY_UNITS = ("bar", "MPa", "kPa", "psi")
 
 
 def chambers_of(recording: Container[str]) -> tuple[str, ...]:
-    """List the chamber pressures among the channels of a recording, p_A before p_B."""
+    """List the names of the chamber pressures that a recording contains, p_A before p_B."""
     return tuple(name for name in CHAMBERS if name in recording)

@@ -22,7 +22,8 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period of the duty cycle [s], with which the machine's motion repeats; None if nothing repeats.
 
-    The period is estimated from the command if it moves, else from p_A - p_B or the only chamber pressure, and cached.
+    The period is estimated from the command u if this moves, else from p_A - p_B or the only chamber pressure. Also
+    None if the recording has none of these channels. The result is cached with the recording.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
     if not names:
@@ -33,16 +34,17 @@ def find_cycle(recording: Recording) -> float | None:
 
 
 def duty_signal(channels: Sequence[Array]) -> Array:
-    """Compute the signal (n,) in which the duty cycle shows: the only one of `channels` (n,), or p_A - p_B of both."""
+    """Compute the signal (n,) that shows the duty cycle: the only one of `channels` (n,), or p_A - p_B of two."""
     return channels[0] - channels[1] if len(channels) == 2 else channels[0]
 
 
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    It is the lag of a maximum of the autocorrelation, refined by a parabola. Of the maxima after the first negative
-    value, it is the first that is nearly as high as the highest. It must reach 0.6 of the value at lag 0, and the
-    period must be between 0.2 s and 20 s and at most a fifth of the signal.
+    A fast signal is first averaged to 50 Hz or a little more. The period is the lag of a peak of the autocorrelation,
+    refined by a parabola. Peaks are searched for after the first negative value, and must reach 0.6 of the value at lag
+    0. The first one that is at most 0.05 lower than the highest is taken. The period must be between 0.2 s and 20 s,
+    and at most a fifth of the signal's duration. Also None for fewer than 32 averaged samples and for missing samples.
     """
     stride = max(1, int(rate / _CYCLE.rate))  # samples averaged to one, to save time
     n = signal.size // stride
@@ -77,8 +79,8 @@ def fundamental_frequency(signal: Array, t: Array, period: float) -> float:
     """Estimate the fundamental frequency [Hz] of a periodic signal (n,) from the slope of its phase over time.
 
     The signal, without its mean, is multiplied by exp(-2 pi i t/period) and averaged over each period. The phase of
-    these averages drifts by 2 pi times the difference of the frequency from 1/period. `t` (n,): times [s] in even
-    steps; the signal must cover two or more of the approximate `period` [s].
+    these averages changes at the rate 2 pi (f - 1/period), with the fundamental frequency f. `t` (n,): evenly spaced
+    times [s]; `period` [s]: the approximate period, of which the signal must contain two or more.
     """
     n_period = max(1, round(period / (t[1] - t[0])))
     n_periods = t.size // n_period

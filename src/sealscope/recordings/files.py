@@ -47,7 +47,11 @@ _MAX_NESTING = 3
 
 
 def _detect_format(path: Path) -> str:
-    """Detect the format in `formats.toml`, such as "zip", from a file's content; raise UnreadableFile without one."""
+    """Detect the format of a file, or the kind of an archive such as "zip", from its content.
+
+    The names are those in `formats.toml`. A file in no known format is taken for "text". Raises UnreadableFile if the
+    file is missing, empty or not readable, or has a format that is recognised but not read.
+    """
     try:
         with open_regular(path, "a recording") as file:
             head = file.read(SNIFF)
@@ -211,7 +215,10 @@ def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recordin
 
 @contextmanager
 def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
-    """Yield the path and format of a file, or of the file unpacked from it if it is an archive; errors name both."""
+    """Yield path and format of a file, or of the file unpacked from it if it is an archive; errors name both files.
+
+    An archive may contain another one, up to `_MAX_NESTING` in all. The unpacked files are removed at the end.
+    """
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
         max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0
@@ -221,7 +228,7 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
                     inner = folders.enter_context(unpack(inner, kind, max_bytes))
                     kind = _detect_format(inner)
             if kind in _ARCHIVES:
-                raise UnreadableFile(f"at most {_MAX_NESTING} archives may lie in each other, got more ({inner})")
+                raise UnreadableFile(f"archives must be nested at most {_MAX_NESTING} deep, got more ({inner})")
             yield inner, kind
         except UnreadableFile as error:
             if inner == file:

@@ -28,8 +28,9 @@ def to_pandas(
 ) -> pandas.DataFrame:
     """Make a data frame of a recording's samples, with the index `t [s]` and columns such as `p_A [Pa]`.
 
-    `values`, `units`, `description`: as from `Recording.series`. The `attrs` of the frame contain the units by column,
-    the rate, the provenance and the history. Raises MissingExtra without pandas.
+    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
+    history. The `attrs` of the frame contain the units by column, the rate, the provenance and the history. Raises
+    MissingExtra without pandas.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
@@ -43,7 +44,8 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
     """Read the requested columns of a data frame to the fields of a recording.
 
     An index with a name is also read as a column. An index of dates, time differences or floating-point numbers may
-    lack a name, and is then called `t`.
+    lack a name, and is then called `t`. The unit of a column is in the `attrs` of the frame or of the column, or else
+    in its name. Raises InputError if `frame` is not a data frame.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     if not isinstance(frame, pandas.DataFrame):
@@ -70,7 +72,11 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
 
 
 def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
-    """Convert a pandas series, with `dtypes` = pandas.api.types, to datetime64, timedelta64, doubles or texts (n,)."""
+    """Convert a pandas series, with `dtypes` = pandas.api.types, to datetime64, timedelta64, doubles or texts (n,).
+
+    Dates with a time zone are converted to UTC, and missing texts become empty. Raises InputError, which calls the
+    series `name`, for other types such as complex numbers.
+    """
     if dtypes.is_datetime64_any_dtype(series.dtype):
         if getattr(series.dtype, "tz", None) is not None:
             series = series.dt.tz_convert("UTC").dt.tz_localize(None)
@@ -88,7 +94,8 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
     """Make a data set of a recording's samples: variables over the coordinate `t`, with attributes as in NetCDF files.
 
-    `values`, `units`, `description`: as from `Recording.series`. Raises MissingExtra without xarray.
+    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
+    history. Raises MissingExtra without xarray.
     """
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {

@@ -18,10 +18,15 @@ _COPY_TOLERANCE = 1e-6
 def find_implausibility(recording: Recording) -> str | None:
     """Find a reason, in words, why the channels cannot come from one hydraulic machine; None if there is none.
 
-    They cannot if p_B is a copy of p_A, if the motor speed differs from the rate of the motor angle by a constant
-    factor, if p_A - p_B (or the only chamber pressure that varies) is nothing but noise, or if pressures in Pa stay
-    below `readings.pressure` of `priors.toml`, as those of another unit would. Raw counts may have any offset and
-    range. Constant and absent channels are ignored, as a chamber may rest at charge pressure.
+    There are four such reasons:
+
+    - p_B is a copy of p_A.
+    - The motor speed differs from the rate of the motor angle by a large constant factor.
+    - Pressures in Pa stay below `readings.pressure` of `priors.toml`, as those in another unit would.
+    - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
+
+    Constant and absent channels are ignored, as a chamber may rest at charge pressure. Raw counts may have any offset
+    and range.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -42,10 +47,11 @@ def find_implausibility(recording: Recording) -> str | None:
 
 
 def _describe_speed_mismatch(recording: Recording) -> str | None:
-    """Describe a motor speed that is a constant factor off the rate of the motor angle, as a wrong unit would cause.
+    """Describe the factor between the motor speed and the rate of the motor angle if a unit seems to be wrong.
 
-    Returns None if the least-squares factor is between 1 / m and m, with m = `readings.misfit` of `priors.toml`, if the
-    two do not correlate or are in raw counts, or if samples are missing.
+    Both are averaged to `readings.rate` of `priors.toml`. Returns None if the least-squares factor is between 1 / m and
+    m, with m = `readings.misfit`. Also None if the two hardly correlate, if either is absent or in raw counts, or if
+    samples are missing or fewer than `readings.samples`.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None
@@ -66,17 +72,18 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 def _is_noise(values: Array, is_zero_known: bool) -> bool:
     """Test whether a signal (n,) is mostly white noise, or has missing samples.
 
-    White noise must have more than the fraction `readings.noise` (`priors.toml`) of the signal's variance, or of its
-    mean square with `is_zero_known`: zero then means no load, so that a constant load is a signal. The mean square of
-    the third difference of white noise is 20 times its variance.
+    The noise variance is estimated as a twentieth of the mean square of the third difference. The signal is noise if
+    this variance exceeds the fraction `readings.noise` (`priors.toml`) of the signal's variance. With `is_zero_known`,
+    zero means no load, and the signal's mean square is taken instead of its variance, so that a constant load is a
+    signal.
     """
     power = np.mean(values**2) if is_zero_known else np.var(values)
-    # `not <=`, so that missing samples count as noise
+    # the third difference of white noise has 20 times its variance; `not <=`: missing samples count as noise
     return not np.mean(np.diff(values, 3) ** 2) <= 20.0 * _PRIORS.noise * power
 
 
 def describe_missing_chambers(recording: Recording) -> str | None:
-    """Report that a recording has no chamber pressure, and name its file's unused columns; None if it has one."""
+    """Describe the lack of a chamber pressure, with the file's unused columns; None if there is a chamber pressure."""
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]

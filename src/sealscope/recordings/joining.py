@@ -45,7 +45,8 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 def file_seconds(recording: Recording, path: Path) -> float:
     """Find the time of a file's first sample [s since 1970].
 
-    If it is not stated, it is estimated as the time of the file's last change minus the duration of the recording.
+    If neither the recording nor the file's name states it (`start_seconds`), it is estimated as the time of the file's
+    last change minus the duration of the recording.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -106,7 +107,8 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     Returns
     -------
     Recording
-        Time and provenance are those of the first, with the names of all files.
+        Its provenance and its origin of time are those of the earliest recording; the entry `files` of the provenance
+        lists the names of all.
 
     Raises
     ------
@@ -138,7 +140,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     for earlier, later in pairwise(order):
         begin, end = float(np.nanmin(times[later])), float(np.nanmax(times[earlier]))
         if begin <= end:
-            clock = "the start times in the files" if is_dated else "their columns of time"
+            clock = "the start times in the files" if is_dated else "their time columns"
             raise InputError(
                 f"recordings to join must not overlap in time, got {end:g} s at the end of {names[earlier]} and "
                 f"{begin:g} s at the beginning of {names[later]}, according to {clock}"

@@ -52,8 +52,10 @@ class Holds(NamedTuple):
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than 1.5 s and 64 samples. Its first sample is a reading and not
-    flagged, unless the run continues an earlier hold of the value `before`.
+    A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; `rate`: sampling rate [Hz]. The
+    first sample of a hold is a reading and not flagged. `before`: value of a hold just before these samples, NaN if
+    there is none. If the first run has this value, it continues that hold: all its samples are flagged, even if it is
+    short.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -72,7 +74,8 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
-    It repeats one value for too long (`find_holds`), or follows a straight line. No sample may be missing.
+    Such a pressure repeats one value for too long (`find_holds`), or follows a straight line throughout. A pressure
+    that is constant throughout, or has at most 64 samples, is skipped. No sample may be missing.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -84,7 +87,7 @@ def describe_hold(recording: Recording) -> str | None:
             start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))
             return f"{name} does not move from {start:.4g} s to {stop:.4g} s"
         if np.abs(np.diff(values, 2)).max() <= ROUNDING * np.abs(values).max():
-            return f"{name} does not move but along a straight line, as if its samples were interpolated"
+            return f"{name} moves along a straight line only, as if its samples were interpolated"
     return None
 
 
@@ -102,17 +105,23 @@ def smallest_step(values: Array) -> float:
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values."""
+    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
+
+    The result is 0 for a constant channel. Of a long channel, only about `_QUANTUM_SAMPLES` evenly spaced samples are
+    compared.
+    """
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
 def find_stuck(values: Array) -> NDArray[np.intp]:
     """Find runs of equal values that are too long for the signal around them: first index and length of each (k, 2).
 
-    Let p be the larger fraction of samples that equal the previous one among the 100 samples before or after a run. A
-    run of length m then begins at a given sample with the probability p^(m-1). It is too long if fewer than 1e-6 such
-    runs are expected in `values` (n,), and if the value jumps by more than 3.5 quantisation steps at an end; a slow
-    quantised signal turns in single steps. Runs of fewer than 5 samples, and near the ends, are not found.
+    Let p be the fraction of samples that equal the previous one, among the 100 samples before or the 100 after the run,
+    whichever is larger. By chance, a run of m equal samples begins at a given sample with the probability p^(m-1). A
+    run is too long if fewer than 1e-6 such runs are expected in `values` (n,), and if the value jumps by more than 3.5
+    quantisation steps at one of its ends. The jump excludes a slow quantised signal, which changes in single steps.
+    Runs of fewer than 5 samples, runs within 20 samples of an end of the channel, and runs in a channel of fewer than
+    200 samples are not found.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
@@ -130,7 +139,10 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of samples from `begin` to `end` (k,) that equal the one before; never 0 or 1."""
+        """Estimate the fraction of samples that equal the previous one in each range `begin` to `end` (k,).
+
+        The rule of succession is used, so that the result is never 0 or 1.
+        """
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

@@ -8,13 +8,16 @@ from sealscope.recordings.recording import Recording
 
 
 def oil_temperature(recording: Recording) -> float | None:
-    """Find the oil temperature [deg C]: the mean of a measured one, else that in the file's header; None if unknown."""
+    """Find the oil temperature [deg C], the mean of T_oil or else the value in the file's header; None if unknown."""
     measured = measured_oil_temperature(recording)
     return stated_oil_temperature(recording.provenance) if measured is None else measured
 
 
 def measured_oil_temperature(recording: Recording) -> float | None:
-    """Compute the mean [deg C] of the plausible readings (`oil` in `priors.toml`) of T_oil; None if there are none."""
+    """Compute the mean [deg C] of the plausible readings of the channel T_oil; None if there are none.
+
+    Plausible readings are within the range `oil` of `priors.toml`. A channel in raw counts has none.
+    """
     if "T_oil" not in recording or recording.units["T_oil"] != "K":
         return None
     limits, kelvin = RECORDINGS.oil, recording["T_oil"]

@@ -89,7 +89,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 def _make_finding(
     recording: Recording, code: str, channel: str | None, count: int, first: int, text: str, severity: Severity
 ) -> Finding:
-    """Make a finding on `count` samples, the first at index `first`, which may have no time."""
+    """Make a finding on `count` samples; its time is that of the sample `first`, None if this has no time."""
     t = float(recording.t[first]) if first < recording.t.size else np.nan
     return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
 
@@ -108,17 +108,17 @@ def _time_findings(recording: Recording) -> list[Finding]:
     reversed_steps, equal_steps = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0)
     positive_steps = steps[steps > 0]
     add("missing_time", untimed, f"{format_count(untimed.size, 'sample')} without a time")
-    longest = float(-steps[reversed_steps].min(initial=0.0))
-    text = f"time goes back {_format_repetitions(reversed_steps.size)}, by up to {longest:g} s"
+    largest_step_back = float(-steps[reversed_steps].min(initial=0.0))
+    text = f"time goes back {_format_repetitions(reversed_steps.size)}, by up to {largest_step_back:g} s"
     add("reversed_time", timed[reversed_steps + 1], text)
     text = f"{format_count(equal_steps.size, 'time stamp')} equal to the one before"
     add("duplicated_time", timed[equal_steps + 1], text)
     if positive_steps.size:
         median_step = float(np.median(positive_steps))
-        # coarse stamps repeat, and then step by two sampling steps
+        # stamps of a coarse clock repeat, and their positive steps are about two sampling steps long
         is_coarse = equal_steps.size and median_step < 2.5 * step
         if abs(median_step / step - 1.0) > _CLOCK.rate and not is_coarse:
-            text = f"time stamps tell {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
+            text = f"time stamps show {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
             add("rate_mismatch", timed[:1], text, "fatal")
             step = median_step
         gaps = np.flatnonzero(steps > _MAX_STEP * step)
@@ -146,7 +146,9 @@ def _format_repetitions(count: int) -> str:
 def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of (p_A + p_B)/2 over a whole recording, which a sealed circuit does not show.
 
-    Its steps between equal parts of the recording must be alike, and the drift fast enough (`creep` in `priors.toml`).
+    The recording is divided into equal parts. The steps of the mean from part to part must be alike, and the drift fast
+    enough (`creep` in `priors.toml`). Returns one finding or none; also none if the recording is short, or p_A or p_B
+    is absent or not in Pa.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -213,7 +215,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     if stuck.size and not may_rest:
         start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
-        text = f"does not move {times} while it should, first for {length / recording.rate:g} s"
+        text = f"is stuck {times} while it should move, first for {length / recording.rate:g} s"
         add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
     # the spectrum of a channel with many missing samples would be wrong
     for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
@@ -226,7 +228,11 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 
 
 def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] | None:
-    """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none."""
+    """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none.
+
+    The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing". `rate`: sampling rate
+    [Hz].
+    """
     is_missing = np.isnan(values)
     if not is_missing.any():
         return None
@@ -249,7 +255,10 @@ def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
-    """Find k >= 2 if a channel has a value on every k-th row only, else 0; `present`: indices of rows with values."""
+    """Find the period k >= 2 [rows] of a channel that has a value on every k-th row only; 0 for any other channel.
+
+    `present` (m,): indices of the rows with a value. The distance from value to value must be k in over 95 % of cases.
+    """
     steps = np.diff(present)
     period = int(np.median(steps)) if present.size >= 3 else 0
     is_regular = period >= 2 and np.mean(steps == period) > 0.95  # some values may be missing
@@ -265,8 +274,8 @@ def _format_ordinal(number: int) -> str:
 def uniform_segments(recording: Recording, channels: Sequence[str] | None = None) -> list[slice]:
     """Split a recording into stretches with even sampling and no missing values; return them as slices.
 
-    `channels` must be complete, by default all but the slow ones. Each interval lasts between half and one and a half
-    sampling steps. Raises InputError for a channel that the recording lacks.
+    In a stretch, each interval lasts between half and one and a half sampling steps, and each of the `channels`, by
+    default all but the slow ones, has a value in every row. Raises InputError for a channel that the recording lacks.
     """
     n = len(recording)
     names = [name for name in recording.channels if name not in SLOW] if channels is None else channels
@@ -305,9 +314,12 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     With `low_end` False only the high end is examined. An end is clipped in two cases:
 
     - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
-      run of them (3 samples or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a long run. This
-      excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly as frequent.
+      run of samples with this value (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a long run.
+      This excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly as
+      frequent.
     - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
+
+    A channel with fewer than three different values has no clipped end.
     """
     if not values.size:
         return []
@@ -343,12 +355,12 @@ def fast_length(count: int) -> int:
     The result equals `scipy.fft.next_fast_len(count, real=True)`, but scipy.fft is not loaded.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
-    # times the smallest power of two >= count / factor; higher powers of 3 and 5 exceed any count
+    # each odd factor times the smallest power of two that makes the product >= count; 3**40 and 5**28 exceed any count
     return min((factor << max(0, (-(-count // factor) - 1).bit_length()) for factor in odd_factors), default=count)
 
 
 class HumLine(NamedTuple):
-    """Spectral line of the mains: frequency [Hz], amplitude, and its fraction of the channel's power above 20 Hz."""
+    """Spectral line of the mains: frequency [Hz], amplitude in the channel's unit, share of the power over 20 Hz."""
 
     frequency: float
     amplitude: float
@@ -358,8 +370,9 @@ class HumLine(NamedTuple):
 def find_hum(values: Array, rate: float) -> list[HumLine]:
     """Find spectral lines of the mains, at 50 or 60 Hz, in values (n,) sampled at `rate` [Hz] for 1.5 s or more.
 
-    The spectrum X is that of the detrended values times a Hann window w, and the amplitude of a line is 2 |X| / sum(w).
-    It must exceed 10 times the median and 4 times the largest of the amplitudes within 5 Hz of it.
+    X is the spectrum of the detrended values times a Hann window w; the amplitude at a frequency is 2 |X| / sum(w). The
+    amplitude of a line must exceed 10 times the median and 4 times the largest of the amplitudes around it, i.e. within
+    5 Hz but outside its own peak. A line is only searched for if half the sampling rate is more than 5 Hz above it.
     """
     n = values.size
     if n / rate < _HUM.shortest:

@@ -213,9 +213,10 @@ class Recording:
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
     def format_value(self, name: str, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value of a channel, given in SI, in the unit of the log, with `digits` significant digits.
+        """Format a value of a channel, given in its SI unit, in the unit of the log, with `digits` significant digits.
 
-        `is_span`: the value is a difference of two values, to which the offset of a unit does not apply.
+        Without a unit of the log (`unit_in_log`), the SI unit is kept. `is_span`: the value is a difference of two
+        values, to which the offset of a unit does not apply.
         """
         unit = self.units[name]
         display_unit = self.unit_in_log(name) or unit
@@ -226,7 +227,10 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are displayed, the unit of the log or else bar."""
+        """Unit in which pressures are displayed, such as bar.
+
+        It is the first unit of a logged pressure that is in `DISPLAY_UNITS`, by default bar.
+        """
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 
@@ -253,7 +257,8 @@ class Recording:
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
         """Return the content for writers of files: (name -> samples, name -> unit, description).
 
-        The time is `t`; the description has rate, provenance and history. Raises InputError if JSON lacks their types.
+        The time is called `t`. The description has rate, provenance and history. Raises InputError if the provenance
+        has values that JSON does not have.
         """
         from sealscope.recordings.formats.table import make_description
 
@@ -373,7 +378,7 @@ def compute_once(
     """Return `compute(recording)`, which is computed once for each `key` and then cached with the recording.
 
     `channels`: the channels on which the result depends, by default all. Copies of the recording with fewer channels
-    (`Recording.only`) share the result if they have these.
+    (`Recording.only`) share the result if they have these channels. Other threads that need the result wait for it.
     """
     all_channels = frozenset(recording.channels)
     names = all_channels if channels is None else all_channels.intersection(channels)

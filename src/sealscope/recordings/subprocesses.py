@@ -79,7 +79,7 @@ class _Process:
         """
         process = self._process
         assert process.stdin is not None and process.stdout is not None
-        # kills the process 1 s after the alarm of `_set_limits` should have done; a fresh one also needs time to start
+        # kills the process if the alarm of `_set_limits` is over 1 s late; a fresh process also needs time to start
         killer = Timer(limit + 1.0 + _MAX_START_TIME * self._is_fresh, process.kill)
         killer.daemon = True
         killer.start()
@@ -91,7 +91,7 @@ class _Process:
         except (EOFError, OSError, pickle.UnpicklingError):
             # a process that a signal has ended returns minus the number of the signal
             timed_out = not killer.is_alive() or process.wait() == -getattr(signal, "SIGALRM", 0)
-            failure = f"took over {limit:g} s" if timed_out else "crashed"
+            failure = f"took more than {limit:g} s" if timed_out else "crashed"
             raise CrashedSubprocessError(f"the library that reads it {failure}") from None
         finally:
             killer.cancel()
@@ -146,7 +146,11 @@ def run_in_subprocess(
 
 
 def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: Any) -> T:
-    """Run ``work(file, *arguments)`` by `run_in_subprocess`, with the path of the file as given in error messages."""
+    """Run ``work(file, *arguments)`` in a subprocess by `run_in_subprocess`, whose keyword arguments are `limits`.
+
+    The work gets the absolute path, as the subprocess may run in another folder. If it raises UnreadableFile, the
+    message names the path as it was given.
+    """
     place = file.absolute()  # the process may work in another folder
     try:
         return run_in_subprocess(work, place, *arguments, **limits)
@@ -155,9 +159,10 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 
 
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
-    """Limit the time [s], the `memory` [bytes] and the size of written files, `disk` [bytes], of this process.
+    """Limit this process to `seconds` [s], `memory` [bytes] and written files of up to `disk` [bytes] each.
 
-    The system's timer ends the process even if its parent is dead; 0 s is no limit. Only Unix has these limits.
+    The system's timer ends the process even if its parent is dead; 0 s is no limit. The memory is also limited to
+    `MAX_MEMORY` and half the machine's. Only Unix has these limits.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)
@@ -183,6 +188,7 @@ def _is_spent() -> bool:
 
 def _serve() -> None:
     """Run requests from standard input, one after the other, and answer to standard output until the input ends."""
+    # answers go to a copy of standard output, which then discards the output of libraries
     responses = os.fdopen(os.dup(1), "wb")
     discard = os.open(os.devnull, os.O_WRONLY)
     os.dup2(discard, 1)
@@ -197,7 +203,7 @@ def _serve() -> None:
             del work, arguments, value
             pickle.dump(_is_spent(), responses)
             responses.flush()
-    with suppress(OSError):  # if the program was killed, nobody else removes it
+    with suppress(OSError):  # nobody else removes the temporary folder if the program was killed
         Path(tempfile.gettempdir()).rmdir()
 
 

@@ -81,7 +81,10 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """Text of the repair limit in the chart's legend, with a remark if the limit lies above the frame."""
+        """Text of the repair limit in the chart's legend, with a remark if the limit lies above the frame.
+
+        The chart must have a limit (`level`).
+        """
         is_above = self.level is not None and self.limits is not None and self.level > self.limits[1]
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if is_above else "")
 
@@ -95,7 +98,8 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    Pressures are in `pressure_unit`, raw counts in counts, others in the log's unit, else degC, mm, rpm, L/min or SI.
+    Pressures are shown in `pressure_unit`, and raw counts as they are. Other channels are shown in the unit of the log
+    or, if it has none, in degC, mm, rpm, L/min or the SI unit.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -109,7 +113,8 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
 def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
     """Choose the unit in which values in the SI unit `unit` are displayed; return this unit and its size in SI.
 
-    `detail`: True for a wavelet detail, whose unit may be smaller. Raises InputError for an unknown `pressure_unit`.
+    `pressure_unit`: display unit of pressures; `detail`: True for a wavelet detail, whose unit may be smaller. Raises
+    InputError for an unknown `pressure_unit`.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
@@ -123,7 +128,8 @@ def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tupl
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
     """Choose the display unit of the wavelet detail `name`, such as "d3"; return this unit and its size in SI units.
 
-    For the product d3d4 both are squared. `unit`: SI unit of the channel; `pressure_unit`: the page's unit of pressure.
+    For the product d3d4, unit and size are squared. `unit`: SI unit of the channel; `pressure_unit`: the page's unit of
+    pressure.
     """
     display, scale = display_unit(unit, pressure_unit, detail=True)
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
@@ -164,7 +170,10 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build the charts of the windowed RMS of wavelet details: d1 to d4 of each chamber, then d3d4 (d3 times d4)."""
+    """Build the charts of the windowed RMS of wavelet details: d1 to d4 of each chamber, then d3d4 (d3 times d4).
+
+    A chamber without RMS windows has no chart. `pressure_unit`: the page's unit of pressure.
+    """
     charts = []
     for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
@@ -228,7 +237,10 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber, ordered by detail; `pressure_unit`: the page's unit."""
+    """Build a chart for each wavelet detail of each chamber, ordered by detail.
+
+    `pressure_unit`: the page's unit of pressure.
+    """
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -269,12 +281,11 @@ def draw(
     """Encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
     Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved; around the onset, or else around the middle of the recording, all samples are drawn.
-    `chambers`: wavelet details with the times of their RMS windows; `marks`: moments to mark besides the onset.
+    peaks are preserved. Around the onset, or around the middle of the recording if there is no onset, all samples are
+    drawn. `chambers`: wavelet details with the times of their RMS windows; `marks`: moments to mark besides the onset.
     """
     middle = float(recording.t[len(recording) // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
-    # all samples around the onset, or around the middle of the recording if there is no onset, are drawn
     base = choose_drawn_times(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     still_base = choose_drawn_times(recording.t, recording.rate, STILL_POINTS)
     span = (float(base.t[0]), float(base.t[-1]))
@@ -317,7 +328,10 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its interval cut off at the ends of `span` [s], with None for unknown."""
+    """Return the onset of the leak [s], and its interval [s] with both ends limited to `span` [s].
+
+    Either is None if it is not known.
+    """
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None

@@ -52,8 +52,9 @@ class DetailChange(NamedTuple):
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
     """Compute the wavelet details of `channel`, a chamber's pressure; return them with a note on omitted samples.
 
-    Only parts of the recording that are long enough and without a defect are transformed. If there are none, or the
-    transform fails, the details are None, and the note is the reason. It is "" if nothing is missing.
+    Only parts of the recording that are long enough and without a defect are transformed. The details are None if there
+    is no such part, the channel is missing, or the transform fails. The note then states the reason. It is "" if no
+    samples are omitted.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
@@ -64,7 +65,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
     usable_parts = [part for part in parts if part.stop - part.start >= n_needed]
     if not usable_parts:
         n_longest = max((part.stop - part.start for part in parts), default=0)
-        need = f"they need {n_needed} samples without a fault, the most there are is {n_longest}"
+        need = f"they need {n_needed} samples without a fault, the longest stretch has {n_longest}"
         return None, f"No details of {channel}: {need}."
     values = {name: np.full(n, np.nan) for name in QUANTITIES}
     windows: list[tuple[Array, Array]] = []  # centres (w,), RMS (details, w) of each part
@@ -88,7 +89,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
     n_left_out = n - sum(part.stop - part.start for part in usable_parts)
     if n_left_out:
         parts_text = f"{len(usable_parts)} stretch{'es' if len(usable_parts) > 1 else ''} without a fault"
-        notes.append(f"{channel}: the details are of {parts_text}; {n_left_out} of {n} samples are left out.")
+        notes.append(f"{channel}: the details cover {parts_text}; {n_left_out} of {n} samples are left out.")
     if not windows:
         notes.append(f"{channel} has no stretch long enough for an RMS window of {WINDOW_SIZE} samples.")
         windows.append((np.empty(0), np.empty((len(QUANTITIES), 0))))
@@ -113,26 +114,29 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Choose two parts of a recording to compare: before and after the onset's interval, or halves without an onset.
 
     If the halves are too short for `HALF_WINDOWS` RMS windows each, the first part is the whole recording and the
-    second is empty: a difference would reflect the motion of the piston and not the seal.
+    second is empty. A difference between short halves would reflect the motion of the piston and not the seal.
     """
     t, _ = ordered_time(recording.t, recording.rate)
     if diagnosis.onset_s is not None:
         low, high = diagnosis.onset_interval_s or (diagnosis.onset_s, diagnosis.onset_s)
         text = f"Before and after the onset at {low:.1f} s."
         if low < high:
-            text = f"Before {low:.1f} s and after {high:.1f} s; what lies in the onset's interval is left out."
+            text = f"Before {low:.1f} s and after {high:.1f} s; the onset's interval is left out."
         return Parts(low, high, ("Before", "After"), text)
     if len(recording) < 2 * (WINDOW_SIZE + (HALF_WINDOWS - 1) * WINDOW_STEP):
-        text = "No onset was found, and the recording is too short to be parted."
+        text = "No onset was found, and the recording is too short to be divided."
         # the first part ends at infinity, so that it has all samples
         return Parts(end=np.inf, start=np.inf, heads=("Whole", "Later"), text=text)
     middle = float(t[0] + t[-1]) / 2
-    text = f"No onset was found: the first half is set against the second, parted at {middle:.1f} s."
+    text = f"No onset was found: the first half, until {middle:.1f} s, is compared with the second."
     return Parts(middle, middle, ("First half", "Second half"), text)
 
 
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
-    """Compute the RMS of each wavelet detail in two parts of the recording, None for a part without finite values."""
+    """Compute the RMS of each wavelet detail of `chambers` in two parts of the recording.
+
+    It is None for a part without finite values.
+    """
     t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())

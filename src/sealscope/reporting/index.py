@@ -16,7 +16,11 @@ _ORDER = ("leak", "cannot tell", "no leak")
 
 
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
-    """Compute a key that sorts diagnoses by verdict, leak over limit, flow (0: unknown) and file, most severe first."""
+    """Compute a key that sorts diagnoses by severity, the most severe first.
+
+    The order is by verdict ("leak", "cannot tell", "no leak"), then by the leak over the repair limit and by the flow
+    [L/min], the largest first and 0 if unknown, and last by the file's name.
+    """
     severity = diagnosis.severity
     # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval
     limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
@@ -26,7 +30,10 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index page of a folder, with a row for each of its `pages` and their diagnoses; return its path."""
+    """Write the index page of a folder, with a row for each page, the most severe first; return the path.
+
+    `pages`: pairs of the path of a page and the diagnosis that it shows.
+    """
     ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

@@ -54,7 +54,10 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """Format a time in seconds: from 10 s on with one decimal, from an hour on also as h:mm:ss; a dash if unknown."""
+    """Format a time in seconds, such as "3.25 s", "75.5 s" or "3725.0 s (1:02:05)"; a dash if it is not known.
+
+    Three significant digits are written below 10 s, and one decimal from then on. From an hour on, h:mm:ss is added.
+    """
     if seconds is None or not isfinite(seconds):
         return ABSENT
     text = f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s"
@@ -65,7 +68,11 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a heading: the text of `messages.toml` for the verdict or its cause, else the summary."""
+    """Format the verdict as a heading, by the text that `messages.toml` has for it or for the cause of the leak.
+
+    For "no leak" the heading is "No leak began within this recording" unless the machine is known to be healthy,
+    because a leak from the start cannot be excluded. Without a text, the heading is the summary with a capital letter.
+    """
     texts = _texts()["headline"]
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause in texts:
@@ -76,7 +83,10 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the named cause of the change in a recording, or None; a leak is named only with the verdict "leak"."""
+    """Return the named cause of the change in a recording, or None if no cause is named.
+
+    A leak past piston or pump (`LEAKS`) is named only with the verdict "leak".
+    """
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
     return diagnosis.cause
@@ -88,13 +98,17 @@ def shows_reason(diagnosis: Diagnosis) -> bool:
 
 
 def state_text(machine_state: MachineState) -> str:
-    """Format a machine's state by NAMUR NE 107 with its symbol and severity."""
+    """Format a machine's state by NAMUR NE 107: its name, its symbol and, if it is not 0, its severity."""
     severity = f", severity {machine_state.severity} of 1000" if machine_state.severity else ""
     return f"{machine_state.name} ({machine_state.symbol} of NE 107{severity})"
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the onset of the leak with its interval, or a remark if unknown; None if the verdict is not "leak"."""
+    """Format the onset of the leak with its interval; None if the verdict is not "leak".
+
+    If no onset is stated, the text says that the leakage rises within the recording, or that it was there from the
+    start.
+    """
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -108,7 +122,8 @@ def since(diagnosis: Diagnosis) -> str | None:
 def how_much(diagnosis: Diagnosis) -> str | None:
     """Format the leak flow [L/min] with its interval, or the reason why no flow is stated.
 
-    For verdicts other than "leak", the text is the upper bound of a leak, or None if it is not known.
+    If the leak is known as a fraction of the pump's flow, this fraction precedes the reason. For verdicts other than
+    "leak", the text is the upper bound of a leak, or None if it is not known.
     """
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
@@ -127,7 +142,7 @@ def how_much(diagnosis: Diagnosis) -> str | None:
 
 
 def _pump_fraction(diagnosis: Diagnosis) -> str | None:
-    """Format the leak as a fraction of the pump's flow; return None if the fraction is not known."""
+    """Format the leak as a fraction, such as "5 % of the pump's flow in this duty"; None if it is not known."""
     severity = diagnosis.severity
     if severity is None or severity.pump_share is None:
         return None
@@ -153,7 +168,10 @@ def flow_basis(diagnosis: Diagnosis) -> str | None:
 
 
 def machine_text(machine: AssumedMachine) -> str:
-    """Format the piston area and pump displacement on which flows [L/min] are based, and the origin of both."""
+    """Format the piston area and pump displacement on which flows [L/min] are based, and the origin of both.
+
+    If a flow meter measures the pump's flow, the text names only this meter.
+    """
     if machine.flow_meter:
         key = "meter"
     elif machine.stated_by == "recording":
@@ -169,10 +187,10 @@ def machine_text(machine: AssumedMachine) -> str:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the severity of the leak as a percentage or multiple of the repair limit, or None if it is not known.
+    """Format the severity of the leak as a percentage of the repair limit, or as a multiple from 10 times the limit on.
 
-    If the ratio to a stated limit is not known, the text asks for the piston area; without a stated limit, it gives the
-    leak as a fraction of the pump's flow.
+    If this ratio is not known although a limit was stated, the text asks for the piston area. If no limit was stated,
+    the text is the leak as a fraction of the pump's flow. Returns None if there is no leak or its size is not known.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -193,7 +211,10 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep of the piston, or None if unknown."""
+    """Format the leak in mL/min, as a fraction of the pump's flow, and as an equal creep speed of the piston.
+
+    Unknown figures are left out. Returns None if all are unknown.
+    """
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -208,9 +229,10 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 
 
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
-    """Format the total leakage past pump and piston, and its smallest change that could be detected; None if unknown.
+    """Format the total leakage past pump and piston, with its smallest change that could have been detected.
 
-    `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak".
+    It is stated in L/min or, if this is not known, as a fraction of the pump's flow. Returns None if no detector
+    measured it. `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak".
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -232,7 +254,11 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage at a `pressure` as a fraction of the pump's flow, with the smallest detectable change."""
+    """Format a total leakage as a fraction of the pump's flow, with its smallest detectable change.
+
+    `pressure`: the pressure difference at which the leakage was measured, as text. An unknown fraction is written "not
+    measured".
+    """
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -271,7 +297,7 @@ def how_sure(diagnosis: Diagnosis) -> str:
     """Format the evidence: odds that a healthy recording looks like this one, score, threshold, false-alarm rate.
 
     For example "1 in 2000; score 5.1, over the threshold of 3.2 of volume balance; ...". If an alarm has another cause
-    than a leak, the text names the cause to which odds and score refer.
+    than a leak, the text names the cause to which odds and score refer. Without a score, the text says only this.
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
@@ -295,7 +321,10 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the false-alarm probability of all tests together as a percentage and as "1 in n"."""
+    """Format the false-alarm probability of all tests together as a percentage and as "1 in n".
+
+    A value that is not between 0 and 1 is written as a plain number.
+    """
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))
@@ -304,7 +333,10 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """List the recommended next steps as sentences, most useful first."""
+    """List the recommended next steps as sentences, most useful first.
+
+    If the data have faults, one of the steps names them.
+    """
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
@@ -339,14 +371,17 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
 
 
 def quality_summary(diagnosis: Diagnosis) -> str:
-    """Format the number of findings on the quality of the data, and the worst severity among them."""
+    """Format the number of findings on the quality of the data, and the worst severity, unless it is "note"."""
     severities = {finding.severity for finding in diagnosis.quality}
     worst = next((f" ({severity})" for severity in ("fatal", "warning") if severity in severities), "")
     return f"{format_count(len(diagnosis.quality), 'finding')}{worst}"
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Format a note on channels recorded in raw counts, with the remedy; return None if there are no such channels."""
+    """Format a note on channels recorded in raw counts (numbers of a converter), with the remedy.
+
+    Returns None if there are no such channels.
+    """
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
@@ -379,7 +414,7 @@ def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
 def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
     """Format a whole diagnosis as text: verdict, numbers, all methods and all findings; `width`: columns of a line.
 
-    The text has no colours, and no control characters, which file names or headers could contain.
+    The text has no colours. Unprintable characters, which file names or headers may contain, are replaced.
     """
     rows: list[tuple[str, str | None]] = [
         ("state", state_text(diagnosis.state)),
@@ -411,13 +446,19 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
 
 
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Format a line with file and verdict, and a paragraph of `width` columns for each row (label, text) with text."""
+    """Format a diagnosis as lines of text: file and verdict, then a paragraph of `width` columns for each row.
+
+    `rows`: pairs (label, text). A row without a text is left out.
+    """
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, columns=12, width=width)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow [L/min] with its interval for the verdict "leak", and its upper bound for other verdicts."""
+    """Format the leak flow [L/min] with its interval for the verdict "leak", and its upper bound for other verdicts.
+
+    If this is not known, the text is "L/min not stated".
+    """
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -427,7 +468,7 @@ def format_leak_flow(diagnosis: Diagnosis) -> str:
 
 
 def what_to_do(diagnosis: Diagnosis) -> str:
-    """Return the first recommended step; for `cannot tell`, the reason of the verdict instead."""
+    """Return the first recommended step or, for the verdict "cannot tell", the reason of this verdict."""
     return diagnosis.reason if diagnosis.verdict == "cannot tell" else next_steps(diagnosis)[0]
 
 
@@ -436,8 +477,9 @@ _FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as a line of a table (file, date, verdict and leak flow in L/min), and lines on what to do.
+    """Format a diagnosis as a line of a table with file, date, verdict and leak flow [L/min].
 
+    Lines on what to do follow, except for "no leak" without another cause. A long file name stands on a separate line.
     `start_s` [s since 1970]: start of the recording, None for a blank date.
     """
     file = PurePath(diagnosis.file).name

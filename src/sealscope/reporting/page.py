@@ -117,7 +117,10 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the moments to mark on all charts, with the true onset; raise InputError if the recording is empty."""
+    """Collect the moments to mark on all charts: `marks`, then the true onset [s] if it is stated.
+
+    Raises InputError if the recording is empty.
+    """
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -217,10 +220,10 @@ def render_page(
 def _change_rows(
     recording: Recording, diagnosis: Diagnosis, chambers: list[features.ChamberDetails], pressure_unit: str
 ) -> dict[str, Any]:
-    """Build the values for the template's table that compares the details' RMS in two parts of the recording.
+    """Build the template's values for the table that compares the RMS of wavelet details in two parts of the recording.
 
-    They are `changes`, rows (channel, detail, unit, RMS in the first part, in the second, change [%]); `bar_limit`, the
-    largest change [%] that the table's bars show; and the two `parts`.
+    They are `changes`, rows (channel, detail, unit, RMS in the first part, in the second, change [%]), with None for
+    unknown numbers; `bar_limit`, the largest change [%] that the table's bars show; and the two `parts`.
     """
     parts = features.parts_to_compare(diagnosis, recording)
     rows = []
@@ -235,7 +238,10 @@ def _change_rows(
 
 
 def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    """Compute minimum, mean and maximum of a channel in its display unit, or None, and count missing samples."""
+    """Compute minimum, mean and maximum of a channel in its display unit, and count the missing samples.
+
+    Returns a mapping for the page's template. The three numbers are None if all samples are missing.
+    """
     unit, values = charts.display_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
     statistics = (np.min, np.mean, np.max)
@@ -244,7 +250,10 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested mappings as pairs (`prefix` + dotted name, text), such as ("rig.name", "thesis")."""
+    """Yield the entries of nested mappings as pairs (`prefix` + dotted name, text), such as ("rig.name", "thesis").
+
+    A value that is no text is written as JSON.
+    """
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

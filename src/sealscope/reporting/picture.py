@@ -101,7 +101,10 @@ class Picture:
         return "".join(f"{'M' if first else 'L'}{left:.{digits}f} {top:.{digits}f}" for first, left, top in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between the lines `low` and `high` (n,), without the points at which either is NaN."""
+        """Draw the area between the lines `low` and `high` (n,) over `x` (n,), given as values of the axes.
+
+        Points at which one of the lines is NaN are left out.
+        """
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
             # along the upper line, and back along the lower one

@@ -26,7 +26,8 @@ _BROWSER_TIMEOUT = 120.0
 def print_page(page: str, path: str | os.PathLike[str]) -> str:
     """Write a page (HTML) as a PDF, atomically, and return the name of the program that printed it.
 
-    Raises MissingExtra if neither a browser nor WeasyPrint is installed, and InputError if printing fails.
+    This is a browser or, if none is installed, WeasyPrint. Raises MissingExtra if neither is installed, and InputError
+    if printing fails.
     """
     browser = _find_browser()
     with atomic_write(path) as temporary:
@@ -43,7 +44,7 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
             ) from error
         HTML(string=_inline_styles(page)).write_pdf(temporary)  # runs no scripts: the page shows its still charts
         if not _is_complete_pdf(temporary.read_bytes()):
-            raise InputError(f"a PDF must be written to its end, got less: is the disk full? ({path})")
+            raise InputError(f"a PDF must be complete, got one without its end: is the disk full? ({path})")
         return "WeasyPrint"
 
 
@@ -59,7 +60,8 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
         picture = temporary.with_name(f"{temporary.name}.png")  # browsers require this suffix
         options = ["--hide-scrollbars", "--force-device-scale-factor=1", f"--window-size={width},{height}"]
         try:
-            kind, is_complete = "picture of the size asked for", partial(_is_complete_png, width=width, height=height)
+            kind = f"picture of {width} x {height} pixels"
+            is_complete = partial(_is_complete_png, width=width, height=height)
             _write_by_browser(browser, page, picture, [*options, f"--screenshot={picture}"], kind, is_complete)
             picture.replace(temporary)
         finally:
@@ -70,7 +72,8 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 def _inline_styles(page: str) -> str:
     """Copy the style sheet of a page (HTML) into each drawing, with each CSS variable replaced by its value for print.
 
-    WeasyPrint neither applies the page's style sheet to drawings nor knows CSS variables there.
+    WeasyPrint neither applies the page's style sheet to drawings nor knows CSS variables there. A page without a style
+    sheet is returned unchanged.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -109,9 +112,11 @@ def _is_complete_png(data: bytes, width: int, height: int) -> bool:
 def _write_by_browser(
     browser: str, page: str, target: Path, options: list[str], kind: str, is_complete: Callable[[bytes], bool]
 ) -> None:
-    """Run a browser, with `options`, that converts a page (HTML) to the file `target`; raise InputError if that fails.
+    """Let a browser convert a page (HTML) to the file `target`; raise InputError if this fails.
 
-    `kind`: description of the file for the message; `is_complete`: function that tests the bytes of the file.
+    `options`: options of the browser's command line, which name the target; `kind`: description of the file for the
+    error message; `is_complete`: function that tests the bytes of the file. The browser is ended after
+    `_BROWSER_TIMEOUT`.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
@@ -126,7 +131,7 @@ def _write_by_browser(
             raise InputError(f"a browser must end within {_BROWSER_TIMEOUT:g} s, got: {error} ({browser})") from None
     data = target.read_bytes() if target.is_file() else b""
     if not is_complete(data):
-        # a list with the last line of the messages
+        # the last line of the messages, as a list of one line
         last_line = result.stderr.decode(errors="replace").strip().splitlines()[-1:] or ["no message"]
         got = f"status {result.returncode}: {last_line[0][:160]}"
         got += f", and {len(data)} bytes: is the disk full?" if data else ""

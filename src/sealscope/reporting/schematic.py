@@ -74,7 +74,8 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: areas of the sides A and B. A single rod is drawn sqrt(1 - smaller/larger area) times as high as the bore.
+    `areas`: areas of the sides A and B. A single rod is drawn sqrt(1 - smaller/larger area) times as high as the bore,
+    but at most 0.8 times.
     """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:
@@ -84,7 +85,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format a value in SI units as a number of `unit` with four significant digits; `scale`: `unit` in SI units."""
+    """Format a value in SI units as a number of `unit`, with four significant digits; `scale`: size of `unit` in SI."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 
@@ -105,7 +106,10 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
 
 
 def channel_columns(recording: Recording) -> dict[str, str]:
-    """Return the name of each channel's column in the file, by channel; {} if the recording does not state them."""
+    """Return the name of each channel's column in the file, by channel; {} if the recording does not state them.
+
+    Names are cut to 60 characters.
+    """
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

@@ -22,7 +22,7 @@ class DrawnTimes:
     Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
     `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): samples [start, stop) of each
     bucket; `width`: number of samples in a full bucket, 1 if all are drawn; `fine`: range of samples that are all
-    drawn; `breaks`: indices of the points, counted without NaN, before which NaN interrupts the line at gaps in time;
+    drawn; `breaks`: for each gap in time, the number of points before it, without NaN, where a NaN interrupts the line;
     `by_sample`: True if the time stamps do not increase, and `t` is the number of the sample over the sampling rate.
     """
 
@@ -56,9 +56,10 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Choose an increasing time axis (n,) [s] for a recording, and tell whether it was computed from sample numbers.
+    """Choose an increasing time axis (n,) [s] for a recording, the time stamps or else the numbers of the samples.
 
-    The axis is the time stamps `t` (n,) [s]. If they do not increase, it is the sample number divided by `rate` [Hz].
+    If the time stamps `t` (n,) [s] are finite and increase, the result is (`t`, False). Otherwise it is (sample number
+    / `rate` [Hz], True).
     """
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
@@ -71,8 +72,8 @@ def choose_drawn_times(
 
     The samples are divided into buckets, groups of successive samples of which only minimum and maximum are drawn. A
     bucket has two times. Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from
-    its true time. At each gap in time a new bucket starts, and an additional point interrupts the line; of many gaps,
-    only the longest count, a twentieth of `points`. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
+    its true time. At each gap in time a new bucket starts, and an additional point interrupts the line. This is done
+    for the longest gaps only, at most `points` / 20. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
     `near` [s]: time around which `near_samples` samples are all drawn, None for the start of the recording.
     """
     n = t.size
@@ -100,8 +101,8 @@ def choose_drawn_times(
 def encode_values(values: Array) -> dict[str, Any]:
     """Encode values as base64 text of 16-bit integers, for the script of the page.
 
-    An integer of the text `q` is decoded as `low + (q + 32767) * step`, where `low` is the minimum and `step` is
-    1/65534 of the range; -32768 stands for a value that is not finite.
+    Returns the text `q`, the minimum `low` of the values, and `step`, 1/65534 of their range. An integer q of the text
+    stands for the value ``low + (q + 32767) * step``, and -32768 for a value that is not finite.
     """
     is_finite = np.isfinite(values)
     low, high = 0.0, 0.0

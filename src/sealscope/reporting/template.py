@@ -51,7 +51,8 @@ def render(
     """Render the template called `template` as the text of a page, with the values `context`.
 
     `package`: package of the template; `scripts`: names of script files in it that the page runs; `chart_data`: plain
-    JSON values of charts, or None; scripts that draw them are added. Control characters, as in names, are replaced.
+    JSON values of charts, which adds the scripts that draw charts, or None. Control characters in the text, such as
+    those of file names, are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -60,7 +61,10 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a file of `package`, or else of `sealscope.reporting`, as text that templates do not escape."""
+    """Read a text file that templates do not escape, from `package` or else from `sealscope.reporting`.
+
+    `name`: path of the file within the package.
+    """
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -86,7 +90,7 @@ def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
     """Check that a path ends in .html, .htm or .pdf, or in .png if `card`; return it as a Path, or raise InputError."""
     suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
-        raise InputError(f"a page must be a file {', '.join(suffixes)}, got {os.fspath(path)}")
+        raise InputError(f"a page's name must end in {', '.join(suffixes)}, got {os.fspath(path)}")
     return Path(path)
 
 
@@ -99,7 +103,7 @@ def write(path: str | os.PathLike[str], page: str) -> Path:
         print_page(page, path)
         return Path(path)
     with atomic_write(path) as temporary:
-        # the name of a file may contain bytes that are no UTF-8
+        # the name of a file may contain bytes that are not UTF-8
         temporary.write_text(page, encoding="utf-8", errors="backslashreplace", newline="\n")
     return Path(path)
 

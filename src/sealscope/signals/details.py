@@ -80,8 +80,9 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
     The detail d_j of a sample depends on before_j earlier and after_j later samples (`reach`). The two counts are:
 
     - stationary: before_j and after_j;
-    - decimated: ``2^j k - before_j`` and after_j. Coefficient k begins at sample ``2^j k - before_j`` and depends on
-      before_j samples before it, so the first one without padding is ``k = ceil(2 before_j / 2^j)``;
+    - decimated: ``2^j k - before_j`` and after_j, with ``k = ceil(2 before_j / 2^j)``. Coefficient k is repeated from
+      sample ``2^j k - before_j`` on and depends on the before_j samples before that one, so this k is the first without
+      padding;
     - reconstructed: before_j + after_j at both ends, since analysis and synthesis both reach beyond a sample. This is
       ``(L - 1)(2^j - 1)`` for filters of L taps.
     """
@@ -99,7 +100,10 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
 
 
 def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
-    """Compute how many samples a signal needs, so that each level has one without padding: 226 for db8 to level 4."""
+    """Compute the length of the shortest signal in which each level has a sample that does not depend on padding.
+
+    It is 226 samples for the stationary transform with db8 to level 4.
+    """
     deepest_edges = edge_samples(wavelet, levels, transform)[-1]  # the largest of all levels
     return int(deepest_edges.sum()) + 1
 
@@ -121,7 +125,8 @@ def details(
     - "decimated": Mallat's transform, with each coefficient of level j repeated 2^j times;
     - "reconstructed": d_j is the part of the signal that comes from level j.
 
-    The signal is padded by `edge` beyond its ends; `Details.inside` excludes the samples that depend on it.
+    Beyond its ends the signal is padded by the mode `edge` of PyWavelets; `Details.inside` excludes the samples that
+    depend on padding.
 
     The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
     (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at sample ``n
@@ -146,7 +151,10 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3d4 in k segments with the limits `bounds` (k + 1,)."""
+    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3d4 in k segments of a transformed signal.
+
+    Segment i has the samples bounds[i] to bounds[i + 1] - 1.
+    """
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 

@@ -87,7 +87,10 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
 
 
 def require_positive_int(value: object, name: str, unit: str = "") -> int:
-    """Return `value` as an int if it is a whole number of 1 or more; raise InputError with `name` and `unit` if not."""
+    """Return `value` as an int if it is a whole number of 1 or more; raise InputError otherwise.
+
+    The message states `name`, and the text `unit`, such as " sample", after the smallest number.
+    """
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
         raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
     return int(value)

@@ -21,8 +21,9 @@ def filter_rows(
 ) -> None:
     """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
-    i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows: the second axis of `rows`, `taps`
-    and `out` holds the eight signals. Eight outputs are computed at a time, the rest one by one.
+    i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows of eight numbers, one for each signal, in
+    `rows`, `taps` and `out`. Successive outputs use rows that are `stride` apart, and successive taps of a filter use
+    rows that are `dilation` apart. Eight outputs are computed at a time, the rest one by one.
     """
     i = 0
     while i + 8 <= n:
@@ -60,13 +61,13 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Compute the wavelet details of `n` new samples of one channel for a group of eight signals (WIDTH).
+    """Compute the wavelet details of `n` new samples of one channel, such as a pressure, of eight actuators.
 
-    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters. `buffers` has a buffer of `capacity` rows for
-    each level of the channel, stacked from row `start` on; the new samples begin at row `first` of the first buffer.
-    High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills the buffer of the next level.
-    The finer levels, whose filters are shorter, get the delay of the deepest level, so that row i of all levels in
-    `details` (levels, CHUNK, WIDTH) belongs to one sample.
+    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters, repeated for each actuator. `buffers` has a
+    buffer of `capacity` rows for each level of the channel, stacked from row `start` on; the new samples begin at row
+    `first` of the first buffer. High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills
+    the buffer of the next level. The finer levels, whose filters are shorter, get the delay of the deepest level, so
+    that row i of all levels in `details` (levels, CHUNK, WIDTH) belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -105,10 +106,10 @@ def advance_details(
     """Compute the wavelet details of the next block of all signals.
 
     `block` (channels, actuators, n): samples; `out` (channels, actuators, levels, n): receives the details. A group has
-    eight actuators, and `groups` is (first, last + 1) of the groups to filter. `buffers` (groups, channels, levels,
-    capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`, `high`
-    (taps, WIDTH): low-pass and high-pass filter; `details` (levels, CHUNK, WIDTH): work array. Returns the number of
-    rows that are in use in the buffers afterwards.
+    eight actuators (WIDTH), and `groups` is (first, last + 1) of the groups to filter. `buffers` (groups, channels,
+    levels, capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`,
+    `high` (taps, WIDTH): low-pass and high-pass filter; `details` (levels, CHUNK, WIDTH): work array. Returns the
+    number of rows that are in use in each buffer afterwards.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]

@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 class DetailStream:
     """Stationary wavelet details of live signals, block by block.
 
-    The results equal those of ``details(..., transform="stationary")`` to rounding. A causal filter knows level j of
-    a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with the delay of
-    the deepest one, so that a column has all levels of one sample: column i, counted from the beginning of the
+    The results equal those of ``details(..., transform="stationary")`` to rounding. A causal filter with L taps knows
+    level j of a sample only ``(L/2)(2^j - 1)`` samples later (db8: 8, 24, 56, 120). All levels are returned with the
+    delay of the deepest one, so that a column has all levels of one sample: column i, counted from the beginning of the
     stream, is the detail of sample ``i - delay``. The first `settling` columns depend on zeros before the beginning.
 
     Parameters
@@ -73,6 +73,7 @@ class DetailStream:
     def __init__(
         self, channels: int | tuple[int, int] = 1, levels: int = 4, *, wavelet: str = "db8", threads: int = 1
     ) -> None:
+        """Prepare the filters and the buffers of all signals; the class describes the parameters."""
         from sealscope.physics.lanes import WIDTH
         from sealscope.signals.kernels import CHUNK
 
@@ -109,7 +110,7 @@ class DetailStream:
         ----------
         block : array_like
             Samples (channels, n), or (n,) of a single signal; n may be 0. A missing sample (NaN) affects only its own
-            signal, in at most this and the next `settling` columns.
+            signal: its column of the result, and at most the next `settling` ones.
         out : ndarray, optional
             Array to write the result into: C-contiguous doubles in the shape of the result. If the block is of
             C-contiguous doubles, too, no other memory is allocated.
@@ -148,17 +149,20 @@ class DetailStream:
         target = out.reshape(*self._shape_2d, self.levels, n)
 
         def filter_part(part: tuple[int, int], work: Array) -> int:
-            """Filter the groups `part` = (first, last + 1), with the array `work`; return the number of rows in use."""
+            """Filter the groups of signals in `part` = (first, last + 1); return the number of buffer rows then in use.
+
+            `work` (levels, CHUNK, WIDTH): work array, which only this part uses.
+            """
             return advance_details(part, x, self.buffers, self._fill, self._history, *self.taps, work, target)
 
         run = map if len(self._parts) == 1 else self._pool.map
-        self._fill = max(run(filter_part, self._parts, self._workspaces))
+        self._fill = max(run(filter_part, self._parts, self._workspaces))  # the same number for all parts
         self.samples += n
         return out
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
-        """Pool of threads that filter the block, one for each part of the signals."""
+        """Pool of threads by which `update` filters a block, one for each part of the signals."""
         from concurrent.futures import ThreadPoolExecutor
 
         return ThreadPoolExecutor(len(self._parts))
@@ -166,8 +170,8 @@ class DetailStream:
     def state_dict(self) -> dict[str, Any]:
         """Return the state of the stream as plain values and arrays, from which `from_state` continues.
 
-        `history` (rows, levels, samples, columns) has the last inputs of each level's filters, for signals in a table
-        of rows and columns (`channels`); a plain number of signals is one row.
+        Its `history` (rows, levels, samples, columns) has the last inputs of the filters of each level. Rows and
+        columns are those of the table of signals (`channels`); signals that are not in a table form one row.
         """
         # the buffers hold the columns in groups (first axis) of WIDTH columns (last axis): bring both axes together
         history = np.moveaxis(self.buffers[:, :, :, self._fill - self._history : self._fill], 0, -2)
@@ -181,7 +185,10 @@ class DetailStream:
 
     @classmethod
     def from_state(cls, state: dict[str, Any], *, threads: int = 1) -> DetailStream:
-        """Continue a saved `state_dict` as if it had not been interrupted; raise InputError if it is not valid."""
+        """Make a stream that continues from a saved `state_dict`; raise InputError if the state is not valid.
+
+        `threads`: number of threads, which may differ from that of the saved stream.
+        """
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         channels = tuple(channels) if isinstance(channels, list) else channels  # JSON has no tuples
         stream = cls(channels, levels, wavelet=wavelet, threads=threads)
@@ -196,7 +203,7 @@ class DetailStream:
 
 
 def aligned_zeros(shape: tuple[int, ...]) -> Array:
-    """Make an array of zeros that begins at a cache line of 64 bytes, so that no row of 8 doubles is divided."""
+    """Make an array of zeros that begins at a cache line (64 bytes), so that each row of 8 doubles lies in one line."""
     values = np.zeros(math.prod(shape) + 8)  # 8 doubles of 8 bytes are one cache line
     skip = -(values.ctypes.data // 8) % 8  # doubles before the next cache line
     return values[skip : skip + math.prod(shape)].reshape(shape)

@@ -25,8 +25,8 @@ WINDOW_STEP = 500
 class WindowedRms(NamedTuple):
     """RMS of sliding windows over a series.
 
-    `rms` (..., w): RMS of each window, in the series' unit; `ends` (w,): number of the sample just after the window. A
-    window of `size` samples is centred at ``(ends - size / 2) / rate`` seconds.
+    `ends` (w,): number of the sample just after each window; `rms` (..., w): RMS of each window, in the series' unit.
+    At the sampling rate `rate` [Hz], a window of `size` samples is centred at ``(ends - size / 2) / rate`` seconds.
     """
 
     ends: IntArray
@@ -91,6 +91,7 @@ class RmsStream:
     """
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
+        """Begin a stream without samples; the class describes the parameters."""
         self.size = require_positive_int(size, "size", unit=" sample")
         self.step = require_positive_int(step, "step", unit=" sample")
         if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
@@ -185,8 +186,8 @@ def _piece_sums(x: Array, piece: int) -> Array:
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     """Compute the RMS (..., windows) of each complete window of `size` samples; one begins every `step` samples.
 
-    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples. Those of a window are added
-    in their order, so that rounding does not depend on how the series is divided into blocks.
+    `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples. The sums of a window are
+    added in their order, so that rounding does not depend on how the series is divided into blocks.
     """
     piece = math.gcd(size, step)
     pieces_per_window, pieces_per_step = size // piece, step // piece
@@ -194,6 +195,6 @@ def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     squares = np.zeros((*sums.shape[:-1], n_windows))
     if n_windows:
         for i in range(pieces_per_window):  # add piece i of all windows
-            last = i + (n_windows - 1) * pieces_per_step  # in the last window
+            last = i + (n_windows - 1) * pieces_per_step  # index of piece i of the last window
             squares += sums[..., i : last + 1 : pieces_per_step]
     return np.asarray(np.sqrt(squares / size))

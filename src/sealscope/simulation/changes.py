@@ -73,7 +73,11 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute the parameter `field` at times t [s]: (`rig_value` + sum of addends) x product of factors, if any."""
+    """Compute the parameter `field` at times t [s]: (`rig_value` + sum of addends) x product of factors.
+
+    Addends and factors are the changes by those `effects` that concern this parameter. Without any, `rig_value` is
+    returned as it is.
+    """
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
         if effect.field == field:
@@ -82,7 +86,10 @@ def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array)
 
 
 def changing_values(effects: Sequence[Effect], base: RigNumbers, t: Array) -> dict[str, Array]:
-    """Compute the changed parameters, name -> values (n,) at times t (n,) [s]; `base`: parameters without effects."""
+    """Compute the values (n,) of all parameters that effects change, by name, at times t (n,) [s].
+
+    `base`: the parameters of the model without effects.
+    """
     names = dict.fromkeys(effect.field for effect in effects)
     return {name: apply_effects(np.full(t.size, float(getattr(base, name))), effects, name, t) for name in names}
 
@@ -91,11 +98,13 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     """Divide a run into blocks of time within which the solver takes all parameters as constant.
 
     Returns the bounds of the blocks (blocks + 1,) as indices, 0 to `n_out`, of the solver's outputs at `rate` [Hz].
+    Without effects, the whole run is one block.
 
-    The first bounds are the breakpoints of effects, to within one output interval, and times `LONGEST_BLOCK` apart.
-    Then each block is divided into equal parts, as many as the most demanding effect needs: an effect may change by its
-    `max_change` from part to part, or more if the parts would otherwise be shorter than its `min_block`. A part may
-    therefore be shorter than the `min_block` of a slower effect, and between close breakpoints than that of any effect.
+    The run is first divided at the breakpoints of effects, to within one output interval, and at times `LONGEST_BLOCK`
+    apart. Then each block is divided into equal parts, as many as the most demanding effect needs: an effect may change
+    by its `max_change` from part to part, or more if the parts would otherwise be shorter than its `min_block`. A part
+    may therefore be shorter than the `min_block` of another effect. Between two close breakpoints it may be shorter
+    than that of every effect.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -192,7 +201,10 @@ class Readings:
         return apply_effects(rig_value, self.effects, parameter, t)
 
     def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Repeat the first of the readings `values` (n,) at times `t` (n,) [s] while the channel is stuck."""
+        """Replace the readings in each span in which the channel is stuck by the first reading of that span.
+
+        `values` (n,): readings at times `t` (n,) [s]. They are copied before a change.
+        """
         for hold in self.holds:
             samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
             if hold.channel == channel and samples.size:
@@ -247,7 +259,7 @@ class Wander:
         return ()
 
     def scale_to_range(self, size: float) -> Wander:
-        """Scale the walk so that its maximum minus minimum over its duration is `size`; keep a constant walk."""
+        """Scale the walk so that its maximum minus minimum over its duration is `size`; leave a constant walk."""
         path = self.value_at(np.linspace(0.0, self.duration, _N_PATH_POINTS))
         path_range = float(np.ptp(path))
         return self.times(size / path_range) if path_range > 0 else self

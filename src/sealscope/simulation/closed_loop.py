@@ -39,7 +39,7 @@ class Feedback:
 
     The controller measures position and angle in whole counts of the rig's encoders, and pressures with the
     transducers' noise. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate`
-    [Hz] of the solver's outputs; `seed` of the noise.
+    [Hz]: rate of the solver's outputs; `seed`: seed of the noise.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class Feedback:
         t = np.arange(samples + 1) / controller.rate
         inputs = np.zeros((samples + 1, 5))  # time, target, its speed, noise of p_A and p_B (`Loop.inputs`)
         inputs[:, 0], inputs[:, 1] = t, target.value_at(t)
-        # a sample's voltage acts from `delay` to `delay + 1` samples later; the speed is the target's mean speed then
+        # a sample's voltage acts from `delay` to `delay + 1` samples later: the target's mean speed in this interval
         target_ahead = target.value_at(t + controller.delay / controller.rate)
         inputs[:-1, 2] = np.diff(np.broadcast_to(target_ahead, t.shape)) * controller.rate
         random = np.random.default_rng([seed, 2])  # 2: a stream independent of the instruments' noise

@@ -61,7 +61,7 @@ class MultiSine:
 
     def __post_init__(self) -> None:
         if len(self.parts) < 2 or any(sine.offset for sine in self.parts[:-1]):
-            raise InputError(f"a multi-sine must be of two sines or more, an offset in the last alone, got {self}")
+            raise InputError(f"a multi-sine must have two sines or more, with an offset in the last only, got {self}")
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V], the sum of all sines, at times t [s]."""
@@ -73,7 +73,10 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """A periodic command that rises from 0 to `level` [V] within `rise` [s], and falls half a `period` [s] later."""
+    """A periodic command that rises from 0 to `level` [V] within `rise` [s], and falls to 0 half a `period` [s] later.
+
+    The fall also takes `rise` seconds.
+    """
 
     level: float
     rise: float
@@ -98,14 +101,20 @@ class Trapezoid:
 
 @dataclass(frozen=True)
 class Alternating:
-    """A command of several sines in turn, repeated without end; each part is a whole number of a sine's periods."""
+    """A command of several sines in turn, repeated without end.
+
+    `parts`: for each sine the number of its periods, and the sine, which has neither phase nor offset.
+    """
 
     parts: tuple[tuple[int, Sine], ...]
 
     def __post_init__(self) -> None:
         for periods, sine in self.parts:
             if not (periods >= 1 and sine.omega > 0 and sine.phase == 0 and sine.offset == 0):
-                raise InputError(f"a duty in turn must be of periods >= 1 of sines from zero, got {periods} of {sine}")
+                raise InputError(
+                    "sines in turn must have periods >= 1, a frequency > 0 and neither phase nor offset, got "
+                    f"{periods} periods of {sine}"
+                )
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V] of the sine that is active at each of the times t [s]; 0 before t = 0."""
@@ -183,10 +192,11 @@ def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:
     """Make the polyline through the points of a table, with the values `y` at the times `t` [s].
 
-    `what`: name of the table in messages. Raises InputError if the times do not rise, or if a number is not finite.
+    `what`: name of the table in messages. Raises InputError for an empty table, another number of values than of times,
+    a time before the previous one (equal times are a jump), or a number that is not finite.
     """
     if t.ndim != 1 or t.shape != y.shape or t.size < 1 or np.any(np.diff(t) < 0):
-        raise InputError(f"{what} must have one value for each time, and its times must rise")
+        raise InputError(f"{what} must have one value for each time, and its times must not fall")
     if not (np.all(np.isfinite(t)) and np.all(np.isfinite(y))):
         raise InputError(f"times and values of {what} must be finite, got NaN or infinity")
     return Polyline(t, y, f"table of {t.size} points over {t[0]:g}..{t[-1]:g} s")
@@ -269,7 +279,8 @@ class PseudoRandom:
 def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
     """Make the polyline through the samples of a recorded signal, `u` (n,) at the times `t` (n,) [s].
 
-    `origin`: name of the signal in messages and text. Raises InputError for fewer than two samples, or equal times.
+    `origin`: name of the signal in messages and text. Raises InputError for fewer than two samples, times that do not
+    rise, or a number that is not finite.
     """
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
@@ -277,7 +288,10 @@ def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
 
 
 def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command from the channel `u` [V] of a recording, from t = 0 on; `origin`: name of the recording."""
+    """Make a command from the channel `u` [V] of a recording, whose first sample is moved to t = 0.
+
+    `origin`: name of the recording in messages and in the command's text.
+    """
     return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
 
 
@@ -340,9 +354,12 @@ _MAX_CHARACTERS = 1000
 
 
 def normalize_blanks(text: str, what: str) -> str:
-    """Replace runs of blanks in a text by single blanks, except in a path after ``file``; `what`: noun for messages."""
+    """Strip a text, and replace runs of blanks in it by single blanks, except in a path after ``file``.
+
+    Raises InputError for a text of more than 1000 characters; `what`: noun for the message, such as "command".
+    """
     if len(text) > _MAX_CHARACTERS:
-        raise InputError(f"{what} must be of at most {_MAX_CHARACTERS} characters, got {len(text)}")
+        raise InputError(f"{what} must have at most {_MAX_CHARACTERS} characters, got {len(text)}")
     if file := re.fullmatch(r"(?:(position)\s+)?(file)\s+(.*)", text.strip(), re.IGNORECASE):
         return " ".join(filter(None, file.groups()))
     return " ".join(text.split())

@@ -72,7 +72,8 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 def check_circuit(rig: Rig) -> None:
     """Raise InputError for a single-rod cylinder in a closed circuit without pilot-operated check or relief valves.
 
-    Only through these can the difference between the oil volumes of its chambers leave and enter the circuit.
+    When the piston of such a cylinder moves, one chamber gives off more oil than the other takes in. Only these valves
+    let the difference out of the circuit. A cylinder counts as single-rod if its piston areas differ at all.
     """
     cylinder, makeup = rig.cylinder, rig.makeup
     is_single_rod = rig.circuit.pump_feeds_chambers and cylinder.A_A != cylinder.A_B
@@ -232,9 +233,9 @@ class Experiment:
 
     @property
     def voltage_command(self) -> Command:
-        """The voltage command with its changes by faults; InputError if there is a position target instead."""
+        """The voltage command with its changes by faults; raises InputError if there is a position target instead."""
         if isinstance(self.command, Position):
-            raise InputError(f"what a controller sends is known after its run only, got {self.command}")
+            raise InputError(f"a run with a position target has no voltage command, got {self.command}")
         return self._with_duty_changes(self.command)
 
     @property
@@ -306,7 +307,7 @@ class Experiment:
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
-        """Compute the time [s] at which the first leak opens; None if no leak opens within the run."""
+        """Compute the time [s] at which the first leak opens; None if no leak of a size > 0 opens within the run."""
         sized_leaks = [leak for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
         onsets = [onset for leak in sized_leaks if (onset := leak.opening.onset()) < self.duration]
         return max(0.0, min(onsets)) if onsets else None
@@ -355,8 +356,9 @@ def _parse_several(
 ) -> tuple[_Kind, ...]:
     """Parse an argument that states one or several leaks or faults.
 
-    `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` returns None for a text
-    such as ``none``, which is left out. Raises InputError, with the `name` of the argument, if it is anything else.
+    `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` converts a text, and
+    returns None for a text such as ``none``, which is left out. Raises InputError, with the `name` of the argument, for
+    an argument of any other type.
     """
     if argument is None:
         return ()

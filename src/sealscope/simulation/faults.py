@@ -166,9 +166,9 @@ class Fault:
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
-        A fault with a function in `_EFFECTS` has the effects that it returns. Any other multiplies each of
-        `row.parameters` or adds to it, in proportion to its opening (0 to 1). Raises InputError if this rig cannot have
-        the fault: a part is absent, or a needed parameter is 0.
+        If `_EFFECTS` has a function for this kind of fault, it builds the effects. Otherwise each parameter in
+        `row.parameters` is multiplied by a factor or gets an addend, to the extent of the fault's opening (0 to 1).
+        Raises InputError if this rig cannot have the fault: a part is absent, or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
@@ -218,7 +218,10 @@ class Fault:
         return ChangedDuty(command, self) if self.name == "duty" else command
 
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
-        """Build a function that computes the oil's relative dynamic viscosity at times t [s]; None if constant."""
+        """Build a function that computes the oil's dynamic viscosity at times t [s], relative to that in the rig.
+
+        Returns None unless this is a fault of the oil's temperature, because other faults do not change the viscosity.
+        """
         if self.name != "oil":
             return None
         from sealscope.physics.fluid import kinematic_viscosity, thermal_density_ratio
@@ -235,7 +238,7 @@ class Fault:
         return dynamic_viscosity_ratio
 
     def _oil_temperature(self, rig: Rig, t: Array) -> Array:
-        """Compute the oil's temperature [K] at times t [s] under this fault of the oil's temperature."""
+        """Compute the oil's temperature [K] at times t [s]: that of the rig, plus the part by this fault."""
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
     def __str__(self) -> str:

@@ -70,7 +70,8 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     """Compute the output y of a first-order transducer for a signal at `rate` [Hz]: lag dy/dt + y = signal.
 
-    `lag` [s]: time constant. The output is exact for a signal that is linear between its values and constant before.
+    `lag` [s]: time constant; with 0 the signal `values` is returned as it is. The output is exact for a signal that is
+    linear between its values and constant before the first.
     """
     if lag == 0.0:
         return values
@@ -87,9 +88,10 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
     """Sample a signal by a clock with jitter; return the samples (n,).
 
-    `values`: the signal, of any length; `sample`: function that computes its samples (n,) by a clock without jitter;
-    `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. The signal is
-    interpolated by a parabola through three of its values.
+    `values`: the signal, of any length; `sample(signal)`: computes the samples (n,) of a signal by a clock without
+    jitter; `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. Each sample is
+    interpolated by a parabola through the sample without jitter, the one an interval earlier and the one an interval
+    later.
     """
     center = sample(values)
     if lateness is None:
@@ -105,7 +107,10 @@ def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
 
 
 def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Compute the pressure [Pa] read back from a transducer, which saturates, by an analog-digital converter."""
+    """Compute the readings [Pa] that a transducer and the analog-digital converter give for pressures [Pa].
+
+    The transducer saturates at its range. The converter rounds its voltage to whole steps.
+    """
     sensitivity = volts_per_pascal(sensor, daq)
     saturated = np.clip(pressure, sensor.range_lo, sensor.range_hi)
     volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity

@@ -96,7 +96,8 @@ class RunInputs:
         """Compute the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), for some solver steps.
 
         `start` (steps,): beginnings of the steps [s]; `offsets` (nodes,): times [s] after each at which the solver
-        needs its inputs. Raises InputError for a command beyond the converter's limit within the run.
+        needs its inputs. Raises InputError for a command beyond the converter's limit within the run. After the end of
+        the run the command is limited instead.
         """
         t = start[:, None] + offsets
         u = self._command.volts(t)
@@ -142,7 +143,7 @@ def oversampling_of(rate: float, step: float) -> int:
 
 
 def steps_per_output(rate: float, step: float) -> int:
-    """Compute the fewest solver steps between two outputs at `rate` [Hz] for which none is longer than `step` [s]."""
+    """Compute the fewest solver steps between two outputs at `rate` [Hz] so that a step takes at most `step` [s]."""
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))  # 1e-9: a quotient just above a whole number is whole
 
 
@@ -195,7 +196,10 @@ def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
 
 
 def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the leakage coefficients that give the stated mean flows; return the leaks with these coefficients."""
+    """Find the leakage coefficients that give the stated mean flows; return the leaks with these coefficients.
+
+    Leaks with a stated coefficient keep it. Without a stated mean flow > 0, nothing is simulated.
+    """
     if not any(leak.mean for leak in experiment.leaks):
         return _start_of_search(experiment.leaks)
     leaks, _ = run_with_sized_leaks(experiment)
@@ -408,7 +412,8 @@ class _Integration:
     def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
-        `rows`: outputs of the run, each after `n_steps` steps; the window: first <= k < end. `check` keeps the errors.
+        `rows`: outputs of the run, with `n_steps` steps between them; the window has the outputs first <= k < end.
+        `check` computes the errors and keeps the largest ones.
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
@@ -476,7 +481,7 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
     They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless this would overlap the window before
-    or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz] of the outputs.
+    or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz]: rate of the outputs.
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -490,9 +495,9 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
 class StepErrorCheck:
     """Comparison of a run at one solver step with the same run at half that step, window by window.
 
-    `rate` [Hz] of the solver's outputs; `tolerance` [Pa rms]: allowed difference of a pressure. `pressure_error` [Pa]:
-    largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`: largest relative difference
-    of the RMS of a wavelet detail so far.
+    `rate` [Hz]: rate of the solver's outputs; `tolerance` [Pa rms]: allowed difference of a pressure. `pressure_error`
+    [Pa]: largest rms difference of a pressure in a window so far, times `SAFETY`; `detail_error`: largest relative
+    difference of the RMS of a wavelet detail so far.
     """
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:

@@ -41,7 +41,7 @@ def opening_from(start: float = 0.0, stop: float = math.inf, ramp: float = 0.0) 
     if not (math.isfinite(ramp) and ramp >= 0.0):
         raise InputError(f"a ramp must be >= 0 s and finite, got {ramp:g} s")
     if not stop >= start + ramp:
-        raise InputError(f"what begins at {start:g} s and takes {ramp:g} s must end later than that, got {stop:g} s")
+        raise InputError(f"an opening from {start:g} s within {ramp:g} s must end after that, got an end at {stop:g} s")
     text = f"from {format_number(start)} s"
     points = [(start, 0.0), (start + ramp, 1.0)]
     if math.isfinite(stop):
@@ -62,9 +62,10 @@ def growing_opening(start: float, stop: float) -> Polyline:
 
 @dataclass(frozen=True, eq=False)
 class Thinned:
-    """The opening of a laminar leak in oil whose relative `viscosity` changes over time t [s]: `opening` divided by it.
+    """The opening of a laminar leak in oil of changing viscosity: `opening` divided by the relative viscosity.
 
-    `rise`: None, because the result is not a single linear rise (`Polyline.rise`).
+    `viscosity`: function that computes the relative viscosity at times t [s]; `rise`: None, because the quotient is not
+    a single linear rise (`Polyline.rise`).
     """
 
     opening: Opening
@@ -92,9 +93,9 @@ class Leak:
     """A leak across the piston, from chamber A to B.
 
     `law`: "laminar", Q = G dp with G [m^3/(s Pa)] (worn seal), or "orifice", Q = C sign(dp) sqrt(abs(dp)) with C
-    [m^3/(s Pa^0.5)] (needle valve); `opening`: how far the leak is open over time, 0 to 1. The size at full opening is
-    stated by one of `coefficient`, G or C, and `mean` [m^3/s], the mean of abs(Q) while the leak is open
-    (`sizing.mean_while_open`), for which `sizing.size_leaks` finds the coefficient.
+    [m^3/(s Pa^0.5)] (needle valve); `opening`: how far the leak is open over time, 0 to 1. Either `coefficient` or
+    `mean` states the size at full opening. `coefficient` is G or C. `mean` [m^3/s] is the mean of abs(Q) while the leak
+    is open (`sizing.mean_while_open`), for which `sizing.size_leaks` finds the coefficient.
     """
 
     law: Literal["laminar", "orifice"] = "laminar"
@@ -120,9 +121,11 @@ class Leak:
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening of a leak or fault from the times in the named groups of a matched text, such as of `WHEN`.
+    """Build the opening of a leak or fault from the times in its text.
 
-    Without times, it is fully open from 0 s on.
+    `groups`: named groups of a match with a pattern such as `WHEN`. `start` and `stop` are the times between which the
+    opening grows. Otherwise it begins at `since`, ends at `until` and takes `ramp` to open; by default it is fully open
+    from 0 s on without an end.
     """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))

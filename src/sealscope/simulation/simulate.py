@@ -52,8 +52,8 @@ class Truth:
     """The true leaks, faults, drifts and noise-free outputs of a run, which its recording does not contain.
 
     `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first of them opens, None
-    if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`: by name at the samples'
-    times `t` [s].
+    if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`: noise-free outputs by
+    name, at the times `t` [s] of the recording's samples.
     """
 
     leaks: tuple[Leak, ...]
@@ -331,7 +331,10 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Describe a drift over times t [s] for JSON by range and net change, in per cent if relative, else in SI units."""
+    """Describe a drift over times t [s] for JSON: its range (maximum minus minimum), and its change from start to end.
+
+    Both are in per cent of the parameter for a relative drift, else in the parameter's SI unit.
+    """
     change = drift.shape.value_at(t)
     span, net_change = float(np.ptp(change)), float(change[-1] - change[0])
     if drift.absolute:

@@ -54,8 +54,9 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     `mean` [m^3/s]: the mean flow to reach; `previous`, `latest`: (coefficient, mean flow) of the last two runs, (0, 0)
     for no run. If the `latest` coefficient is 0, its flow is the one that a coefficient of 1 would give in that run.
 
-    The next coefficient is on the straight line through both runs on logarithmic scales. Its slope is limited to 0.1 ..
-    1, as is usual for leaks. It is 1 if the previous run was without a leak, or if the coefficients are nearly equal.
+    The next coefficient is on the straight line through both runs on logarithmic scales. The line's slope is limited to
+    0.1 .. 1, as is usual for leaks. The slope is 1 if the previous run was without a leak, or if both coefficients are
+    nearly equal.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest
@@ -77,8 +78,9 @@ def size_leaks(
 
     A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
     values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig; it returns
-    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), also where the coefficient is 0, and the run,
-    of any type. Returns the coefficients found, and the run with them. `progress` is called with a task and a fraction.
+    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), and the run, of any type. For a coefficient of
+    0 the flow is that of a leak of coefficient 1 under the pressures of this run. Returns the coefficients found, and
+    the run with them. `progress` is called with the name of the task and its completed fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less (`next_coefficient`). Raises SimulationFailed if the search does not converge.
@@ -103,11 +105,11 @@ def size_leaks(
         next_coefficients = coefficients.copy()
         for k in indices:
             previous = previous_coefficients[k], previous_flows[k]
-            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # else that of 1
+            latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # else the flow of a coefficient of 1
             next_coefficients[k] = next_coefficient(means[k], previous, latest=(coefficients[k], latest_flow))
         previous_coefficients, previous_flows = coefficients, flows
         coefficients = next_coefficients
     raise SimulationFailed(
-        f"no leakage coefficient gives the mean asked for within {TOLERANCE:g}: {', '.join(map(str, leaks))} is more "
-        "than this rig's pressures can drive; ask for a smaller leak"
+        f"no leakage coefficient gives the stated mean flow within {TOLERANCE:g}: {', '.join(map(str, leaks))} is more "
+        "than this rig's pressures can drive; state a smaller leak"
     )

@@ -73,7 +73,7 @@ class Force:
         return self.signal.volts(t)  # the value of the signal, here in newtons
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the load's tables over position and velocity for `piecewise_linear_force`; None without either."""
+        """Build the load's tables over position and velocity for `piecewise_linear_force`; None if it has neither."""
         if not (self.over_x or self.over_v):
             return None
         no_load: Breakpoints = ((0.0, 0.0),)
@@ -86,7 +86,8 @@ class Force:
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
     """Build the parameters of the compiled model for a rig with an additional `load`, if any.
 
-    The result's `pushed` has the load's tables over position and velocity, or is (True,) for a load over time only.
+    The result's `pushed` has the load's tables over position and velocity, or is (True,) for a load over time only, ()
+    without a load.
     """
     from sealscope.physics.rig import rig_numbers
 
@@ -95,7 +96,10 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the model's state (14,) at rest at `x` [m], under a load in addition to the rig's own."""
+    """Compute the model's state (14,) at rest at `x` [m], under a `load` in addition to the rig's own, if any.
+
+    The load is taken at t = 0, at the position x and at the velocity 0.
+    """
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
@@ -139,9 +143,10 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
 
 
 def parse_position(text: str) -> Position | None:
-    """Parse a position target, such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``, if it is one.
+    """Parse a position target, such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
 
     The signal is written as in `parse_command`, in mm, cm or m; ``position file LOG`` takes channel x of a recording.
+    Returns None for a text that does not begin with ``position``. Raises InputError for a signal in another form.
     """
     normalized = normalize_blanks(text, "command")
     if not normalized.lower().startswith("position "):
@@ -153,7 +158,7 @@ def parse_position(text: str) -> Position | None:
         path = signal[len("file ") :].strip()
         recording = read(path)
         if "x" not in recording or recording.units["x"] != "m":
-            raise InputError(f"a recorded position must have the channel x with a unit of length, got {path} without")
+            raise InputError(f"a recorded position must have the channel x with a unit of length, got none ({path})")
         return Position(sampled_signal(recording.t - recording.t[0], recording["x"], path), signal)
     return Position(_parse_signal(signal, _LENGTHS, "position"), signal)
 
@@ -166,9 +171,9 @@ def command_or_target(text: str) -> Command | Position:
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]``, ``v [m/s]``, in any unit.
 
-    The load is linear between the rows and constant beyond them; `words` describe it in the result. If there is a
-    column of times, columns of x and v are ignored, and the first time becomes t = 0. Raises InputError for any other
-    table.
+    The load is linear between the rows and constant beyond them. If there is a column of times, columns of x and v are
+    ignored, and the first time becomes t = 0. `words`: text of the load for the result. Raises InputError for any other
+    table, such as one with columns of x and v but without times.
     """
     with open_regular(path, "a recorded load") as file:
         first_line = file.readline(4096).decode("utf-8-sig", "replace")
@@ -184,7 +189,7 @@ def _read_force(path: str, words: str) -> Force:
         try:
             table = np.loadtxt(file, delimiter=",", usecols=[indices[arguments[0]], indices["F"]], ndmin=2)
         except ValueError as error:
-            raise InputError(f"a recorded load must hold numbers, got a table of which {error} ({path})") from None
+            raise InputError(f"a recorded load must have numbers only, got an error: {error} ({path})") from None
     argument = arguments[0]
     unit = {"t": "s", "x": "m", "v": "m/s"}[argument]
     s = to_si(table[:, 0], units[argument], unit, name=argument, place=path)

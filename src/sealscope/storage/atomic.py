@@ -89,8 +89,9 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    `target`: name of the file whose temporary files are removed; None for all files, also in subfolders, except
-    linked ones. A file is removed if its process ran on this computer and has ended, or was changed over a day ago.
+    `target`: name of the file whose temporary files are removed; None for all files, also in subfolders, except linked
+    ones. A temporary file is removed if its process ran on this computer and has ended, or if the file has not been
+    changed for a day.
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:

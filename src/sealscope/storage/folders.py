@@ -42,7 +42,7 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
         except (OSError, RuntimeError):  # removed meanwhile, or circular links
             continue
         if is_file and not is_inside:
-            _log.warning("%s", printable(f"a file of a folder must lie in it, got a link out of it, left out ({path})"))
+            _log.warning("%s", printable(f"a link that leads out of its folder is left out ({path})"))
         elif is_file:
             yield path
 

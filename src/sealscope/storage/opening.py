@@ -32,7 +32,8 @@ def open_regular(path: str | os.PathLike[str], what: str) -> BinaryIO:
     """Open a regular file for reading, in binary mode.
 
     `what` names the file in error messages, such as "a recording". Raises InputError for a folder, pipe, socket or
-    device, and for an empty file, which includes endless files in /proc. Raises OSError if it cannot be opened.
+    device, and for an empty file. A file in /proc counts as empty, as its stated size is 0. Raises OSError if the file
+    cannot be opened.
     """
     file = _open_checked(path, what, "rb", _NO_WAITING)
     if not os.fstat(file.fileno()).st_size:
@@ -53,7 +54,10 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
 
 
 def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+"], extra_flags: int) -> BinaryIO:
-    """Open a regular file, like `open_inner`, with `extra_flags` of `os.open`; raise InputError for any other file."""
+    """Open a regular file, with `extra_flags` of `os.open`; raise InputError for any other file.
+
+    `what`: name in messages; `mode`: `rb` to read, `ab+` to append or create, which refuses several hard links, too.
+    """
     flags = os.O_RDONLY if mode == "rb" else os.O_RDWR | os.O_CREAT | os.O_APPEND
     flags |= extra_flags | getattr(os, "O_BINARY", 0) | getattr(os, "O_CLOEXEC", 0)
     try:
@@ -74,7 +78,8 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
 def raising_unreadable(what: str, place: str | os.PathLike[str]) -> Iterator[None]:
     """Convert any error that a damaged file causes in the block to an UnreadableFile with a message of one line.
 
-    `what` ("a rig") and `place` appear in the message. MissingExtra is not changed; unexpected errors are also logged.
+    `what` ("a rig") and `place` appear in the message. MissingExtra and UnreadableFile are not changed. Unexpected
+    errors are also logged.
     """
     try:
         yield

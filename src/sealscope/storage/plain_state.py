@@ -43,7 +43,10 @@ def restore(kind: type[_T], state: Any, name: str) -> _T:
 
 
 def restore_array(value: Any, name: str) -> NDArray[np.float64]:
-    """Restore an array of doubles from the mapping that `plain_array` made; raise InputError for any other value."""
+    """Restore an array of doubles from the mapping that `plain_array` made.
+
+    `name`: its name in errors. Raises InputError for any other value, and for more than `_MAX_SIZE` numbers.
+    """
     try:
         shape = tuple(int(size) for size in value["shape"])
         if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:
@@ -57,7 +60,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
 def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     """Return the entry `name` of a saved state; raise InputError if it is missing or not of the type `kind`."""
     if not isinstance(state, Mapping) or name not in state:
-        raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without")
+        raise InputError(f"saved state must have {name!r}, got {type(state).__name__} without it")
     value = state[name]
     if not isinstance(value, kind):
         raise InputError(f"saved state's {name} must be {kind}, got {type(value).__name__}")
@@ -95,7 +98,11 @@ def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _to_plain_value(value: Any) -> Any:
-    """Convert one attribute of an object to a value that JSON can store, as `save_attributes` describes."""
+    """Convert one attribute of an object to a value that JSON can store.
+
+    An object with a method `state` is converted by this method. Dataclasses become dicts, arrays become mappings
+    (`plain_array`), tuples become lists, and a float that is not finite becomes None. Inner values are not converted.
+    """
     if callable(getattr(value, "state", None)):
         return value.state()
     if is_dataclass(value):  # its lists are copied, as they may grow

@@ -52,7 +52,8 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    `entry_name`: converts the name of an entry for the error, which has one line; `context`: data for the validators.
+    `entry_name`: function that converts the name of the wrong entry for the error, which has one line; `context`: data
+    for the validators of `kind`.
     """
     from pydantic import ValidationError
 
@@ -70,10 +71,11 @@ _PLAIN_RULES = {
 
 
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
-    """Format the first of pydantic's errors as "ENTRY must be ..., got ...", preferably one about an unknown entry.
+    """Format one of pydantic's errors in one line, such as "ENTRY must be ..., got ..." or "ENTRY is missing".
 
-    ENTRY is the path to the wrong entry, such as `line.V_1`. `entry_name` converts the first name of this path, "" if
-    the whole value is wrong; `unit`: text that is appended to the broken rule.
+    An error about an unknown entry is preferred; otherwise the first error is taken. ENTRY is the path to the wrong
+    entry, such as `line.V_1`. `entry_name`: function that converts the first name of this path, which is "" if the
+    whole value is wrong; `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
     chosen = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])
@@ -94,7 +96,8 @@ def format_error(error: ValidationError, entry_name: Callable[[str], str] = str,
 def to_plain(value: Any) -> Any:
     """Convert a value to plain values for JSON, at any depth.
 
-    Dataclasses and named tuples become dicts, tuples become lists, and numbers that are not finite become None.
+    Dataclasses and named tuples become dicts, tuples become lists, and numbers that are not finite become None. Other
+    values are not changed.
     """
     if isinstance(value, float):
         return float(value) if math.isfinite(value) else None

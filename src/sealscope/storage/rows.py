@@ -39,9 +39,10 @@ def read_rows(
 ) -> dict[str, Row]:
     """Read the results of jobs that `store_rows` stored in a folder; return the last result of each job by its id.
 
-    `parse`: parses a line to plain values; `row_of`: converts these to a result, or to None to ignore the line; `what`:
-    name of the folder in errors. An incomplete last line is ignored, and a missing file holds no results. Raises
-    UnreadableFile if the file cannot be read or a line does not fit, and InputError if the file is a link.
+    `parse`: function that parses a line to plain values; `row_of`: function that converts the plain values to a result,
+    or to None to ignore the line; `what`: name of the folder in errors. An incomplete last line is ignored, and a
+    missing file holds no results. Raises UnreadableFile if the file cannot be read or a line does not fit, and
+    InputError if the file is a link.
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -95,7 +96,7 @@ def lock_rows(folder: Path, what: str) -> Iterator[None]:
 
     Raises InputError if another process holds the lock; `what` names the folder in the error.
     """
-    busy = f"{what} must be run by one process at a time, got another at work ({folder})"
+    busy = f"{what} must be run by one process at a time, but another one is running ({folder})"
     with folders.lock_file(folder / LOCK, busy):
         remove_temporaries(folder)
         yield

@@ -48,7 +48,11 @@ def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> di
 
 
 def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Parse the content `data` of a TOML file; arguments, errors and limits are those of `read_toml`."""
+    """Parse the content `data` of a TOML file; `what` ("a rig file") and `place` name the file in error messages.
+
+    Raises InputError if the content is larger than `max_size` [bytes], is not UTF-8 or not TOML, has a whole number
+    over 2^53 or a key with more than 30 dots, or would take too much memory.
+    """
     if len(data) > max_size:
         raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
     try:
@@ -56,7 +60,7 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
         if any(key[0].count(".") > _MAX_DOTS for key in _KEY.finditer(text)):
             raise ValueError(f"a dotted key must have at most {_MAX_DOTS} dots")
         if (memory := _estimate_memory(text)) > max(_MAX_MEMORY, _MEMORY_RATIO * len(data)):
-            raise ValueError(f"{len(data)} bytes of text must hold fewer tables and values, got some {memory} bytes")
+            raise ValueError(f"{len(data)} bytes of text must take less memory when parsed, got some {memory} bytes")
         tree = tomllib.loads(text)
         _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
@@ -71,7 +75,8 @@ def read_model(
 ) -> _T:
     """Convert the tables `tree` of a TOML file to the model or dataclass `kind`; raise InputError if they do not fit.
 
-    `entry_name`: converts the name of an entry for the error; `context`: data for the validators.
+    `place`: file, for the error; `entry_name`: function that converts the name of the wrong entry for the error;
+    `context`: data for the validators of `kind`.
     """
     try:
         return convert_type(kind, tree, entry_name, context)
@@ -88,7 +93,7 @@ class PriorTable:
     """
 
     def __init__(self, **values: Any) -> None:
-        """Set the keys of the table, in its `__dict__` because `__setattr__` refuses."""
+        """Set the keys of the table, directly in its `__dict__`, because `__setattr__` refuses all changes."""
         vars(self).update(values)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -111,7 +116,10 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert a table of priors, with {value, unit, source} by key, to the type `kind`, a `PriorTable` or a mapping."""
+    """Convert a table of priors, with {value, unit, source} by key, to the type `kind`, a `PriorTable` or a mapping.
+
+    `place`: file and name of the table, for errors. Raises InputError if a key or a value does not fit `kind`.
+    """
     is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
     optional: tuple[str, ...] = ()
     if is_mapping:
@@ -127,14 +135,17 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
 
 
 def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Convert the value of a prior, given as {value, unit, source}, to `kind`: int, a tuple of numbers, or float."""
+    """Convert the value of a prior to `kind`: int, float, or a tuple of them.
+
+    `row`: the prior as {value, unit, source}; `place`: file, table and key, for the InputError if it does not fit.
+    """
     if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
         raise InputError(f"{place} must have value, unit and source, got {row!r}")
     if get_origin(kind) is tuple:
         item_kind, *rest = get_args(kind)
         has_any_length = Ellipsis in rest  # tuple[float, ...]
         if not isinstance(row["value"], list) or not (has_any_length or len(row["value"]) == 1 + len(rest)):
-            raise InputError(f"{place} must be a list as {kind}, got {row['value']!r}")
+            raise InputError(f"{place} must be a list that fits {kind}, got {row['value']!r}")
         return tuple(_parse_number(value, item_kind, place) for value in row["value"])
     return _parse_number(row["value"], int if kind is int else float, place)
 
@@ -147,7 +158,10 @@ def _parse_number(value: Any, kind: type, place: str) -> Any:
 
 
 def _check_keys(keys: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that a table has all keys in `names`, except `optional` ones, and no others; raise InputError otherwise."""
+    """Check that a table has all keys in `names`, except `optional` ones, and no others; raise InputError otherwise.
+
+    `keys`: the keys of the table; `place`: subject of the error message, such as "keys of FILE [TABLE]".
+    """
     for name in keys:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")

@@ -27,6 +27,6 @@ def check_unpacked(size: int, max_bytes: int, place: str | Path) -> None:
     """Check that the unpacked `size` of the file `place` is at most `max_bytes`; raise UnreadableFile otherwise."""
     if size > max_bytes:
         raise UnreadableFile(
-            f"a packed file must unpack to at most {max_bytes} bytes, got {size} or more: unpack it, or export it as "
-            f"CSV, where you know it ({place})"
+            f"a packed file must unpack to at most {max_bytes} bytes, got {size} or more: if you trust it, unpack it "
+            f"or export it as CSV ({place})"
         )

@@ -48,7 +48,8 @@ def noise_free_mean_squares(
 
     Returns (chambers, 5): the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4]. The pressures are sampled
     at the rig's rate after its anti-alias filter; the means are over 4 pi s (`ANALYSED`) from 7.2 s on (`SETTLING`).
-    `leak`: text of the leak, None for no leak; `x_0` [m]: first position; `values`: parameters that replace the test's.
+    `leak`: description of the leak, such as "0.01 L/min laminar", None for no leak; `x_0` [m]: initial position of the
+    piston; `values`: by name, parameters that replace those of the test.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
     values = {**experiment_values(condition), **(values or {})}
@@ -64,9 +65,9 @@ def noise_free_mean_squares(
 def log_rms(squares: Array, sigma: float) -> Array:
     """Compute the logarithm of the RMS (..., 5) of the wavelet details d1..d4 and d3d4 of pressures with white noise.
 
-    It is ``log(m_j + sigma^2) / 2`` for d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for the
-    product d3d4, with the noise-free mean `squares` (..., 5) m_1 to m_4 [psi^2] and m_34 [psi^4], and the standard
-    deviation `sigma` [psi] of the noise in the pressure.
+    It is ``log(m_j + sigma^2) / 2`` for the detail d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for
+    the product d3d4. `squares` (..., 5): mean squares without noise, m_1 to m_4 [psi^2] and m_34 [psi^4]; `sigma`:
+    standard deviation [psi] of the noise in the pressure.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -86,9 +87,9 @@ def pressure_noise(rig: Rig, chamber: str) -> float:
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
-    """Compute log(simulated/measured leak-free RMS) of d1..d4 and d3d4 in each test of Appendix C.
+    """Compute log(simulated RMS / measured RMS) of d1..d4 and d3d4 without the leak, for each test of Appendix C.
 
-    Returns (tests, chambers, 5); the rig is simulated at its own sampling rate.
+    Returns (tests, chambers, 5). `rig`: rig to simulate, at its own sampling rate; `sheet`: the measured RMS.
     """
     group_squares = {}
     for command, closed_pct in groups():
@@ -135,7 +136,10 @@ HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hy
 def predicted_sheet(
     rig: Rig, hypothesis: Hypothesis = HYPOTHESES[0], conditions: tuple[Condition, ...] = APPENDIX_C
 ) -> DataSheet:
-    """Simulate the tests of Appendix C, without and with their leaks, on a rig changed according to a hypothesis."""
+    """Simulate the tests of Appendix C, without and with their leaks, on a rig changed according to a hypothesis.
+
+    Returns the RMS of the wavelet details, with the noise of the sensors, as a data sheet of the tests in `conditions`.
+    """
     h = hypothesis
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
@@ -162,7 +166,10 @@ def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's, with sources."""
+    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's, with sources.
+
+    `context` is not used.
+    """
     fitted = load_rig(BENCH_RIG)
     thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
@@ -178,7 +185,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
     The first table has the geometric mean over all tests, "yes" if this is within 25 % of 1, and the geometric standard
-    deviation; the second the geometric mean over the tests of each operating condition.
+    deviation. The second table has the geometric mean over the tests of each operating condition.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
@@ -198,11 +205,15 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 
 
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well the fitted rig, changed as each hypothesis says, agrees with the measured data sheet.
+    """Tabulate the agreement of the fitted rig, changed according to each hypothesis, with the measured data sheet.
 
-    For each chamber the columns are the ratio of simulated to measured leak-free RMS (geometric mean over the tests;
-    details d3 and d4), the change of the simulated RMS by the leak [%] (likewise; d2 to d4), and the number of tests in
-    which simulated and measured change have the same sign (d3 and d4). The first row is the measured sheet itself.
+    For each chamber the columns are:
+
+    - the ratio of simulated to measured RMS of d3 and d4 without the leak (geometric mean over the tests)
+    - the change [%] of the simulated RMS of d2 to d4 with the leak (geometric mean over the tests)
+    - the number of tests in which the RMS of d3 and d4 changes in the same direction in simulation and measurement
+
+    The first row compares the measured sheet with itself. A quick reproduction has the first two hypotheses only.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     sheet = context.sheet

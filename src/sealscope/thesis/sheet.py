@@ -162,7 +162,8 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
     """Parse the number in a column of a row of the data sheet.
 
-    `number`, `path`: row number and file, for messages. Raises InputError unless it is > 0, or >= 0 if `allow_zero`.
+    `number`, `path`: row number and file, for messages. Raises InputError unless the value is finite and > 0, or 0 if
+    `allow_zero`.
     """
     try:
         value = float(row[column] or "nan")  # an empty cell is no number > 0

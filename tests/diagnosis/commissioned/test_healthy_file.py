@@ -97,13 +97,13 @@ def test_without_its_damaged_summary_the_machine_has_the_others(pair):
 def test_a_summary_that_is_not_there_is_named(pair):
     text, summaries = pair
     summaries.write_bytes(b"".join(summaries.read_bytes().splitlines(keepends=True)[:-1]))
-    assert "of run3.nc must be in the file of healthy summaries, got none such" in refused(text)
+    assert "of run3.nc must be in the file of healthy summaries, but is missing" in refused(text)
 
 
 def test_summaries_that_were_left_behind_are_asked_for(pair):
     text, summaries = pair
     summaries.unlink()
-    assert refused(text).startswith("actuator7.healthy must lie beside a machine's file, got none: move it there")
+    assert refused(text).startswith("actuator7.healthy must be in the folder of the machine's file: move it there")
 
 
 def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
@@ -143,7 +143,7 @@ def test_a_text_names_no_summaries_elsewhere(pair, tmp_path, name):
     other.mkdir()
     hostile = other / "hostile.toml"
     hostile.write_text(text.read_text().replace('summaries = "actuator7.healthy"', f'summaries = "{name}"'))
-    assert refused(hostile).startswith("hostile.healthy must lie beside")
+    assert refused(hostile).startswith("hostile.healthy must be in the folder")
 
 
 @pytest.mark.slow
@@ -230,8 +230,8 @@ HOSTILE = {
     "units": ([], "units"),
     "start_s": ("now", "start_s"),
     "summaries/volume balance/sums": ([[1.0]], "must be an array of numbers"),
-    "summaries/volume balance/sums ": (sums_of(0.0), "sums must be those of squares and products"),
-    "summaries/volume balance/sums  ": (sums_of(1e200), "finite numbers of a size below 1e+100"),
+    "summaries/volume balance/sums ": (sums_of(0.0), "sums must be sums of squares and products"),
+    "summaries/volume balance/sums  ": (sums_of(1e200), "finite numbers with a magnitude below 1e+100"),
     "summaries/volume balance/sums   ": (sums_of(np.nan), "finite numbers"),
     "summaries/volume balance/scale": (1e300, "scale"),
     "summaries/volume balance/flow": (-1.0, "flow"),

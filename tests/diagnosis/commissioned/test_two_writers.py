@@ -48,7 +48,7 @@ def mark(path: Path, number: int) -> None:
     span, words = (1.68e9, 1.695e9), ("piston leak", "the balance", "the seal")
     alarm = Alarm(f"press-{number}", "press", "error", "new", 1.7e9, 1.7e9, 1.69e9, span, 0.01, None, *words, 1)
     done = record_mark(str(path), alarm, "valid", [])
-    assert done == "press.toml: written down", done
+    assert done == "press.toml: mark stored", done
 
 
 def work(pipe: Connection, path: Path) -> None:

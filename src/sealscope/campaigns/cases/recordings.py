@@ -37,7 +37,7 @@ def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet
         paths = sorted(files, key=lambda path: numeric_sort_key(path.name))
         selected = paths[recordings.first - 1 : recordings.end - 1]  # `first` counts from 1, `end` is excluded
         if not selected:
-            raise InputError(f"a set's files must be there, got none for {recordings.files!r} ({folder})")
+            raise InputError(f"a set must have files, got none for {recordings.files!r} ({folder})")
         yield from ((recordings, path) for path in selected)
 
 
@@ -50,7 +50,7 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
     files = list(_iter_files(plan, folder))
     for path, count in Counter(path for _, path in files).items():
         if count > 1:
-            raise InputError(f"a recording must be in one set, got it in two ({path})")
+            raise InputError(f"a recording must be in one set only, got {count} sets ({path})")
     rows: dict[str, CaseRow] = {}
     for number, (recordings, path) in enumerate(files, 1):
         row = _judge_file(plan, recordings, path, path.relative_to(folder).as_posix())
@@ -63,7 +63,8 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 def _stroke_direction(recording: Recording) -> str:
     """Classify a recording as a stroke "out" (p_A higher on average) or "in", or else as "both".
 
-    In a stroke |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS.
+    In a stroke the |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS. Without both pressures the
+    result is "both".
     """
     if not all(name in recording for name in CHAMBERS):
         return "both"

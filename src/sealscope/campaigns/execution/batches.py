@@ -176,8 +176,9 @@ def make_step_chooser(
 
     All cases with the same levels of the factors (a cell) share the search. `N_SCOUT_MACHINES` machines are drawn for
     the cell, and on a short run of each, `integrate_run` chooses the longest step that passes its check of the error. A
-    case gets the shortest of the steps chosen with its solver, limited to the longest stable step of its machine, but
-    not refined further than by `MAX_STEP_REFINEMENT`. `profile`: by default the plan's.
+    case gets the shortest of the steps chosen for machines with the same solver as its own. The step is shortened to
+    the longest stable one of the case's machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
+    `profile`: the plan's profile if it is already loaded.
     """
     shared = digest(shared_inputs(plan))
 

@@ -53,7 +53,7 @@ def run(
     mode = store.RUN_BY_RUN
     if batch:
         if cluster is not None:
-            raise InputError("--cluster must stand without --batch: a batch runs on one machine")
+            raise InputError("--cluster cannot be combined with --batch: a batch runs on one machine")
         batches.check_plan(plan, cases)
         mode = batches.IN_BATCHES
     place = Path(folder)
@@ -73,7 +73,7 @@ def run(
             new_rows = batches.iter_batch_rows(plan, waiting, jobs)
         else:
             results = iter_results(partial(task, plan, folder=recordings), waiting, jobs, cluster)
-            error = "the process that carried it out died"
+            error = "the process that ran the record died"
             new_rows = iter_rows(results, lambda case: CaseRow.from_case(case, error=error))
         for row in store_rows(place, new_rows, store.WHAT):
             n_done += 1

@@ -33,7 +33,8 @@ class StatedErrors:
 class NamedCauses:
     """The confusion matrix of one detector: how often it names each cause, for each true cause of a record.
 
-    `covered`: fraction of records for which it names the true cause, or an ambiguous cause that includes the true one.
+    `covered`: fraction of records for which the detector names the true cause, or an ambiguous cause that includes the
+    true one.
     """
 
     detector: str
@@ -44,7 +45,8 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
-    Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks.
+    Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks;
+    `confidence`: confidence level of the intervals in the results.
     """
     for name, records in verdicts.items():
         detected = (record for record in records if record.size > 0 and record.alarm)
@@ -61,8 +63,7 @@ def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Itera
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the leak flows [L/min] that detectors state, by detector and planned mean flow (`size`).
 
-    `confidence`: probability with which a stated interval should contain the true flow. Recordings without a statement
-    are left out.
+    Records without a statement are left out. `confidence`: confidence level of the intervals in the results.
     """
     for name, records in verdicts.items():
         for size, group in group_by(records, attrgetter("size")).items():

@@ -56,7 +56,7 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     for name in dict.fromkeys(names):
         if not (trust or is_installed(name)):
             raise InputError(
-                f"a controller must be installed, or the plan be trusted to run it (--trust, when you have read it), "
+                f"a controller must be installed, or the plan must be trusted (--trust, after reading its code), "
                 f"got {name} ({plan.place})"
             )
         if name not in CONTROLLERS:
@@ -89,5 +89,5 @@ def parse_plan_fault(text: str, onset_s: float) -> Fault:
     has_time = any(f" {word} " in f" {text} " for word in ("from", "growing"))
     fault = parse_fault(text if has_time else f"{text} from {onset_s:g} s")
     if fault is None:
-        raise InputError(f"a fault must be one, got {text!r}")
+        raise InputError(f"a fault must be named, such as 'pump leak x3', got {text!r}")
     return fault

@@ -36,7 +36,9 @@ def _validate_file_name(name: str) -> str:
     A valid name has at most `_MAX_NAME_LENGTH` letters, digits, '-', '_' and '.', and does not start with '.'.
     """
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
-        raise ValueError(f"must be of at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.', no '.' first")
+        raise ValueError(
+            f"must have at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.', and not begin with '.'"
+        )
     return name
 
 
@@ -49,7 +51,7 @@ def _validate_pattern(pattern: str) -> str:
     if not parts or Path(pattern).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
     if "\0" in pattern or any("**" in part and part != "**" for part in parts) or pattern.count("**") > 1:
-        raise ValueError("must be a pattern of names, with ** once at most")
+        raise ValueError("must be a pattern of names with at most one **, which stands for whole folders")
     return pattern
 
 
@@ -71,7 +73,7 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the name of a view (a set of channels); raise ValueError if empty, with "@" or with outer blanks."""
+    """Return the name of a view (a set of channels); raise ValueError if it is empty, or has "@" or outer blanks."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -224,7 +226,8 @@ class RecordingSet(_TomlTable):
     - `files`: pattern of the file names
     - `use`: `calibrate` for healthy recordings from which thresholds are set, `judge` for recordings to be judged
     - `size`: size of the leak in the plan's `unit`, 0 for healthy recordings
-    - `first`, `end`: positions from 1 of the first file and after the last, ordered by the numbers in their names
+    - `first`, `end`: positions, counted from 1, of the first file that is used and of the first one after it that is
+      not; the files are ordered by the numbers in their names
     - `label`: name of the set in tables, by default the pattern
     """
 

@@ -55,7 +55,7 @@ def load_plan(name_or_path: str | os.PathLike[str]) -> AnyPlan:
     if text in plan_names():
         return read_plan(read_toml(_PACKAGED / f"{text}.toml", "a plan", f"plans/{text}.toml"), f"plans/{text}.toml")
     if not (text.endswith(".toml") or is_file_path(text)):
-        raise InputError(f"{text!r} is no packaged plan ({', '.join(plan_names())}) and no .toml file")
+        raise InputError(f"{text!r} is neither a packaged plan ({', '.join(plan_names())}) nor a .toml file")
     return read_plan(read_toml(Path(text), "a plan", text), text)
 
 
@@ -167,9 +167,10 @@ def _check_factors(plan: SimulatedPlan) -> None:
 
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
-    """List the commands of a plan's records: levels of the factor `command`, or commands of the profile's families.
+    """List the commands of a plan's records: the levels of the factor `command`, or else the profile's commands.
 
-    Without factor and profile the only command is '3 sin(4t)'.
+    With a factor `family`, the profile's commands are those of its levels (families). Without factor `command` and
+    profile, the only command is '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))
@@ -182,7 +183,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
     """Check that `level` is a valid value of the factor `name`; raise InputError otherwise."""
     if name == "family":
         if not plan.profile:
-            raise InputError(f"a family must be of the plan's profile, got {level!r} and no profile")
+            raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
         load_profile(plan.profile).family(str(level))
     elif name in (COMMAND, CONTROLLER, LOAD):
         check_duty(name, level, plan.rig, plan.duration_s)

@@ -110,9 +110,10 @@ class Scorer:
     """A decision rule of the thesis that computes a score of a record, to be compared with a threshold.
 
     `conditions`: each a wavelet detail, a chamber and a direction, such as ("d3", "p_A", "fell"); `threshold`: fixed
-    threshold, None if it is set from leak-free records. The rule's score is the smallest of its conditions' scores. By
-    direction, these are the change of the detail's log RMS from the first to the second part of the record ("rose"),
-    its negative ("fell"), its magnitude ("changed"), the log RMS over both parts ("high"), or its negative ("low").
+    threshold, None if it is set from leak-free records. The rule's score is the smallest of its conditions' scores. The
+    score of a condition depends on its direction: it is the change of the detail's log RMS from the first to the second
+    part of the record ("rose"), its negative ("fell"), its magnitude ("changed"), the log RMS over both parts ("high"),
+    or its negative ("low").
     """
 
     name: str

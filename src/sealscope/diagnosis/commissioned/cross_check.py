@@ -26,10 +26,10 @@ def cross_check(
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
-    out with `keep`, or if at least half of them seem to leak, as there is then no healthy majority. Nor is one in which
-    a leak seems to begin that no later recording shows (`_has_healed`). Fewer than `MIN_RECORDINGS` recordings are not
-    judged. Returns the remaining recordings, and the reason for each recording left out. If a remaining recording shows
-    a leak or another event, its problems (`about["wrong"]`) state it.
+    out if `keep` is True, or if at least half of the recordings seem to leak, as there is then no healthy majority. A
+    recording in which a leak seems to begin is also kept if no later recording shows a leak (`_has_healed`). Fewer than
+    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each recording left
+    out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
     """
     problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
     begins_within = set[str]()  # names of the files in which a leak seems to begin
@@ -56,7 +56,7 @@ def cross_check(
 def _has_healed(file: str, healthy: Sequence[SummarisedRecording], leaking: Collection[str]) -> bool:
     """Return True if recordings were made after that of the `file`, and none of them is among the `leaking` files.
 
-    Since a worn seal does not heal, the apparent onset of a leak is then a peculiarity of the healthy machine.
+    Since a worn seal does not heal, the leak that seemed to begin in the recording is then no leak.
     """
     start_s = next(recording.start_s for recording in healthy if recording.file == file)
     if start_s is None:

@@ -102,12 +102,12 @@ def _check_array(value: Any) -> Any:
     if not isinstance(value, np.ndarray):
         raise ValueError("must be an array of numbers")
     if not (np.abs(value) < _MAX_NUMBER).all():
-        raise ValueError(f"must hold finite numbers of a size below {_MAX_NUMBER:g}")
+        raise ValueError(f"must hold finite numbers with a magnitude below {_MAX_NUMBER:g}")
     return value
 
 
 def _check_statistic(value: Any) -> Any:
-    """Return the value if it is a float or an array of finite numbers below 1e100; raise ValueError otherwise."""
+    """Return the value, a float or an array, if its numbers are finite and below 1e100; raise ValueError otherwise."""
     _check_array(np.array(value) if isinstance(value, float) else value)
     return value
 
@@ -115,12 +115,15 @@ def _check_statistic(value: Any) -> Any:
 def _check_sums(summary: Any) -> Any:
     """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
 
-    `sums` (E, m, m) holds for each of E balances the sums of products of its m columns: the `terms`, which must include
-    the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey Cauchy's
-    inequality. `shut_sums` (1, m + 2, m + 2) are the sums for a pump that valves cut off at rest, which needs two more
-    columns; `held` are the leaks while valves hold the load; `held_pump` are the pump's leakage just before these times
-    and its standard deviation; `stroke` are the ends of the recorded motion; and `resistance` is what resists the
-    motion (`recording_sums.Resistance`).
+    The array `sums` (E, m, m) has for each of E balances the sums of products of its m columns: the `terms`, which must
+    include the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey
+    Cauchy's inequality. The other arrays may be None:
+
+    - `shut_sums` (1, m + 2, m + 2): the sums if valves cut the pump off at rest, which needs two more columns.
+    - `held`: fields of `HeldLeaks`, the leaks while valves hold the load.
+    - `held_pump` (2,): the pump's leakage just before these times, and its standard deviation.
+    - `stroke` (2,): lower and upper end of the recorded motion.
+    - `resistance`: fields of `recording_sums.Resistance`, a fit of what resists the motion.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -142,12 +145,12 @@ def _check_sums(summary: Any) -> Any:
         if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # these are divisors
             raise ValueError("resistance must hold positive standard errors and a positive speed")
     if LEAK not in summary.terms:
-        raise ValueError(f"terms must have {LEAK!r}, got {', '.join(summary.terms)}")
+        raise ValueError(f"terms must include {LEAK!r}, got {', '.join(summary.terms)}")
     leak = summary.terms.index(LEAK)
     squares = summary.sums[:, [leak, -1], [leak, -1]]  # (E, 2): sums of squares of leak and left side
     product = summary.sums[:, leak, -1]
     if not (squares > 0.0).all() or not (product**2 <= _ROUNDING * squares.prod(axis=1)).all():
-        raise ValueError("sums must be those of squares and products of a leak and a flow, got none such")
+        raise ValueError("sums must be sums of squares and products of a leak and a flow, got other numbers")
     return summary
 
 
@@ -162,7 +165,7 @@ def _check_levels(summary: Any) -> Any:
         shapes = f"{summary.levels.shape} and {summary.duty.shape}"
         raise ValueError(f"levels and duty must be of the shapes {expected} and ({len(DUTY)},), got {shapes}")
     if not max(np.abs(summary.levels).max(), np.abs(summary.duty).max()) < _MAX_LOGARITHM:
-        raise ValueError(f"levels and duty must be logarithms, of a size below {_MAX_LOGARITHM:g}")
+        raise ValueError(f"levels and duty must be logarithms with a magnitude below {_MAX_LOGARITHM:g}")
     return summary
 
 
@@ -176,7 +179,7 @@ def _check_octaves(values: Any) -> Any:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
         raise ValueError(f"octaves must be of the shape {shape}, got {values.shape}")
     if not np.abs(values).max() < _MAX_LOGARITHM or (values[-1] < 0.0).any():
-        raise ValueError(f"octaves must be logarithms, phases and variances, of a size below {_MAX_LOGARITHM:g}")
+        raise ValueError(f"octaves must hold logarithms, phases and variances below {_MAX_LOGARITHM:g} in magnitude")
     return values
 
 
@@ -250,9 +253,10 @@ _ABOUT = {
 
 
 def _restore_arrays(value: Any, name: str) -> Any:
-    """Convert packed arrays (tables of "shape" and "f8") at any depth of a JSON value to arrays.
+    """Convert packed arrays (tables of "shape" and "f8") in a JSON value, at any depth of nested tables, to arrays.
 
-    `name` is the key of the value. Raises ValueError with the key of an array that is not valid.
+    Lists are returned unchanged. `name` is the key of the value. Raises ValueError with the key of an array that is not
+    valid.
     """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
@@ -305,9 +309,10 @@ def _format_json(value: Any) -> bytes:
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Check that the summary by the detector `method` can be stored and read back, e.g. is finite.
+    """Check that the summary by the detector `method` can be stored and read back; its numbers must be finite.
 
-    Raises ArithmeticError otherwise; `log_failure` attributes this error to the recording, not to the detector.
+    Raises ArithmeticError otherwise. For a built-in detector, `log_failure` attributes this error to the recording, not
+    to the detector.
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
@@ -355,9 +360,10 @@ _REMEDY = "take its [[healthy]] out of the machine's file, or commission it anew
 
 
 def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecording]:
-    """Read the summaries of the recordings in `files`, a mapping of line checksum to recording name, in its order.
+    """Read the summaries of the recordings in `files`, which maps the checksum of a line to the recording's name.
 
-    Raises InputError if the file is missing, of another kind or too large, or if a line is missing or not valid.
+    The result has the order of `files`. Raises InputError if the file at `path` is missing, of another kind or too
+    large, or if one of the lines is missing or not valid.
     """
     recordings: dict[str, SummarisedRecording] = {}
     for line in _iter_lines(path):
@@ -365,7 +371,7 @@ def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecor
             recordings[line.checksum] = parse_summary(line, files[line.checksum], str(path))
     for checksum, file in files.items():
         if checksum not in recordings:
-            rule = "must be in the file of healthy summaries, got none such"
+            rule = "must be in the file of healthy summaries, but is missing"
             raise InputError(f"the summary {checksum[:12]}... of {file} {rule}: {_REMEDY} ({path})")
     return [recordings[checksum] for checksum in files]
 

@@ -152,7 +152,7 @@ class CommissionedMachine:
     def diagnose(
         self, recording: Recording | str | os.PathLike[str], *, false_alarm_probability: float = FALSE_ALARM_PROBABILITY
     ) -> Diagnosis:
-        """Decide whether a recording, or the log at a path, shows a leak, given the machine's healthy recordings.
+        """Decide if a recording, or the log at a path, shows a leak, given the machine's healthy recordings.
 
         Arguments, result and errors are as in `sealscope.diagnose`; rig, baseline and repair limit are the machine's.
         """
@@ -179,7 +179,7 @@ class CommissionedMachine:
                 raise InputError(f"a healthy recording must not leak, got one that does: {diagnosis.reason} ({file})")
         start_s = start_seconds(recording, file)
         if start_s is not None and (leak := self._find_confirmed_leak(start_s, start_s + recording.duration)):
-            raise InputError(f"a healthy recording must be of a time without a leak, got {leak} ({file})")
+            raise InputError(f"a healthy recording must be from a time without a leak, got {leak} ({file})")
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
@@ -196,8 +196,8 @@ class CommissionedMachine:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
         An alarm judged "valid" or "repaired" is a confirmed leak, open from its onset until the next repair. A later
-        judgement "invalid" of an alarm of the same name revokes it, unless the onset stated there is after the
-        confirmation, as that is another alarm.
+        judgement "invalid" of an alarm with the same name revokes the confirmation, unless the onset of the invalid
+        alarm is after the confirmation: then it is another alarm.
         """
         for k, leak in enumerate(self.alarms):
             is_revoked = any(
@@ -235,7 +235,8 @@ class CommissionedMachine:
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a log with the channel map of its machine or, if the log does not fit the map, without a map.
 
-    `rate` is the sampling rate [Hz] without a time column. If both fail, the first UnreadableFile is raised.
+    `rate` is the sampling rate [Hz] of a log without a time column. If both attempts fail, the UnreadableFile of the
+    first one is raised.
     """
     if not channel_map:
         return read(path, rate=rate)
@@ -310,7 +311,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
                     distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
                     log_failure(name, distribution, error)
         if not summaries:
-            raise InputError(f"a healthy recording must hold channels that a method reads, got none such ({file})")
+            raise InputError(f"a healthy recording must have channels that a method can use, got none ({file})")
         if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra
             summaries[HealthyLevels.name] = levels
         return SummarisedRecording(

@@ -61,7 +61,7 @@ _RENAMED = {"lesson": "summary", "lessons": "summaries"}
 _SPARE = 5_000_000
 #: Longest wait [s] for another process that writes, and the error after it.
 _LONGEST_WAIT = 60.0
-_BUSY = "a machine's file must be free to be written, got another process that writes it ({})"
+_BUSY = "a machine's file must not be in use, got another process that writes it ({})"
 _HEAD = """\
 # A machine commissioned by Sealscope. [machine], [map] and [rig] may be edited; [learnt] is written anew with each
 # change; a [[healthy]] is a recording that diagnoses compare with: without it, the recording is forgotten. The numbers
@@ -76,7 +76,7 @@ def parse_moment(text: Any) -> float:
         seconds = (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
         datetime.fromtimestamp(seconds, UTC)  # raises for a time that could not be written again
     except (TypeError, ValueError, OverflowError, OSError):
-        raise ValueError("must be a time as ISO 8601 writes it") from None
+        raise ValueError("must be a time in the format of ISO 8601") from None
     return seconds
 
 
@@ -158,7 +158,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
             present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
             change = _find_change(machine.origin, present, written)
             if change is not None:
-                raise InputError(f"a machine's file must be as it was read, got {change}: load it again ({target})")
+                raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
         _write_files(machine, target)
     return Path(path)
 
@@ -169,8 +169,8 @@ def update_machine(
     """Apply a change to a machine's file without losing changes that another process makes at the same time.
 
     `change` converts the machine that was read to the machine to write. If another process has written the file
-    meanwhile, it is called a second time, with the new file's machine. Returns the changed machine. Raises InputError
-    as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
+    meanwhile, `change` is called a second time, with the machine of the new file. Returns the changed machine. Raises
+    InputError as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
     """
     target = _resolve_target(path)
     machine = read_machine(target)
@@ -208,10 +208,10 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: the summaries, then a backup of the present TOML file, then the new TOML file.
 
-    With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. The
-    present file of summaries is extended by those of the machine. Summaries that neither the machine nor the present
-    TOML file or its backup names are kept only while the total size stays below 5 MB (`_SPARE`). Raises InputError if
-    the TOML file could not be read back.
+    With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. The new
+    file of summaries has those of the machine and those that the present TOML file or its backup names. Other summaries
+    of the present files are kept as long as the total size stays below 5 MB (`_SPARE`). Raises InputError if the TOML
+    file could not be read back.
     """
     data = _format_text(machine, target)
     _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
@@ -310,7 +310,10 @@ def _read_if_valid(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the valid checksums of summaries that the tables of a machine's file name."""
+    """List the checksums of summaries in the tables `tree` of a machine's file; entries that are no text are skipped.
+
+    The list is empty if the tables are not valid.
+    """
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
@@ -372,9 +375,9 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
     """Format a table as lines of TOML: first plain values, then inner tables.
 
-    An inner table of plain values only is a value on one line, except in the outermost table. `path` is the table's
-    dotted name, "" for the file itself, in which a list becomes an array of tables; `heading` is the line to write
-    before the table's values.
+    `path` is the table's dotted name, "" for the outermost table, which is the file itself. In this table a list
+    becomes an array of tables. In other tables, an inner table that has only plain values is written on one line.
+    `heading` is the line to write before the table's values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -397,7 +400,7 @@ def _format_key(name: str) -> str:
 
 
 def _format_value(value: Any) -> str:
-    """Format a plain value as TOML. Entries of a table that are None are left out; numbers keep all their digits."""
+    """Format a plain value as TOML; entries of a table that are None are left out, and numbers keep all digits."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):
@@ -445,7 +448,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     rig_tables = {name: table for name, table in tree.items() if name not in (*MACHINE_TABLES, "map")}
     summaries = _summaries_path(target, tree)
     if not summaries.exists():
-        rule = "must lie beside a machine's file, got none: move it there, or commission the machine anew"
+        rule = "must be in the folder of the machine's file: move it there, or commission the machine anew"
         raise InputError(f"{summaries.name} {rule} ({place})")
     return CommissionedMachine(
         name=machine_table["name"],

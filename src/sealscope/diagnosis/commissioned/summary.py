@@ -68,7 +68,10 @@ class MachineSummary:
     problems: list[str] = field(default_factory=list)  # problems of the recordings, one line each
 
     def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
-        """Format the summary as a table of about ten lines; `rig` states the machine's sizes, if any."""
+        """Format the summary as a table of about ten lines.
+
+        `healthy` are the recordings from which it was made, and `rig` states the machine's sizes, if any are stated.
+        """
         units = dict(healthy[0].units) if healthy else {}
         # units in the log of the first recording, or else the usual ones
         log_units = healthy[0].about.get("log_units", {}) if healthy else {}
@@ -100,7 +103,7 @@ class MachineSummary:
         return "\n".join(paragraphs(rows, columns=16))
 
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
-        """Build the rows (heading, text) on the smallest detectable leak and on what would halve it.
+        """Build the rows (heading, text) on the smallest detectable leak and on the recordings needed to halve it.
 
         `n_healthy` is the number of healthy recordings; `are_dated` is True if their dates are known.
         """
@@ -134,7 +137,8 @@ def _describe_rig(rig: Rig | None) -> str:
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
     """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
 
-    Unknown quantities are left out: the flow is known only with a stated displacement or area, or from a flow meter.
+    Pressures are stated in `pressure_unit`. Unknown quantities are left out: the flow is known only with a stated
+    displacement or area, or from a flow meter.
     """
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     # "scale": factor from the flow of the balance to the true flow, 0 if unknown
@@ -157,7 +161,9 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
-    """Collect figures of a healthy recording for display, by name. Unknown figures are left out.
+    """Collect figures of a healthy recording for display, by name; unknown figures are left out.
+
+    `inspection` has the corrected samples of the recording and the findings on it.
 
     - `pressure_bar`: mean of abs(p_A - p_B) [bar].
     - `oil_degC`: oil temperature [deg C].
@@ -254,9 +260,9 @@ def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Arra
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `balance` is the detector that made the `summaries` of the healthy recordings, with these channels. The leakage of a
-    recording is compared with the healthy mean by Student's t test. A leak that is detected with the probability
-    `power` (`priors.toml`) raises the leakage by
+    `balance` is the detector that made the `summaries` of the healthy recordings, and `channels` are the recorded
+    channels. The leakage of a recording is compared with the healthy mean by Student's t test. A leak that is detected
+    with the probability `power` (`priors.toml`) raises the leakage by
 
         rise = (threshold of the test + normal quantile of `power`) * deviation,
 

@@ -26,7 +26,7 @@ from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.states import joint_causes
 
-#: Name of the third test, besides WITHIN and AGAINST: whether the leakage exceeds the limit in the rig's file.
+#: Name of the third test, besides WITHIN and AGAINST: for leakage above the limit in the rig's file.
 LEVEL = "against the rig's file"
 
 
@@ -96,13 +96,14 @@ class Case:
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
     def shows_leak(self, alarm: LeakTest) -> bool:
-        """Return True if a leak caused an alarm, or if the recording does not tell a leak from an external leak.
+        """Return True if a leak probably caused an alarm, or if a leak and an external leak cannot be distinguished.
 
-        `alarm`: the test that raised the alarm. There are two cases, with limits of `[explanation]` in `priors.toml`:
+        `alarm` is the test that raised the alarm. The result is True in two cases, with the limits `leak`, `named` and
+        `sure` from the table `[explanation]` of `priors.toml`:
 
         - The probability of a leak past piston or pump is above `leak`.
-        - The probability of this leak or an external leak is above `named`, that of the external leak alone is not, and
-          neither of the two is excluded, i.e. both have a probability above 1 - `sure`.
+        - The probability that it is one of the two, a leak past piston or pump or an external leak, is above `named`,
+          the probability of the external leak alone is not, and each of the two has a probability above 1 - `sure`.
         """
         limits, leak = DECISION.explanation, self.leak_probability(alarm)
         if leak > limits.leak:
@@ -112,9 +113,10 @@ class Case:
         return joint > limits.named >= external and min(leak, external) > 1.0 - limits.sure
 
     def _data_kind(self, alarm: LeakTest) -> str:
-        """Return the kind of data (`Observable.data`) by which the test `alarm` raised its alarm.
+        """Return the kind of data (`Observable.data`) from which the test `alarm` was computed.
 
-        It is `RISE` for a comparison with healthy recordings, else that of the judging detector's first test result.
+        It is `RISE` for a comparison of measured leakage with healthy recordings. Otherwise it is the kind of the
+        judging detector's first test result.
         """
         if alarm.name == AGAINST and self.leak is not None:
             return RISE
@@ -142,7 +144,7 @@ class Case:
         An older leak explains the rise over healthy recordings and, by its law, some changes with the pressure. One
         that began within the recording explains a step (a sudden increase) and the rise that this step causes. The
         result is True without measured leakage or healthy recordings, or if the times in which valves hold the load
-        show when the rise began (`rise_onset`).
+        show when the rise began (`rise_onset` is not None).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -155,9 +157,10 @@ class Case:
     def leak_flow(self, alarm: LeakTest) -> Flow | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
-        For an alarm by comparison with healthy recordings it follows from the rise over them. For an alarm by a step
-        within the recording it is the step's flow, or that of an older leak if this explains the step
-        (`has_onset_within`) and its flow is known.
+        After an alarm by comparison with healthy recordings, this is the flow of the rise over them; after an alarm by
+        the limit in the rig's file, the total leakage. After an alarm by a step within the recording, it is the step's
+        flow. If an older leak explains the step better (`has_onset_within` is False) and the flow of this leak is
+        known, the flow of the older leak is returned instead.
         """
         leak = self.leak
         if leak is None:
@@ -172,7 +175,8 @@ class Case:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
         The observables are tried in the order of their p-values, as long as these are below the allowed probability of
-        naming an event by mistake. For each, single causes come before groups of inseparable causes (`joint_causes`).
+        naming an event by mistake. For each observable, single causes are tried before groups of inseparable causes
+        (`joint_causes`).
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -236,10 +240,11 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     Two tests share the allowed false-alarm probability. A fraction of it (`questions.within` in `priors.toml`) goes to
     WITHIN if the other test is AGAINST, or to LEVEL if the other test is WITHIN. The rest goes to the other test.
 
-    A chance is compared with the test's part. That of a step is `StepTest.chance` (`inference/onset.py`), divided by
-    the fraction that the law of the leak has (`inference/leak_law.py`), and calibrated (`null.py`) by the chances that
-    the same test gave in the healthy recordings (`healthy_null` of `detectors/observation.py`). That of a rise is
-    `Rise.chance`; of a level, that of the normal distribution.
+    The p-value (`chance`) of each test is compared with the test's part of the probability. The p-value of a step is
+    `StepTest.chance` (`inference/onset.py`). In the volume balance it was divided by the prior probability of the
+    leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`null.py`) by the p-values that the same
+    test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
+    `Rise.chance`, and that of a level follows from the normal distribution.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
@@ -275,9 +280,9 @@ def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
     Of the test results that a leak changes, the one with the smallest p-value gives the score and the calibrated
-    p-value (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. It is
-    computed as the score with a calibrated p-value equal to the allowed false-alarm probability, assuming that scores
-    are proportional to the logarithm of the detector's p-value.
+    p-value (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. The
+    threshold is therefore computed as the score with a calibrated p-value equal to the allowed false-alarm probability,
+    assuming that scores are proportional to the logarithm of the detector's p-value.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

@@ -37,7 +37,7 @@ def rank(detector: str) -> int:
 
 
 def is_decided(evidence: Evidence) -> bool:
-    """Return True if a detector could use the recording and states leak, no leak, a change's cause, or an alarm."""
+    """Return True if a detector could use the recording and states leak, no leak, an alarm or the cause of a change."""
     return evidence.usable and not evidence.abstains
 
 
@@ -45,8 +45,9 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     """Combine the decisions of several detectors into the decision of the first one, by rank, that decides.
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
-    can use the recording. If none decides, the verdict is `cannot tell`. It also replaces `no leak` if the recording's
-    end is not judged, or for a reason `refusal`: a measuring detector failed, or no baseline recording is comparable.
+    can use the recording. If no detector decides, the verdict is `cannot tell`. This verdict also replaces `no leak` if
+    the recording's end is not judged, or if there is a `refusal`: the reason why a measuring detector failed, or why no
+    baseline recording is comparable.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -75,9 +76,9 @@ def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -
     """Make the verdict `cannot tell` with a reason, for a recording on which no detector decides.
 
     `ranked` are the decisions of all detectors by rank, and `usable` those of detectors that could use the recording.
-    The reason is that of the first usable detector; if this is the change of RMS, the reason why the volume balance
-    cannot be used comes first. If no detector is usable, it is the reason of the last built-in detector by rank, which
-    needs the fewest channels.
+    The reason is that of the first usable detector. If this detector is the change of RMS, the reason why the volume
+    balance cannot be used is put before it. If no detector is usable, the reason is that of the last built-in detector
+    by rank, which needs the fewest channels.
     """
     if usable:
         undecided = usable[0]

@@ -59,13 +59,14 @@ def decide(
 ) -> Evidence:
     """Decide on a recording by the report `judge` of one detector: leak, no leak, or cannot tell.
 
-    `reports` are those of all detectors, with or without that of `judge`; their observables may show other causes,
-    which compete with a leak unless `weigh_rivals` is False. `null` is the distribution of the observables in healthy
-    recordings of the machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free recording.
+    `reports` are those of all detectors; they may contain `judge`. Their test results (observables) may show other
+    causes, which compete with a leak unless `weigh_rivals` is False. `null` is the distribution of the test results in
+    healthy recordings of the machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free
+    recording.
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
-    # two measures of the leak use the same samples, and do not compete
+    # reports that measure the leak use the same samples as the judge's measurement, and do not compete with it
     rivals = [report for report in reports if report is not judge and (report.leak is None or judge.leak is None)]
     observables = [*judge.observables]
     if weigh_rivals:
@@ -78,8 +79,8 @@ def decide(
 def _decide_without_leak(case: Case) -> Evidence:
     """Decide between `no leak` and `cannot tell`, given that no test has found a leak.
 
-    The verdict is `no leak` if an undetected leak can only be small. The evidence states the cause of another event
-    that explains a rare change and, if leakage is measured, the bound of an undetected leak.
+    The verdict is `no leak` if an undetected leak can only be small. If another event explains a rare change, the
+    evidence states the event's cause. If leakage is measured, it also states the upper bound of an undetected leak.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
@@ -99,7 +100,12 @@ def _decide_without_leak(case: Case) -> Evidence:
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
-    """Make the verdict `leak`, detected by the test `alarm`, with cause, onset and, if measured, flow of the leak."""
+    """Make the verdict `leak`, detected by the test `alarm`, with cause, onset and, if measured, flow of the leak.
+
+    The onset is that of the step or of the rise over healthy recordings or, without measured leakage, that of the
+    rarest change. No onset is stated after an alarm by the limit in the rig's file, or of a leak that seems older than
+    the recording (`Case.has_onset_within`).
+    """
     leak = case.leak
     if leak is None:
         fields: dict[str, Any] = {"cause": "piston leak"}
@@ -137,10 +143,11 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 
 
 def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
-    """Compute the fields of `Evidence` that state how large a leak is, by their names; none without a `flow`.
+    """Compute the fields of `Evidence` on the size of a leak, by their names; none without a `flow`.
 
-    The mean `flow` is stated relative to the machine and, if `leak` has a factor to L/min, in L/min with a 95 %
-    interval, which allows for the ratio of true to stated flow (`flow_factors`). Otherwise L/min are refused.
+    The mean `flow` is stated relative to the machine. If `leak` has a factor to L/min, it is also stated in L/min with
+    a 95 % interval, which is widened by the possible ratios of true to stated flow (`flow_factors`). Otherwise the
+    field `refuses` says that L/min are not stated.
     """
     if flow is None:
         return {}
@@ -178,8 +185,9 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
     If leakage is measured, both are flows [m^3/s]: the argument `bound`, and a fraction (`worth.share` in
-    `priors.toml`) of the flow while the pump delivers. Otherwise they are changes of the logarithm of the pressures'
-    ringing (RMS of their wavelet details), infinite if not measured, after an alarm, or at too low a sampling rate.
+    `priors.toml`) of the mean flow while the pump delivers. Otherwise both are changes of the logarithm of the
+    pressures' ringing (RMS of their wavelet details). The bound is then infinite if the ringing was not measured, if a
+    test raised an alarm, or if the sampling rate is too low.
     """
     if case.leak is not None:
         _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
@@ -191,10 +199,10 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 
 
 def _findable_step(case: Case) -> float | None:
-    """Compute the mean flow [m^3/s] of the smallest step of a leak that its test would call a leak.
+    """Compute the mean flow [m^3/s] of the smallest leak that the test for a step would detect with a high probability.
 
-    The test has its own part of the false-alarm probability, which is converted to a p-value before calibration by the
-    healthy recordings. None if no step is tested.
+    The test may use its part of the false-alarm probability. This part is converted to the uncalibrated p-value that
+    the detector must reach. The result is None if no step is tested.
     """
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
@@ -205,10 +213,11 @@ def _findable_step(case: Case) -> float | None:
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to `evidence` name, share and leakage ratio from the report that the verdict rests on, and its tests.
+    """Add to `evidence` fields of the judging detector's report and the results of its tests.
 
-    Score, threshold and p-value are those of the deciding test, `judging`; if it is None, nothing of tests is added. If
-    there are several tests, `parts` has an entry for each.
+    From the report come the detector's name, the used fraction of the recording and, if measured, the ratio of
+    displacement to area. Score, threshold and p-value are those of the test `judging`; if it is None, no test result is
+    added. If there are several tests, `parts` has an entry for each.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)

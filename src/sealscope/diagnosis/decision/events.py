@@ -17,16 +17,16 @@ class Event:
     """An event that may happen to a machine or its instruments within a recording, from `events.toml`."""
 
     name: str  # such as "piston leak" or "pump wear"
-    cause: str | None  # heading under which a verdict names the event, None if a verdict never does
+    cause: str | None  # heading under which a verdict names the event, None if no verdict names it
     probability: float  # prior probability that it begins within a recording
     affected: tuple[str, ...]  # patterns "data: name" of the observables that it changes
-    scaled: tuple[str, ...]  # patterns of those that it changes by multiplying both pressures by a common factor
-    disturbed: tuple[str, ...]  # patterns of those that it may change as a side effect
+    scaled: tuple[str, ...]  # patterns of observables that it changes by multiplying both pressures by one factor
+    disturbed: tuple[str, ...]  # patterns of observables that it may change as a side effect
     description: str  # phrase for what it changes, used in a verdict's reason: "the external leakage on side A"
 
     @property
     def is_sized(self) -> bool:
-        """True if a verdict may name the event, which then has a prior on its size (part of `Observable.advantage`)."""
+        """True if the event has a prior on its size (part of `Observable.advantage`), i.e. if a verdict may name it."""
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:

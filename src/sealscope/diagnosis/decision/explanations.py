@@ -69,10 +69,10 @@ def explain(
 ) -> tuple[Explanation, ...]:
     """Find the sets of events that may explain the tests (`observables`) of a recording, the most probable first.
 
-    `chance` gives the p-value of an observable (`null.HealthyNull.chance`), by default the one that its detector
-    states, and `rise` is the leakage above that of healthy recordings. Returns the single events of `events.toml`, such
-    as a sensor drift, and combinations of up to `MAX_EVENTS` that the observables support. Their probabilities are
-    given that some event has happened.
+    `chance` computes the p-value of an observable (`null.HealthyNull.chance`), by default the one that its detector
+    states. `rise` is the leakage above that of healthy recordings, None without such recordings. Returns all single
+    events of `events.toml`, such as a sensor drift, and combinations of up to `MAX_EVENTS` events whose own log Bayes
+    factors are above `MIN_LOG_FACTOR`. Their probabilities add up to 1, as they are given that some event has happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -94,7 +94,7 @@ def explain(
 
 
 def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of those terms of the volume balance that do not describe a change best.
+    """Derive the log Bayes factors of all terms of the volume balance from the term that describes a change best.
 
     The terms are alternative descriptions of the same residual. A term's log likelihood l is the log Bayes factor of
     its uncalibrated p-value. The best term has the log likelihood L and the calibrated log Bayes factor B. With the
@@ -102,8 +102,9 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 
         log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
-    Healthy recordings show how rare the best description is, but are too few to show which term is the best; for that
-    only the judged recording counts. Calibrated factors of other data are returned unchanged.
+    Healthy recordings show how rare the best description is, but are too few to show which term is the best. Only the
+    judged recording shows this. `log_factors` has each observable with its calibrated log Bayes factor. Factors of
+    other kinds of data are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -137,9 +138,9 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
 
         log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
 
-    For the leakage's rise over healthy recordings, the negative factors of events that contradict it are added.
-    `gains_of` has the log Bayes factors of each event by kind of data, in one mapping for each possible onset
-    (`_possible_gains`). The combination of onsets with the largest sum counts.
+    For the leakage's rise over healthy recordings (the kind of data `RISE`), the negative factors of events that
+    contradict the rise are added. `gains_of` has the log Bayes factors of each event by kind of data, in one mapping
+    for each possible onset (`_possible_gains`). The combination of onsets with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -162,8 +163,8 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third one is for an
-    older leak that is not laminar: how its flow changes with the pressure shows its size, which must then agree with
+    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third mapping is for
+    an older leak that is not laminar. Its size follows from how its flow changes with the pressure, and must agree with
     the rise.
     """
     gains = _gains_at_onset(event, factors)
@@ -180,11 +181,11 @@ def _possible_gains(
 
 
 def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
-    """Compute how well a leak that is older than the recording explains the changes of the leakage within it.
+    """Compute the log Bayes factor of a leak older than the recording, given changes of the leakage in the recording.
 
-    The result is a log Bayes factor of at least 0: that of a leak that begins within the recording, `step_gain`, minus
-    the log likelihood ratio of this leak to the older one (`LeakRise.onset_log_ratio`), which is reduced for the
-    models' misfit as all factors are (`_correct_for_misfit`).
+    The result is at least 0. It is `step_gain`, the log Bayes factor of a leak that begins within the recording, minus
+    the log likelihood ratio of this leak to the older one (`LeakRise.onset_log_ratio`). This ratio is divided by
+    1 + 2 m `step_gain`, with the misfit m of the models (`explanation.misfit` in `priors.toml`).
     """
     misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * step_gain
     return max(step_gain - rise.onset_log_ratio / misfit_divisor, 0.0)
@@ -193,12 +194,13 @@ def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are test results (observables) with the log Bayes factors of a change. The log odds from the prior on the
-    event's size are added to them. The event changes observables by any amount, or by a common scale of both pressures,
-    on which these must agree (`_agree_on_scale`). Of these observables, the one with the largest factor gives the time
-    of the event; others count if they may have changed then. Side effects on other kinds of data count only if an
-    affected observable supports the event. Their factors are limited to the largest one of the affected observables: a
-    much clearer side effect has another cause.
+    `factors` are test results (observables) with the log Bayes factors of a change. The event affects observables
+    freely, or by a common scale of both pressures, on which the observables must agree (`_agree_on_scale`). The
+    affected observable with the largest factor gives the time of the event. Others count if they may have changed at
+    that time. Side effects on other kinds of data count only if an affected observable supports the event. Their
+    factors are limited to the largest one of the affected observables, as a much clearer side effect has another cause.
+    For each kind of data the largest factor is returned, with the log odds from the prior on the event's size added. If
+    the event affects no observable, the result is empty.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
@@ -221,12 +223,14 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 
 
 def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Reduce the log Bayes factors of changes by how badly a common scale of both pressures explains them.
+    """Reduce the log Bayes factors of changes that a common scale of both pressures does not explain well.
 
-    Each observable states the logarithm v of the scale that would cause its change. If k is the logarithm of the common
-    scale, the log factor is reduced by ((v - k) / s)^2 / 2, to 0 at least. The standard deviation s includes
-    `explanation.scale` of `priors.toml`, the error of a law that relates the change to the scale. k is the one of the v
-    with the largest sum of reduced factors. Observables without a stated scale are left out.
+    `factors` has observables with their log Bayes factors. Each observable states the logarithm v of the scale that
+    would cause its change. If k is the logarithm of the common scale, the log factor is reduced by ((v - k) / s)^2 / 2,
+    but not below 0. The variance s^2 is that of v plus the square of `explanation.scale` of `priors.toml`, the error of
+    the law that relates the change to the scale. For k, each v is tried, and the one with the largest sum over kinds of
+    data of the largest reduced factor is used. Observables without a stated scale are left out. The result is empty if
+    no factor remains above 0.
     """
     best: list[tuple[Observable, float]] = []
     best_sum, misfit = 0.0, DECISION.explanation.scale
@@ -248,8 +252,9 @@ def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) ->
     """Compute the log Bayes factor of a change of an observable from its p-value `chance`.
 
     A quantity such as an external leakage may describe the same change as a leak. It then seems to rise if the leakage
-    rises above that of healthy recordings (`rise`). Its observable states `log_ratio_to_leak`, the log likelihood ratio
-    of this description to that by a leak. Its log factor is at most that of the rise plus this ratio.
+    rises above that of healthy recordings (`rise`). The observable of such a quantity states `log_ratio_to_leak`, the
+    log likelihood ratio of its description of the change to the description by a leak. Its log factor is limited to the
+    log factor of the rise plus this ratio, but not below 0.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -267,9 +272,9 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if two observables may have changed together: an onset is unknown, or the two are near.
+    """Return True if two observables may have changed at the same time: an onset is unknown, or both are near.
 
-    They are near if they differ by at most half the sum of the widths of their 95 % intervals.
+    Two onsets are near if they differ by at most half the sum of the widths of their 95 % intervals.
     """
     if observable.onset is None or anchor.onset is None:
         return True
@@ -282,8 +287,8 @@ def probability_of(
 ) -> float:
     """Compute the probability of an event with one of the `names` or `causes`; 0 without `explanations`.
 
-    With `data_kind`, only explanations (sets of events) of a change in this kind of data (`Observable.data`) count, as
-    if no others were possible.
+    With `data_kind`, only explanations (sets of events) of a change in this kind of data (`Observable.data`) count, and
+    their probabilities are divided by their sum.
     """
     relevant = [explanation for explanation in explanations if data_kind is None or data_kind in explanation.data]
     total = sum(explanation.probability for explanation in relevant)

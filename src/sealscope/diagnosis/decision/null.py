@@ -48,16 +48,19 @@ class HealthyNull:
     def calibrate(self, key: str, chance: float) -> float:
         """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings.
 
-        The result is the sum over k of w_k chance^(1/lambda_k). lambda_k (`inflations`) are possible means of the
-        surprisals -log(p-value) in healthy recordings. w_k are their posterior probabilities, given the `surprisals`
-        that are stored under the test's `key`.
+        The result is the sum over k of w_k chance^(1/lambda_k), and at most 1. The lambda_k (`inflations`) are possible
+        means of the surprisals -log(p-value) in healthy recordings. The w_k (`weights`) are the posterior probabilities
+        of these means, given the `surprisals` that are stored under the test's `key`.
         """
         weights, inflations = self._inflation(key)
         log_chance = np.log(max(chance, np.finfo(float).tiny))
         return min(float(weights @ np.exp(log_chance / inflations)), 1.0)
 
     def uncalibrated_chance(self, key: str, chance: float) -> float:
-        """Invert `calibrate`: compute the p-value, above 0, that a detector must state so that it becomes `chance`."""
+        """Invert `calibrate`: compute the p-value that a detector must state so that the calibrated one is `chance`.
+
+        If no p-value is small enough, the smallest positive float is returned.
+        """
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:
             return float(np.finfo(float).tiny)
@@ -74,8 +77,9 @@ class HealthyNull:
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
 
-    Both have the shape (NODES + 1,), or are [1] without surprisals. The first value is 1, for right p-values; the prior
-    of the others is exponential in log lambda. n surprisals have the likelihood lambda^-n exp(-their sum / lambda).
+    Both arrays have the shape (NODES + 1,); without surprisals both are [1]. The first value of lambda is 1, for
+    correct p-values. The prior density of log lambda for the other values is exponential. The likelihood of n
+    surprisals with the sum s is lambda^-n exp(-s / lambda).
     """
     priors = DECISION.null
     if not len(surprisals):

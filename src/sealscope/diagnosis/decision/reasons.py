@@ -41,9 +41,9 @@ def text_of(table: str, key: str, **values: Any) -> str:
 def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
     """Compose the reason of a verdict in words.
 
-    For a `leak`, it describes the leak that the test `alarm` detected. Otherwise it states the 95 % upper `bound` of an
-    undetected leak [m^3/s], and the cause of a change: the event `other` or, if there is an alarm, the most probable
-    explanation other than a leak. Remarks on the measured leakage follow.
+    For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
+    upper `bound` of an undetected leak [m^3/s], and the cause of a change. This is the event `other` or, if that is
+    None and there is an alarm, the most probable explanation other than a leak. Remarks on the measured leakage follow.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -68,7 +68,8 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
     """Describe in words a leak that the test `alarm` detected, or the rarest change if leakage is not measured.
 
-    Without an alarm, the level of the total leakage shows the leak, compared with the limit of a healthy machine.
+    An alarm by the limit in the rig's file is described by the total leakage and this limit, if both are known in
+    L/min. The text also says if the leak's flow is not stated in L/min.
     """
     if case.leak is None:
         rarest = case.rarest_observable
@@ -91,12 +92,12 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
-    """State in words how large a leak can be that was not detected.
+    """State in words the largest leak that may have remained undetected.
 
-    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. If leakage is measured, the text states it
-    in L/min, as a percentage of the pump's flow, or as "any size", in this order of preference; with `cannot tell`, it
-    also says how to record better. Otherwise it describes the pressures' ringing: its change if there is an alarm, else
-    the limit of an undetected fall.
+    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. If leakage is measured, the text states
+    the bound in L/min, as a percentage of the pump's flow, or as "any size", in this order of preference. With the
+    verdict `cannot tell`, it also says how to record better. If leakage is not measured, the text describes the
+    pressures' ringing: its change if there is an alarm, else the limit of an undetected fall.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
@@ -122,8 +123,9 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     """State in words the 95 % upper limit [%] of an undetected fall of the ringing (RMS of the pressures' details).
 
     The fall is relative to healthy recordings or, without these, to the start of the same recording. With the verdict
-    `cannot tell`, the text says that such a fall would not show. If the sampling rate is too low, it says so or names
-    unused columns instead. If the ringing was not measured (None), it says that the detector `provider` sees no change.
+    `cannot tell`, the text says that such a fall would not show. If the sampling rate is too low, the text begins with
+    the names of unused columns or, if there are none, with the rate. If the ringing was not measured (None), the text
+    is that the detector `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -150,9 +152,10 @@ def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State with how many healthy recordings the ringing was compared, and whether they have no dates.
+    """State the number of healthy recordings with which the ringing was compared.
 
-    The text is "" if it was compared with none.
+    The text also mentions if their dates are not known. It is "" if the ringing was not measured, or not compared with
+    healthy recordings.
     """
     if ringing is None or not ringing.healthy:
         return ""
@@ -161,11 +164,12 @@ def _against_text(ringing: Ringing | None) -> str:
 
 
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
-    """Describe the most probable explanation of an `alarm` other than a leak, and how to tell it from a leak.
+    """Describe the most probable explanation of an `alarm` other than a leak, and the way to tell it from a leak.
 
     The stated probability is that of all explanations without a leak. If the explanation has several events, only the
-    first one is described. If this is a change of the operating point, the text states only its time, the onset of the
-    step that looks like a leak. It is "" if that time is unknown, or if there is no explanation without a leak.
+    first one is described. If this event has no cause, it is a change of the operating point: the text then states only
+    its time, the onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no
+    explanation without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
@@ -194,7 +198,7 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
 
 
 def _onset_text(observable: Observable) -> str:
-    """State in words when the change of an observable began; "" for an observable without an onset."""
+    """State the time [s] at which the change of an observable began; "" for an observable without an onset."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
 
 

@@ -60,14 +60,14 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
     if reason is None:
         return None
     if not isinstance(reason, str):
-        raise TypeError(f"usable must give None or a reason, got {reason!r}")
+        raise TypeError(f"usable must return None or a reason, got {reason!r}")
     return " ".join(reason.split()) or "the recording cannot be used"
 
 
 def make_observable(
     name: str, chance: float, *, size: float = 0.0, onset: tuple[float, float, float] | None = None
 ) -> Observable:
-    """Make the observable of a user's own detector from its p-value; the change counts as an effect of a piston leak.
+    """Make an observable for a user's own detector from a p-value; the change counts as an effect of a piston leak.
 
     Parameters
     ----------
@@ -97,24 +97,24 @@ def validate_report(report: Any, name: str) -> Observed:
     if isinstance(report, Observable):
         report = Observed(name, (report,))
     if not isinstance(report, Observed):
-        raise TypeError(f"observe must give Observed, got {type(report).__name__}")
+        raise TypeError(f"observe must return an Observed, got {type(report).__name__}")
     for observable in report.observables:
         if not isinstance(observable, Observable):
-            raise TypeError(f"observables must be of Observable, got {type(observable).__name__}")
+            raise TypeError(f"each of the observables must be an Observable, got {type(observable).__name__}")
         if not 0.0 <= observable.chance <= 1.0:
             raise ValueError(f"a chance must be 0 to 1, got {observable.chance!r} ({observable.name})")
         if not np.isfinite(observable.score):
             raise ArithmeticError(f"a score must be finite, got {observable.score!r} ({observable.name})")
     if "\n" in report.lack:
-        raise ValueError("what a detector lacks must be one line")
+        raise ValueError("the `lack` of a report must be one line")
     return replace(report, provider=name)
 
 
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
     """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
 
-    `distribution` is the package of a plug-in, None for a built-in detector. An arithmetic error of the latter is due
-    to impossible readings, not to a defect, and is logged at the debug level.
+    `distribution` is the package of a plug-in, None for a built-in detector. An arithmetic error of a built-in detector
+    is due to impossible readings, not to a defect. It is logged at the debug level at every call.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)

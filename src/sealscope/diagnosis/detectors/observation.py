@@ -55,7 +55,8 @@ def limit_threads() -> AbstractContextManager[object]:
 def _thread_pools(n_modules: int) -> Any:
     """Find the thread pools of the loaded linear-algebra libraries.
 
-    The result is cached until `n_modules`, the number of imported modules, changes, as a new one may load a library.
+    The result is cached. A change of `n_modules`, the number of imported modules, makes the search start anew, as a
+    newly imported module may have loaded another library.
     """
     from threadpoolctl import ThreadpoolController
 
@@ -65,8 +66,8 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
 
-    Changes within the recording and against `baseline` are tested. If there is a reason to `distrust` the pressures, it
-    is reported instead.
+    Changes within the recording and against `baseline` are tested. If there is a reason to `distrust` the pressures,
+    nothing is tested, and the report states this reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -129,8 +130,9 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisal, -log(p-value), of each change that the detectors test within a healthy recording.
 
-    Returns surprisals by the key of the change (`null.null_key`), given the assumed `rig`. Keys with the prefix `SHUT`
-    are for a volume balance that assumes that valves cut the pump off at rest. The result is cached.
+    The detectors assume the machine `rig`. The result maps the key of the change (`null.null_key`) to the surprisal.
+    Keys with the prefix `SHUT` are for a volume balance that assumes that valves cut the pump off at rest. The result
+    is cached.
     """
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
@@ -139,8 +141,8 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
 
     These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance. The pressure response
-    is tested, too, if there is no balance, or if no flow is recorded, since a control loop may then hold the load by
-    replacing the leakage.
+    is tested, too, if there is no balance, or if no flow is recorded, as a control loop may then hold the load by
+    replacing the oil that leaks.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -200,7 +202,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 
 
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others, and yield the test results.
+    """Compare the ringing of each healthy recording with that of all others, and yield the test results of each.
 
     The ringing is measured by the RMS of the pressures' wavelet details. Recordings with other chambers or another
     sampling rate than the first usable one are left out. If fewer than `MIN_COMPARED` remain, nothing is yielded.

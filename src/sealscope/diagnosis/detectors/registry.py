@@ -46,7 +46,10 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """First 16 digits of the SHA-256 of the file that defines `make`, to tell versions apart; else "unknown"."""
+        """First 16 digits of the SHA-256 of the file that defines `make`, to tell versions apart.
+
+        It is "unknown" if there is no such file, or if it cannot be read.
+        """
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -89,7 +92,7 @@ def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
             if point.name in built_in_names or point.name in _RESERVED:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
-                raise ValueError("its name must be plain words without ',' and '@'")
+                raise ValueError("its name must be plain words without a comma, ' @ ' or a line break")
             make = point.load()
             if not callable(make):
                 raise TypeError(f"{point.value} must be callable with a rig, got {type(make).__name__}")

@@ -36,9 +36,9 @@ from sealscope.diagnosis.priors.inference import StepSize
 MIN_HEALTHY = 3
 #: Number of grid points of the scatter.
 NODES = 64
-#: The grid reaches from the prior's scatter over this factor to the prior's scatter times this factor, ...
+#: Ratio of the grid's largest scatter to the prior's scatter, and of the prior's scatter to the grid's smallest one.
 MAX_RATIO = 100.0
-#: ... and at least to this multiple of the standard deviation of the healthy values.
+#: Minimum ratio of the grid's largest scatter to the standard deviation of the healthy values.
 MAX_RATIO_TO_VALUES = 10.0
 #: Number of grid points of the factor by which errors are too small or too large.
 INFLATIONS = 9
@@ -83,7 +83,8 @@ def compare_with_healthy(
     - `error`: standard error of a single value;
     - `above`: count only a value above the healthy ones;
     - `prior_change`: standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least
-      the inverse of the Bayes factor of such a change, and 1 if it explains the value no better than scatter does.
+      the inverse of the Bayes factor of such a change to no change. It is 1 if such a change explains the value no
+      better than scatter does.
 
     The observable's size is the difference from the healthy mean, its score the square of t (with `above`, 0 for a
     value below the mean), and its chance the p-value. Return None for fewer than `MIN_HEALTHY` healthy recordings, or
@@ -177,7 +178,7 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
 
 
 def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
-    """Compute how improbable the size of a step is: -2 log(prior density / largest density).
+    """Compute the penalty -2 log(prior density / largest prior density) for an improbable size of a step.
 
     The prior is normal in log(abs(`step`)) about log(`prior.size`), with the standard deviation `prior.spread`. With
     `above`, only steps larger than `prior.size` are penalised.

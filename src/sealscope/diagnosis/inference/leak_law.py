@@ -86,9 +86,10 @@ def law_priors() -> Array:
 def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
     """Return `leak`, the likelihood of the conductance, with a prior for a turbulent part of the healthy leakage.
 
-    This part flows as through an orifice, so that the apparent conductance varies with the pressure like `shape` (of
-    `apparent_conductances`, with the mean 1) times an unknown constant, whose prior standard deviation is the fraction
-    `healthy.turbulent` (`priors.toml`) of the leakage.
+    This part flows as through an orifice, so that it adds an unknown constant times `shape` (K,) to the conductance in
+    K blocks. `shape` is the apparent conductance of an orifice (`apparent_conductances`), scaled to the mean 1. The
+    prior standard deviation of the constant is the fraction `healthy.turbulent` (`priors.toml`) of the mean leakage.
+    `leak` is returned unchanged if the blocks contain no information on it.
     """
     shape = apparent_conductances(blocks, columns)[0.5]
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
@@ -103,10 +104,10 @@ def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnR
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
-    There is a test for each exponent of `EXPONENTS`. Its p-value (`chance`) is divided by the prior probability of the
-    exponent, and the test with the smallest quotient is returned. The step's size is the change of the conductance,
-    averaged over the blocks with their information as weights. `leak`: likelihood of the leak's coefficient in the
-    blocks. Return None if too few blocks determine this coefficient.
+    A step is tested for each exponent of `EXPONENTS`. The p-value (`chance`) of each test is divided by the prior
+    probability of the exponent, and the test with the smallest quotient is returned. The size of the step is the change
+    of the conductance, averaged over the blocks with their information as weights. `leak`: likelihood of the leak's
+    coefficient in the blocks. Return None if too few blocks determine this coefficient.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -120,11 +121,11 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
 
 def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
-    """Compute how well a leak that was there before the recording explains the changes of the leakage within it.
+    """Compute the log likelihood ratio of a leak older than the recording, from changes of the leakage within it.
 
-    Unless its flow is laminar, its apparent conductance changes with the pressure. The result has, for each exponent of
-    `EXPONENTS`, the log likelihood ratio of such a leak to none (`constant_log_ratio`). `leak`: likelihood of the
-    leak's coefficient in the blocks.
+    Unless the flow of such a leak is laminar, its apparent conductance changes with the pressure. The result has, for
+    each exponent of `EXPONENTS`, the log likelihood ratio of an older leak to none (`constant_log_ratio`). `leak`:
+    likelihood of the leak's coefficient in the blocks.
     """
     shapes = apparent_conductances(blocks, columns)
     return np.array(
@@ -138,8 +139,9 @@ def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Infor
 def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Flow | None]:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its curvature over pressure.
 
-    The healthy leakage is laminar and does not bend. To the second order, c |dp|^e bends as an orifice with the
-    coefficient a does if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
+    With dp = p_A - p_B, the flow of the leak is c |dp|^e. The healthy leakage is laminar (e = 1) and not curved. The
+    flow a |dp|^(1/2) of an orifice is fitted in addition to a laminar flow. To the second order, it is as curved as the
+    leak's flow if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
 
         flow = a |dp|^(1/2) / (4 e (1 - e)).
 
@@ -159,10 +161,13 @@ def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: f
 def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
 
-    For each exponent e of the law flow ~ |dp|^e the flow is estimated from the rise over healthy recordings
-    (`rise_flows`) and, for e < 1, also from the curvature over pressure (`bend_flows` of `estimate_bend_flows`). The
-    two are averaged with their precisions, and the weight of e contains the probability density of their difference.
-    `log_ratios` are those of `older_log_ratios`.
+    The flow is proportional to |p_A - p_B|^e, with an exponent e of `EXPONENTS`. For each e it is estimated from the
+    rise over healthy recordings (`rise_flows`) and, for e < 1, also from its curvature over pressure (`bend_flows` of
+    `estimate_bend_flows`); the two are averaged with their precisions as weights.
+
+    The weight of an exponent in the result is its prior probability. For e < 1 it is multiplied by the probability
+    density of the difference between the two flows, and by the largest likelihood ratio in `log_ratios` (those of
+    `older_log_ratios`).
     """
     log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
     weights, flows = list[float](), list[Flow]()
@@ -205,15 +210,16 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     positions = _onset_positions(leak, test)[onsets]
-    weights = blocks.pressure_weights
-    weight_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
+    block_weights = blocks.pressure_weights
+    weight_after = np.maximum(block_weights @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []  # lists of arrays (o,), for each growth and exponent
     for growth, probability in growth_priors():
         steps = step_shapes(len(blocks), positions, growth)  # (K, o)
         for exponent in EXPONENTS:
             likelihood, size, deviation = step_sizes(leak, onsets, shapes[exponent], growth)
-            unit = (weights * unit_flows[exponent]) @ steps / weight_after  # mean flow of a step of 1 after its onset
+            # mean flow of a step of 1 after its onset
+            unit = (block_weights * unit_flows[exponent]) @ steps / weight_after
             log_weights.append(np.log(probability) + likelihood)
             flows.append(size * unit)
             standard_errors.append(deviation * unit)
@@ -267,8 +273,8 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)
     positions = _onset_positions(leak, test)
-    information = np.maximum(leak.precision.sum(axis=0), 0.0)
-    fraction_after = information @ step_shapes(len(information), positions) / max(float(information.sum()), _TINY)
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
+    fraction_after = weights @ step_shapes(len(weights), positions) / max(float(weights.sum()), _TINY)
     step = value / np.maximum(fraction_after, MIN_FRACTION)
     precision = 1.0 / np.maximum(test.deviation, _TINY) ** 2
     log_likelihood = precision * step * (test.size - 0.5 * step)  # normal, relative to no step

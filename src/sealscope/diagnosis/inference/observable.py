@@ -20,7 +20,10 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 
 
 class LogScale(NamedTuple):
-    """Logarithm of the factor by which both pressures would have to be scaled to cause a change, and its deviation."""
+    """Logarithm `value` of the factor by which both pressures would have to be scaled to cause a change.
+
+    `deviation`: standard deviation of this logarithm.
+    """
 
     value: float
     deviation: float
@@ -28,7 +31,7 @@ class LogScale(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class Observable:
-    """Result of a test whether one quantity that a detector estimates has changed.
+    """Result of testing one quantity, estimated by a detector, for a change.
 
     Parameters
     ----------
@@ -83,8 +86,8 @@ class Observable:
     ) -> Observable:
         """Make an observable from a test for a step, a sudden lasting change, within the recording.
 
-        `test`: the best of `n_tests` tests, whose p-value is therefore multiplied by their number (Bonferroni). The
-        others are fields of the class.
+        `test`: the best of `n_tests` tests; its p-value is therefore multiplied by `n_tests` (Bonferroni correction).
+        The other arguments are fields of the class.
         """
         return cls(
             name=name,
@@ -159,7 +162,7 @@ class DatedTest(RiseTest, Protocol):
     def detectable_step(self, chance: float) -> float:
         """Return the smallest increase of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
 
-        `chance`: probability, without an increase, that the test finds one; it sets the threshold.
+        `chance`: probability that the test finds an increase where there is none; it sets the threshold of the score.
         """
 
 
@@ -216,7 +219,7 @@ class LeakMeasure(Protocol):
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and how well a step explains it; None without such recordings."""
+        """Leakage above that of healthy recordings, and the evidence for its causes; None without such recordings."""
 
     @property
     def lpm_per_flow(self) -> float | None:

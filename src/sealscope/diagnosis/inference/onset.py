@@ -168,8 +168,8 @@ class StepTest:
     def onset(self) -> Interval:
         """Return the most likely onset of the step [s] with its 95 % interval.
 
-        It is widened by half a block, which has `PARTS` evenly spaced onsets, at both ends: the rows within the block
-        of the onset are weighted as if the whole block leaked or none of it.
+        The interval is widened at both ends by half a block, i.e. by `PARTS` / 2 times the spacing of the onsets: the
+        rows in the block of the onset are weighted as if the leak were there in the whole block or not at all.
         """
         tail = 0.5 - 0.5 * BOUND_PROBABILITY  # on either side of the interval
         low, high = np.interp([tail, 1.0 - tail], np.cumsum(self.weights), self.onsets)
@@ -189,8 +189,8 @@ class StepTest:
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
         """Compute the smallest step that is detected with the probability `power`, in the unit of the coefficient.
 
-        `chance`: probability, without a step, that the test finds one, which sets the threshold of the score. The step
-        is (sqrt(threshold) + normal quantile of `power`) times the median standard error over all onsets.
+        `chance`: probability that the test finds a step where there is none; it sets the threshold of the score. The
+        result is (sqrt(threshold) + normal quantile of `power`) times the median standard error over all onsets.
         """
         from scipy.special import ndtri
 
@@ -211,7 +211,8 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
     """Compute the upper bound of a step: the quantile of its size at `probability`, given that the size is > 0.
 
     `weights`, `size`, `deviation` (k,): for each of k onsets its probability, and the size of the step there with its
-    standard error. If no step up is possible, the result is 12 standard errors above the largest size, but at least 0.
+    standard error. If practically no step up is possible, the result is the largest value of size + 12 standard errors,
+    but at least 0.
     """
     from scipy.special import ndtr
 
@@ -338,12 +339,12 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
 
 
 def constant_log_ratio(information: Information, shape: Array) -> float:
-    """Compute how well a leak that was there before the recording explains the coefficient's changes within it.
+    """Compute the log likelihood ratio of a leak older than the recording, from a coefficient's changes within it.
 
-    Such a leak adds to the coefficient a constant times `shape` (K,), its apparent coefficient in each block, which
-    varies with the pressure unless its flow is laminar. The result is the log likelihood ratio of the best positive
+    Such a leak adds to the coefficient a constant times `shape` (K,), its apparent coefficient in each block. `shape`
+    varies with the pressure unless the flow is laminar. The result is the log likelihood ratio of the best positive
     constant to no such leak, each with the random walk that fits best. It is at least 0, and 0 if `shape` hardly
-    varies.
+    varies or too few blocks have information.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
@@ -413,7 +414,8 @@ def _fit_steps(z: Array, steps: Array, eigen: Array) -> _StepFits:
     """Fit an upward step of a coefficient at each of o onsets, for each variance of the random walk in `WALKS`.
 
     `z` (n,): whitened values of the coefficient; `steps` (n, o): whitened unit steps; `eigen` (n,): eigenvalues of the
-    walk's covariance (`_Whitening`). The fit is by weighted least squares; the size of a step down is set to 0.
+    walk's covariance (`_Whitening`). The fit is by weighted least squares. Where the best step would be down, its
+    moment is negative, and the residual squares are those without a step.
     """
     weight = 1.0 / (1.0 + WALKS[:, None] * eigen)
     total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
@@ -451,7 +453,8 @@ class _Whitening(NamedTuple):
     are projected out.
 
     - `root` (r,), `vectors` (K, r): square roots of the non-zero eigenvalues of the precision, and their eigenvectors;
-    - `complement` (n, r + s): directions orthogonal to these changes; s of these have a finite prior, a column each;
+    - `complement` (n, r + s): directions, as rows, that are orthogonal to these changes. Each of the s changes with a
+      finite prior adds a column;
     - `basis`, `eigen` (n, n), (n,): eigenvectors of the random walk's covariance, and its eigenvalues times `unit`;
     - `transform` (n, K): matrix from the coefficient in K blocks to z;
     - `unit`: variance of the walk's steps at which it adds on average as much to z as the noise;
@@ -522,8 +525,9 @@ def _build_whitening(
     """Build the matrices that turn the estimates of a coefficient in K blocks into independent values.
 
     The values do not depend on level and slope of the coefficient, nor on a multiple of `shape` (K,), if it is given.
-    `precision` (K, K): that of the estimates; `slope`, `walk`, `disturbance`: scales of the priors on the slope, on the
-    random walk over all blocks, and on the multiple (`Information`). Return None if too few blocks have information.
+    `precision` (K, K): inverse covariance of the estimates; `slope`, `walk`, `disturbance`: scales of the priors on the
+    slope, on the random walk over all blocks, and on the multiple (`Information`). Return None if too few blocks have
+    information.
     """
     count = len(precision)
     # z = Lambda^(-1/2) eta of the module, restricted to the eigenvectors of the precision Lambda with information
@@ -571,7 +575,10 @@ def _build_whitening(
 
 
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
-    """Return `time`, `precision` and `vector`, with a known prior on the level added as a block before the first."""
+    """Return `time`, `precision` and `vector`, with a finite prior on the level added as a block before the first.
+
+    They are returned unchanged if the prior is infinite, or if there are fewer than `MIN_BLOCKS` blocks.
+    """
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:
         return time, precision, vector

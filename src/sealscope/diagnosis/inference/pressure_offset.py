@@ -41,8 +41,8 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
     The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed so
-    far. The blocks are returned unchanged if an equation has no column for a constant flow (`columns`), or if too few
-    blocks determine the leak.
+    far. The blocks are returned unchanged if too few of them determine the leak, or if an equation has no column for a
+    constant flow. `columns`: roles of the columns of each equation.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -76,8 +76,9 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
 
         residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S'),
 
-    where q S S' is the random walk of the leak's coefficient. The likelihood is maximised over size > 0, k, kappa and
-    q; `offset_cost` states the prior on the offset. The search is over asinh of the offset.
+    where q S S' is the random walk of the leak's coefficient, kappa the variance of the noise, and I the identity. The
+    likelihood is maximised over size > 0, k, kappa and q; `offset_cost` states the prior on the offset. The search is
+    over asinh(offset), which covers small and large offsets alike.
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # no walk larger than the best one without an offset: otherwise an offset could explain changes that no leak causes
@@ -145,10 +146,11 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Arr
 def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
     """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the random walk.
 
-    For each q the best step up and the variance kappa of the noise are fitted. A walk consists of steps of independent
-    sizes in all blocks. Thus cov residuals = kappa (I + q S S'), with S = `steps` (n, K), the changes of the residuals
-    by unit steps. This covariance is diagonal along S times the eigenvectors of S' S. `walks` (w,): values of q; q = 1
-    changes the residuals as much as the noise does on average.
+    For each q the best step up and the variance kappa of the noise are fitted. `steps` (n, K): matrix S, whose column k
+    is the change of the residuals by a unit step of the leak's coefficient from block k on. A walk consists of steps of
+    independent sizes in all blocks. Thus cov residuals = kappa (I + q S S'), which is diagonal along S times the
+    eigenvectors of S' S. `walks` (w,): values of q, in units in which q = 1 changes the residuals on average as much as
+    the noise does.
     """
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)

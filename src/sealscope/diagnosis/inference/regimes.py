@@ -45,11 +45,12 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
     `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `terms.with_rests` adds.
 
     - Open valves: the columns `STATES` are dropped from the Gram matrices.
-    - Shut valves: the flow offset in motion replaces the flow offset of all times (`terms.shut_at_rest`). The column
-      `HOLDING`, the leakage of a pump that holds the load, remains only if some hold lasts for seconds (`has_holds`)
-      and the pump is off at other times; otherwise it becomes zero. If all holds are short and the pump is off at other
-      times, the machine is a press whose pump builds up the pressure through open valves. If valves are certainly shut
-      at rest (`is_certain`), its holds count as motion, and are first added to the column `TURNING`.
+    - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
+      (`BIAS`), as in `terms.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
+      load, remains if some hold lasts for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set
+      to zero. If all holds are short and the pump is off at other times, the machine is a press whose pump builds up
+      the pressure through open valves. If its valves are certainly shut at rest (`is_certain`), its holds count as
+      motion: the column `HOLDING` is added to the column `TURNING` before it is set to zero.
     """
     names = (*roles.names, "left")  # the last column is the left side of the balance
     if not shut:
@@ -70,9 +71,9 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
 def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
     """Add the columns of a pump that is cut off at rest to Gram matrices (E, m, m) of a recording without rests.
 
-    The two new columns precede the column of the leak. Without rests the leakage of the turning pump has the same
-    column as the leak, and the leakage of the pump that holds the load has a column of zeros. `names` (m - 1,): names
-    of the old columns without the left side. The result has the shape (E, m + 2, m + 2).
+    The two new columns precede the column of the leak: `TURNING`, the leakage of the turning pump, and `HOLDING`, that
+    of a pump that only holds the load. Without rests the first equals the column of the leak, and the second is zero.
+    `names` (m - 1,): names of the old columns without the left side. The result has the shape (E, m + 2, m + 2).
     """
     leak = names.index(LEAK)
     index = [*range(len(names) + 1)]
@@ -84,7 +85,10 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if pump or piston rest at times; the columns (`roles`) must include those of `terms.with_rests`."""
+    """Return True if pump or piston rest under pressure at times.
+
+    The columns (`roles`) must include those of `terms.with_rests`.
+    """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
@@ -103,16 +107,16 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
 
     `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`. All coefficients are estimated
     from blocks with motion; then leakage and flow offset at rest are estimated from the other blocks, given all other
-    coefficients. A single regression could make leakage and compliance zero at rest: the pressures relax at a rate that
-    shows only the ratio of both. With the columns X of leakage and flow offset at rest, the left side y, the other
-    columns Z and their coefficients b in motion, the leakage r at rest is the first of
+    coefficients. A single regression could make both leakage and compliance zero at rest, since the rate at which the
+    pressures relax shows only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the
+    other columns Z and their coefficients b in motion, the leakage r at rest is the first of
 
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
-    where J = d r/db is the first row of -(X'X)^-1 X'Z. The last term allows for a relative error k = `rest.compliance`
-    (`priors.toml`) of each compliance c, which air in the oil makes larger at low pressures. It vanishes for pressures
-    that stay the same at rest, for example because a pump replaces the leaking oil. The result is 0 if fewer than
-    `MIN_STATE_BLOCKS` blocks are in motion or at rest, or if a variance is not positive.
+    where J = d r/db is the first row of -(X'X)^-1 X'Z, and the sum is over the compliances c. This sum allows for a
+    relative error k = `rest.compliance` (`priors.toml`) of each compliance, which air in the oil makes larger at low
+    pressures. It vanishes if the pressures stay the same at rest, for example because a pump replaces the leaking oil.
+    The result is 0 if fewer than `MIN_STATE_BLOCKS` blocks are in motion or at rest, or if a variance is not positive.
     """
     gram, left = blocks.gram[:, 0], roles.left
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))

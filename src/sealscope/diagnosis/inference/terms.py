@@ -143,11 +143,17 @@ class Signals:
         return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
-        """Return 1 for each interval (n - 1,) in which the pump turns and the piston rests, else 0, as in `moving`."""
+        """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
+
+        `pump_volume`: as in `moving`. Without `rest_limits` the result is 0 everywhere.
+        """
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Compute the flags of `moving` and `holding`, only once: all terms of a balance share the `pump_volume`."""
+        """Compute the results of `moving` and `holding`, and store them for later calls.
+
+        Later calls return the stored results: all terms of a balance have the same `pump_volume`.
+        """
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)
@@ -163,8 +169,8 @@ def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_
     """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `MIN_REST`.
 
     `increments` (n,): increments of the pump's volume [m^3] or of the position [m], NaN (not at rest) where missing;
-    `rate`: sampling rate [Hz]; `limit` [m^3/s] or [m/s]. The speed is averaged over `AVERAGING_TIME`. Fewer samples
-    than the averaging time and a rest together contain no rest.
+    `rate`: sampling rate [Hz]; `limit` in m^3/s or m/s. The speed is averaged over `AVERAGING_TIME`. A recording
+    shorter than this time and `MIN_REST` together has no rest.
     """
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
     if len(increments) < window + min_length:
@@ -190,7 +196,7 @@ def central_difference(values: Array, half_width: int) -> Array:
 
 
 def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Flag the `length` consecutive samples from each flagged sample of `starts` (n,) on, shape (n + length - 1,)."""
+    """Flag each flagged sample of `starts` (n,) and the next `length` - 1 samples, shape (n + length - 1,)."""
     changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
     changes[: len(starts)] += starts
     changes[length:] -= starts
@@ -242,7 +248,7 @@ class Term(NamedTuple):
 
     @property
     def compared(self) -> bool:
-        """True if the coefficient is fitted only to several recordings: in one, the motion varies too little."""
+        """True if the coefficient is fitted only to compare recordings: within one, the motion varies too little."""
         return self.drift == "speed"
 
 
@@ -352,7 +358,8 @@ def _free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Te
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
     d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
-    the current position. `weight_A` computes w, the weight (0 to 1) of chamber A in the balance.
+    the current position, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0
+    to 1) of chamber A in the balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -587,7 +594,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 def with_rests(equation: Equation) -> Equation:
     """Add three terms to a pump's volume balance that are zero in some states of the machine (`STATES`).
 
-    They are inserted before the terms of the leak, and have the increments
+    The new terms are inserted before those of the leak. Their increments, 0 in all other states, are
 
     - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
     - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
@@ -619,9 +626,9 @@ def _pump_leakage_terms(
 ) -> tuple[Term, Term]:
     """Make two terms of a pump's leakage: while it moves the piston, and while it turns to hold the load.
 
-    Their increments are (p_A - p_B) dt in this state, and 0 at other times. `pump_volume` computes the volume [m^3]
-    that the pump delivers in each interval; `drift`: entry of `priors.toml` with the prior on the drift of both
-    coefficients, or "" for terms that are not part of every fit.
+    The increments of a term are (p_A - p_B) dt in its state of the machine, and 0 at other times. `pump_volume`
+    computes the volume [m^3] that the pump delivers in each interval; `drift`: entry of `priors.toml` with the prior on
+    the drift of both coefficients, or "" for terms that are not part of every fit.
     """
     # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(_conductance_term, cause="pump leak", needs=(), drift=drift)

@@ -102,8 +102,8 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
     """Fit the coefficients of a volume balance to K blocks together and store them in `model`.
 
-    `grams` (K, m, m) are the products of all m columns in each block, and `rows` (K,) its numbers of equations.
-    `column_order` (n + 2,): indices of the columns to use, n terms other than the leak, the leak, the left side.
+    `grams` (K, m, m) are the products of all m columns in each block, and `rows` (K,) the number of equations of each
+    block. `column_order` (n + 2,): indices of the columns to use, n terms other than the leak, the leak, the left side.
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
@@ -172,15 +172,15 @@ class LiveBalance:
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Test whether a rig states the sizes (piston areas or pump displacement) from which L/min are computed."""
+        """Return True if a rig states the sizes (piston areas or pump displacement) from which L/min are computed."""
         return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
         The next block is processed only when its result is asked for. The first `LEARNED` blocks are estimated
-        together: the result of the last one has the conductances of all. After a gap, or a change of the sampling
-        rate, the coefficients of the balance are kept, and earlier samples that do not fill a block are dropped.
+        together: the result of the last one has the conductances of all. After a gap, or a change of the sampling rate,
+        the coefficients of the balance are kept, and earlier samples that do not fill a block are dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -242,7 +242,10 @@ class LiveBalance:
         return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the balances to the first blocks; return the leakage conductances of the blocks in motion."""
+        """Fit the balances to the first blocks, and set the usual precision; return the leakage conductances.
+
+        Blocks at standstill are left out, so that the list may be empty.
+        """
         for number, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             grams = np.ascontiguousarray(blocks.gram[:, number])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
@@ -313,7 +316,7 @@ class LiveBalance:
         """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.
 
         The result is None if the stored blocks do not reach from the onset of the leakage's increase, `onset` [s], to
-        `end`, and empty if there are too few.
+        `end`, and empty if there are too few blocks.
         """
         stored = self._stored
         if stored is None:
@@ -345,7 +348,7 @@ class LiveBalance:
         restore_attributes(self, _SAVED, state)
         saved_models = require_part(state, "known", list)
         if len(saved_models) != len(self._models):
-            raise InputError(f"saved state's known must be of {len(self._models)} equations, got {len(saved_models)}")
+            raise InputError(f"saved state's known must have {len(self._models)} equations, got {len(saved_models)}")
         for model, saved in zip(self._models, saved_models, strict=True):
             restore_attributes(model, _MODEL, saved)
         stored, stream = (require_part(state, name, (Mapping, type(None))) for name in ("stored", "stream"))
@@ -379,8 +382,9 @@ def size_error(rig: Rig) -> float:
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out. So is the term of the pump's leakage, which cannot be
-    distinguished from the piston's. `with_tested_terms` includes terms that are only tested for a change, not fitted.
+    Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
+    it cannot be distinguished from the piston's. `with_tested_terms` includes terms that are only tested for a change,
+    not fitted.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):

@@ -142,8 +142,8 @@ def _solve(model: Any) -> None:
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
     """Compute a volume balance's residual sum of squares for given nuisances (coefficients other than the leak's).
 
-    The leak's coefficient is the one that minimises it. `sums` (n + 2, n + 2) are the products of the columns of n
-    nuisances, leak and left side. Column 0 of `solution` (n, k) holds the nuisances.
+    For the leak's coefficient, the value that minimises the sum is used. `sums` (n + 2, n + 2) are the products of the
+    columns of n nuisances, leak and left side. Column 0 of `solution` (n, k) holds the nuisances.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     # with the left side y, the columns X of the nuisances c and the column l of the leak, the sum is
@@ -215,7 +215,7 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
     `model` is a `Coefficients`, whose `block` holds the products of the block's columns, and `rows` is the block's
     number of equations. With `is_learned`, the block is also added to the sums over earlier blocks in `model`. Returns
     (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from g to keep the series
-    continuous while the other coefficients (nuisances) improve, and the variance V of g due to their errors.
+    continuous while the other coefficients (nuisances) improve, and the variance V of g due to errors of the nuisances.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:

@@ -30,7 +30,8 @@ GROUP: int = LIVE.watch.group
 class BlockEstimate:
     """Leakage of a running machine in one block.
 
-    Flows and 95 % intervals are None if unknown. After an alarm, that of the increase allows for colder or warmer oil.
+    Flows and 95 % intervals are None if unknown. After an alarm, the interval of `leak_lpm` allows for colder or warmer
+    oil.
 
     Attributes
     ----------
@@ -161,7 +162,7 @@ class WatchBaseline(HealthyLevel):
 def find_level_rise(
     healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
 ) -> LiveRise | None:
-    """Test whether a mean conductance exceeds that of the healthy machine, and estimate by how much.
+    """Find a rise of the mean conductance above that of the healthy machine; None if it is not significant.
 
     `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the time of the
     rise, which the result repeats. Two tests must both be significant at the false-alarm `probability`:
@@ -169,7 +170,7 @@ def find_level_rise(
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
 
-    The result is None if one of them is not, or if there are fewer than two healthy means.
+    The result is also None if there are fewer than two healthy means.
     """
     from scipy.special import ndtr, ndtri
 
@@ -197,7 +198,7 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     With the conductance G before the leak, the result's `low` is G/r and its `high` is r max(G, 0), where r =
     warmest^(tau/shift) and tau is the time since the onset, at most `shift`. By the table `oil` of `priors.toml`,
     warming of the oil raises a conductance at most by the factor `warmest`, within the time `shift` [h]. A negative
-    estimate is an error about a true conductance of 0, and so warmer oil raises it to 0 at most.
+    estimate is an error, as no conductance is below 0; `high` is then 0.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0
@@ -209,7 +210,8 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 def mean_flow(flows: Array, errors: Array) -> Flow:
     """Average the flows of n blocks (n,) [L/min] with standard `errors` (n,); return the mean and its standard error.
 
-    The latter is sqrt(sum(errors^2)/n^2 + s^2/n) with the standard deviation s of the flows, 0 for a single block.
+    The standard error is sqrt(sum(errors^2)/n^2 + s^2/n). Here s is the standard deviation of the flows, 0 for a single
+    block.
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
@@ -217,7 +219,7 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Test whether the duty of a block is in the range from `low` to `high`, extended by a margin.
+    """Return True if the duty of a block is in the range from `low` to `high`, extended by a margin.
 
     A duty consists of the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]. The margin towards
     low pressures is larger, because a leak lowers the pressure difference.

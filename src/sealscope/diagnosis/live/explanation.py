@@ -42,10 +42,10 @@ UNKNOWN = RiseExplanation(is_leak=False)
 def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, is_settled: bool) -> RiseExplanation:
     """Find the cause of an increase of the leakage among the changes observed in the blocks around it.
 
-    `observables` are results of tests for changes, and `onset` is the interval in which the increase began [s]. Changes
-    of the kind `data` from which the leakage is estimated ("volumes" or "response") count only if they began then.
-    `is_settled` is True if enough blocks have followed to distinguish a leak to the outside from a sensor fault; until
-    then, only a leak past piston or pump counts as a leak.
+    `observables` are results of tests for changes, and `onset` is the interval in which the increase began [s]. `data`
+    is the kind of data from which the leakage is estimated, "volumes" or "response". Changes of this kind count only if
+    they may have begun in the same interval. `is_settled` is True if enough blocks have followed to distinguish a leak
+    to the outside from a sensor fault; until then, only a leak past piston or pump counts as a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable other events.
     It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if none of the
@@ -73,6 +73,6 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
 
 
 def _coincides(observable: Observable, onset: Interval) -> bool:
-    """Test whether the 95 % interval of a change's onset is known and overlaps the interval `onset` [s]."""
+    """Return True if the 95 % interval of a change's onset is known and overlaps the interval `onset` [s]."""
     change = observable.onset
     return change is not None and change.low <= onset.high and change.high >= onset.low

@@ -41,7 +41,7 @@ def format_ways(ways: Sequence[Sequence[str]]) -> str:
 
 
 def are_successive(steps: Any, rate: float) -> Any:
-    """Test whether each sample directly follows the sample before it; False for a gap and for a copy.
+    """Return True for each sample that directly follows the sample before it; False for a gap and for a copy.
 
     `steps` are the times between neighbouring samples [s], a number or an array, and `rate` is the sampling rate [Hz].
     A successive sample is 0.5 to 1.5 sampling intervals later (`samples.follows` in `priors.toml`).
@@ -50,7 +50,7 @@ def are_successive(steps: Any, rate: float) -> Any:
 
 
 def is_same_rate(rate: float, rate_before: float) -> bool:
-    """Test whether two sampling rates [Hz] are equal to within 1 %, the usual error of a logger's stated rate."""
+    """Return True if two sampling rates [Hz] are equal to within 1 %, the usual error of a logger's stated rate."""
     return abs(rate / rate_before - 1.0) < _PRIORS.rate
 
 

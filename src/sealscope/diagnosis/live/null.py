@@ -35,7 +35,10 @@ class StepNull:
         self._highest, self._blocks = 0.0, 0  # largest log M and number of blocks in the present window
 
     def add(self, log_e: float) -> None:
-        """Add the evidence log M after a block of a healthy machine."""
+        """Add `log_e`, the log M of the evidence M of a step, after a block of a healthy machine.
+
+        When `WINDOW` blocks are complete, the largest value is added as a window (`add_window`).
+        """
         self._highest = max(self._highest, log_e)
         self._blocks += 1
         if self._blocks == WINDOW:
@@ -43,12 +46,12 @@ class StepNull:
             self._highest, self._blocks = 0.0, 0
 
     def add_window(self, log_e: float) -> None:
-        """Add a window with the largest evidence log M, such as the window of an alarm that was withdrawn."""
+        """Add a window of blocks whose largest log M is `log_e`, such as the window of a withdrawn alarm."""
         self._count += 1
         self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
 
     def log_threshold(self, probability: float) -> float:
-        """Compute the threshold of log M for a false-alarm `probability` per block.
+        """Compute the threshold of the evidence log M of a step for a false-alarm `probability` per block.
 
         A window has `WINDOW` times this probability. The threshold is -log(probability) for fewer than `_MIN_WINDOWS`
         windows, and at least that for more.
@@ -66,7 +69,10 @@ class StepNull:
 
 @lru_cache(maxsize=1024)
 def _find_threshold(count: int, surprisal: float, probability: float) -> float:
-    """Compute the threshold of log M from the number of windows and the sum of their surprisals (`log_threshold`)."""
+    """Compute the threshold of log M for a false-alarm `probability` per block, as `log_threshold` describes.
+
+    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals.
+    """
     if count < _MIN_WINDOWS:
         return -math.log(probability)
     null = HealthyNull({STEP: [surprisal / count] * count})

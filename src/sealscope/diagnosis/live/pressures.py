@@ -88,11 +88,12 @@ class PressureEstimator:
         return self._follower is not None
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
-        """Process the next samples, and yield the result of each block that they complete, when it is asked for.
+        """Process the next samples, and yield the result of each block that they complete.
 
         Before the first block, the model is fitted to `response.begins` (`priors.toml`) seconds of samples. If these
         cannot be used, the reason is yielded, and the fit is tried again with their second half and as many new
-        samples. Samples before a gap that do not fill a block are dropped.
+        samples. Samples before a gap that do not fill a block are dropped. A block is processed only when its result is
+        asked for.
         """
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
@@ -214,7 +215,7 @@ class PressureEstimator:
         """Test the model's parameters and the signals of the last blocks, from `since` to `end` [s], for changes.
 
         The result is None if the stored blocks do not reach from the onset of the leakage's increase, `onset` [s], to
-        `end`, and empty if there are too few.
+        `end`. It is empty if there are too few blocks, or if the fit to all blocks together fails.
         """
         rows, seconds = self._rows, self.block_seconds
         # no blocks, a last block that is not the one at `end`, or a first block that begins after the onset
@@ -236,12 +237,15 @@ class PressureEstimator:
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Make the learned parameters uncertain again, e.g. after a repair; only `LiveBalance.relearn` uses `since`."""
+        """Make the learned parameters uncertain again, for example after a repair.
+
+        `since` is not used; it is there because `LiveBalance.relearn` has it.
+        """
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return the fit and the stored blocks as plain values for JSON, which `load_state` restores; not the rig."""
+        """Return the fit and the stored blocks as plain values for JSON, for `load_state`; the rig is not saved."""
         state = save_attributes(self, _SAVED)
         if (follower := self._follower) is None:
             return state | {"follower": None}

@@ -33,7 +33,8 @@ class LiveRise(NamedTuple):
     def log_chance(self) -> float:
         """Logarithm of the probability that a healthy machine has at least this score in the test.
 
-        By Ville's inequality it is at most -score/2 for a step. For a level it is that of a normal distribution.
+        For a step the result is an upper bound, -score/2 by Ville's inequality. For a level it follows from the normal
+        distribution.
         """
         from scipy.special import log_ndtr
 
@@ -105,17 +106,20 @@ class LiveLeak:
         return self.test.interval
 
     def relative(self, flow: Flow) -> None:
-        """Return None for any leak `flow`: for a running machine no leak is stated relative to the pump's flow."""
+        """Return None for any leak `flow`, as no leak of a running machine is stated relative to the pump's flow."""
 
     def total(self, detectable_flow: float | None) -> None:
-        """Return None: the estimates of the blocks already state the total leakage (`detectable_flow` is not used)."""
+        """Return None, as the estimates of the blocks state the total leakage; `detectable_flow` is not used."""
 
     def history(self, onset_s: float | None) -> None:
-        """Return None: the estimates of the blocks already state the leakage over time (`onset_s` is not used)."""
+        """Return None, as the estimates of the blocks state the leakage over time; `onset_s` is not used."""
 
 
 def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate."""
+    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate.
+
+    `false_alarm_probability` is the allowed probability that the test for the leak raises a false alarm.
+    """
     report = Observed(WATCH, lack=lack, leak=leak)
     # no other reports or healthy recordings; other causes were weighed before the alarm (module `explanation`)
     return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

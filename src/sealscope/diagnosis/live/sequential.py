@@ -96,7 +96,7 @@ class StepDetector:
         self._sums, self._onsets = np.zeros((_N_ROWS, len(WALKS), 0)), np.zeros((0, 4))
 
     def is_representable(self, g: float, deviation: float) -> bool:
-        """Test whether an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
+        """Return True if an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
         unit = self._unit or deviation  # estimates are stored in the unit of the first block's deviation
         return unit > 0.0 and abs(g) < _MAX_NUMBER * unit and unit / _MAX_NUMBER < deviation < _MAX_NUMBER * unit
 
@@ -195,8 +195,9 @@ class StepDetector:
         """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
 
         With the variances S of the n innovations e and T = sum of e^2 / S, the log likelihood of all innovations is
-        -(n log T + sum of log S) / 2, up to a constant equal for all q. From it, the log likelihood of those before the
-        onset is subtracted, and the log prior of the walk is added; `_add_onsets` has stored the sum of both.
+        -(n log T + sum of log S) / 2, up to a constant equal for all q. The log likelihood of the innovations before
+        the onset is subtracted, and the log prior of the walk is added. `_add_onsets` has stored this correction in the
+        row `_LOG_PRIOR`.
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
@@ -280,9 +281,9 @@ class StepDetector:
     def noise(self) -> float:
         """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
-        It is averaged over the blocks with exponential forgetting and with a prior that is worth `step.stated`
-        (`priors.toml`) blocks of the ratio 1. Of the filters it is the one whose random walk has, in each block, a
-        tenth of the first estimate's variance.
+        The ratio is averaged over the blocks with exponential forgetting and with a prior that is worth `step.stated`
+        (`priors.toml`) blocks of the ratio 1. It is taken from the filter whose random walk has, in each block, a tenth
+        of the first estimate's variance.
         """
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))

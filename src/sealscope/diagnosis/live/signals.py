@@ -113,7 +113,7 @@ class SignalWindow:
 
         `rows` are the stored features of n blocks, and `time` (n,) their centres [s]. The blocks are averaged in groups
         of the smallest size in `_GROUP_SIZES` with which the machine moves in both directions in every group. The
-        result is empty if there is none, or fewer than `MIN_BLOCKS` groups.
+        result is empty if there is no such size, or if it leaves fewer than `MIN_BLOCKS` groups.
         """
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
@@ -138,6 +138,6 @@ class SignalWindow:
 
 
 def append_row(rows: Array, row: Array) -> Array:
-    """Append the `row` of a block to the last `WINDOW` - 1 `rows`; drop these if they have another length."""
+    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`; drop all `rows` if their length differs."""
     stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
     return np.vstack([stored, row])

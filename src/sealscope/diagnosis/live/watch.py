@@ -170,13 +170,13 @@ class Watch:
         """Reason why leaks are not stated in L/min, in words; "" if they are, or if no samples have arrived."""
         if self._estimator is None or self._estimator.litres:
             return ""
-        return "L/min is not stated: areas and displacement of the machine are not, which its file states"
+        return "L/min is not stated, as the machine's file does not state its areas and displacement"
 
     @property
     def evidence(self) -> Evidence:
         """Present verdict, with the detected leak or the 95 % upper bound of an undetected one.
 
-        It is "cannot tell" until enough blocks have arrived.
+        The verdict is "cannot tell" until enough blocks have arrived.
         """
         leak = self.leak
         if leak is not None:
@@ -190,10 +190,10 @@ class Watch:
         return decide_on_stream(measure, probability)
 
     def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Convert the detected `leak` to a LiveLeak, from which the verdict is decided (`decide_on_stream`).
+        """Convert the detected `leak` to a LiveLeak, from which `decide_on_stream` decides the verdict.
 
-        Without a leak (None) the result has the present score of the test for a step, limited to below the threshold,
-        and the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
+        If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
+        the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
         """
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
@@ -236,7 +236,10 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Process samples as `update` does, yielding each block's estimate, and the leak found by then, if any."""
+        """Process samples as `update` does, and yield the estimate of each block with the leak detected so far.
+
+        The leak is None if none has been detected.
+        """
         if not follows:
             self._samples.restart("pauses between samples")
         for run in self._samples.runs(remove_dropouts(samples)):
@@ -262,7 +265,10 @@ class Watch:
         return LiveBalance(self._rig, self._samples.names, states_litres)
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the counts of an earlier watch with other settings; its next baseline gets the next version."""
+        """Continue the counts of an earlier watch that had other settings.
+
+        `blocks` is the earlier number of blocks. The next baseline gets the version after `baseline_version`.
+        """
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -290,9 +296,10 @@ class Watch:
         self._compared, self._grouped = self._compared[:0], 0
 
     def judge(self, result: BlockResult) -> BlockEstimate:
-        """Test the conductances of a block for a leak, and return the estimate of the block.
+        """Test the conductance in a `result` of the estimator for a leak, and return the estimate of the block.
 
-        The first blocks, to which the volume balance is fitted together, come as one result; the last estimate counts.
+        The first blocks, to which the volume balance is fitted together, come as one result. All of them are tested,
+        and the estimate of the last one is returned. A `NotJudged` gives an estimate without flows.
         """
         self.blocks += 1
         if isinstance(result, NotJudged):
@@ -310,7 +317,8 @@ class Watch:
         """Test the conductance of a block against those of earlier blocks, and estimate the leak in this block.
 
         The block is added to the baseline, the healthy state, while that is being learned and no leak has been
-        detected. No flows are stated for another duty (pressure difference and pump flow) than the baseline's.
+        detected. No flows are stated for a duty (pressure difference and pump flow) other than the baseline's. A block
+        with numbers that are too large or not finite is not tested.
         """
         row = np.array([block], _BLOCK)
         is_small = all(abs(number) < _MAX_NUMBER for number in block)  # False for NaN, too
@@ -339,8 +347,9 @@ class Watch:
     def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        `has_known_duty` tells if the duty (mean pressure difference and pump flow) is in the baseline's range. Leaving
-        this range or returning to it is a change. `row` (1,) is the block as an array of the type `_BLOCK`.
+        `has_known_duty` is True if the duty (mean pressure difference and pump flow) is in the baseline's range. To
+        leave this range or to return to it is a change of duty. `row` (1,) is the block as an array of the type
+        `_BLOCK`.
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -355,7 +364,10 @@ class Watch:
         self._compared = np.append(self._compared[1 - RECENT :], row)  # the last `RECENT` blocks
 
     def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation."""
+        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation.
+
+        The baseline has at least `LEARNED` blocks.
+        """
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
@@ -366,8 +378,9 @@ class Watch:
     def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. Returns
-        True if a step was found that a leak does not explain, or that cannot be explained yet.
+        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. While the
+        baseline is learned, the evidence of a step in the healthy machine is stored in `_null`. Returns True if a step
+        was found that a leak does not explain, or that cannot be explained yet.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
@@ -396,9 +409,10 @@ class Watch:
     def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
-        The cause is unknown if too few blocks have followed the onset, or if the machine had started shortly before; in
-        the latter case the tests restart. If the blocks around the onset are no longer stored, the cause is a leak.
-        Otherwise `explain_rise` finds it; if it is no leak after enough blocks, tests and `estimator` restart.
+        The result is `UNKNOWN` if too few blocks have followed the onset. It is also `UNKNOWN` if the machine had
+        started shortly before the onset; then the tests restart. If the blocks around the onset are no longer stored,
+        the rise counts as a leak. Otherwise `explain_rise` finds the cause. If other events explain the rise and enough
+        blocks have followed, the tests restart and the `estimator` learns anew.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -423,7 +437,7 @@ class Watch:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
         The blocks are weighted by their precisions. The mean is compared with the baseline or, before there is one,
-        with healthy recordings if `estimator` states levels.
+        with healthy recordings if `estimator` states levels. Without either, nothing is tested.
         """
         has_baseline = self.baseline is not None
         healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
@@ -432,7 +446,7 @@ class Watch:
         blocks = self._compared[-GROUP:]
         first_s = float(self._compared["end"][0])
         max_ratio = INFERENCE.oil.warmest
-        weights = blocks["sd"] ** -2.0 / np.sum(blocks["sd"] ** -2.0)  # a block that shows little counts little
+        weights = blocks["sd"] ** -2.0 / np.sum(blocks["sd"] ** -2.0)  # by the precision of each block
         g, total, offset = (float(weights @ blocks[name]) for name in ("g", "total", "offset"))
         sd = float(np.sum(blocks["sd"] ** -2.0)) ** -0.5
         if has_baseline:
@@ -451,7 +465,7 @@ class Watch:
         if rise is not None:
             reason = (
                 f"the leakage conductance is {mean:.3g} m^3/(s Pa), over {max_ratio:g} times the least of the {name}: "
-                "more than the warmest oil makes of it"
+                "more than the warmest oil can cause"
             )
             threshold = rise.threshold(probability)
             self._raise_leak(estimator, rise, block, threshold=threshold, reason=reason, before=healthy.level)
@@ -548,7 +562,7 @@ class Watch:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the watch as plain values for JSON, which `from_state` restores."""
-        # an estimator for other channels than those in use is not saved, as the next samples would replace it
+        # an estimator for channels other than those in use is not saved, as the next samples would replace it
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
@@ -559,7 +573,7 @@ class Watch:
 
     @classmethod
     def from_state(cls, state: Mapping[str, Any]) -> Watch:
-        """Restore a watch to the last bit from its `state`; raise InputError if it is of another version or damaged."""
+        """Restore a watch exactly from its saved `state`; raise InputError if it is of another version or damaged."""
         version = require_part(state, "version", int)
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")

@@ -59,13 +59,15 @@ class RmsBlocks:
 
     @property
     def seconds(self) -> float:
-        """Length of a block [s], without gaps between blocks; 0 if there are no blocks."""
+        """Length of a block [s]; 0 if there are no blocks."""
+        # the smallest difference, since a block that was left out makes the difference of two starts larger
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
         """Return a copy without the first blocks, in which pressures and speed settle.
 
-        These span 10 s or three cycles, whichever is longer, but are at most an eighth of the blocks.
+        The blocks that are left out span `blocks.settling` seconds or `blocks.settling_cycles` cycles (`priors.toml`),
+        whichever is longer, but at most an eighth of the blocks.
         """
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
@@ -87,7 +89,8 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    Both are described for `RmsBlocks`. Ends, where the wavelet transform depends on padding, are left out.
+    `RmsBlocks` describes both. The ends of the recording are left out, as the wavelet transform depends on padding
+    there.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -123,7 +126,8 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
 
     The recording must be uniformly sampled and its gaps filled in. Blocks in which too many samples were missing are
     left out, and so are the ends, where the wavelet transform depends on padding. If the duty repeats, the mean
-    differences between the phases of its cycle are removed, unless a reading is stuck.
+    differences between the phases of its cycle (blocks at the same place in the cycle) are removed, unless a reading is
+    stuck. For a recording that is too short for a block, the result has no blocks.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -178,7 +182,9 @@ def _find_frozen(
     """Describe the first block in which a pressure reading is stuck; None if no reading is stuck.
 
     A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. `log_rms` (n, 5 per chamber)
-    is that of n blocks, of which `is_complete` (n,) have no missing samples, and `times` (n + 1,) are their bounds [s].
+    is that of n blocks, and `times` (n + 1,) are the bounds of the blocks [s]. Only blocks in which few samples are
+    missing, as marked in `is_complete` (n,), are searched. If several readings are stuck, the first chamber is
+    described.
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

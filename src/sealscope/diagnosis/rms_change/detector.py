@@ -58,7 +58,9 @@ class RmsChange:
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
 
-        `levels` (5 per chamber,) and `duty` (4,) are as in `RmsBlocks`; `chambers` are those not mostly clipped.
+        The summary's `levels` (5 per chamber,) are the `log_rms` of `RmsBlocks`, and `duty` (4,) is as there.
+        `chambers` are the pressures that are not mostly clipped, to which `levels` belong, and `recorded` all chamber
+        pressures; `rate` is the sampling rate [Hz], and `start_s` the start time [s since 1970], None if unknown.
         """
         levels, duty = measure_levels(recording)
         return {
@@ -96,7 +98,7 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
     the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. `rate` is the
     sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels. If most blocks
-    say nothing about a detail, the report only says so.
+    give no information about a detail, the report only says so.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -104,7 +106,7 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
-            return Observed(RmsChange.name, lack=f"{name} says nothing in most blocks")
+            return Observed(RmsChange.name, lack=f"{name} gives no information in most blocks")
         up, down = steps
         step, sign = (up, 1.0) if up.chance <= down.chance else (down, -1.0)
         changes[name] = step, sign * weight * step.fitted.size
@@ -191,7 +193,8 @@ def _make_observable(
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
     `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `onset` its time [s], None for a
-    comparison. The p-value `chance` is multiplied by the number of tests: for rise and fall of each judged detail.
+    comparison with other recordings. The p-value `chance` is multiplied by the number of tests, which is two (rise and
+    fall) for each judged detail of each chamber in `chambers`.
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

@@ -56,8 +56,8 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
     g = log(RMS / mean RMS) of the pressures' wavelet details, after noise (`subtract_noise`) and the effect of the duty
-    were subtracted. Returns one `Information` (a normal likelihood over the blocks) for each column of
-    `blocks.log_rms`, and the mean of each column's fraction of energy that is not noise.
+    were subtracted. Returns a normal likelihood of g over the blocks (`Information`) for each column of
+    `blocks.log_rms`, and the mean fraction of energy that is not noise, (columns,).
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
@@ -93,8 +93,8 @@ def estimate_rises(
     noise (`subtract_noise`) over this fraction.
 
     The model is the sum of a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck process
-    over time, independent between sessions, which are separated by pauses. Its standard deviation is stated in
-    `priors.toml` (`recordings.session`); the likelihood is averaged over a prior on its rate (`walk`).
+    over time, independent between sessions, which are separated by pauses. The standard deviation of this process is
+    `recordings.session` of `priors.toml`; the likelihood is averaged over a prior on the rate of the process (`walk`).
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])

@@ -112,7 +112,8 @@ def estimate_reading(
 
     `rig` states the sizes of the machine, as for `diagnose`. If it is None, the thesis's rig is assumed, and L/min can
     be stated only for a simulation with these sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
-    recording's name, by default its file's. If no estimate is possible, `problem` of the result states the reason.
+    recording's name, by default that of its file. If no estimate is possible, `problem` of the result states the
+    reason.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -242,11 +243,11 @@ def build_timeline(
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
     """Sort leakage readings by time and group those that can be compared with each other.
 
-    Only readings of the most frequent method are used. Those of a group have nearly the same measured ratio of pump
-    displacement to piston area, which changes with a sensor of another scale, and from machine to machine. `every` is
-    the time between readings [s], by which they are dated in the order of their file names; None if their times are
-    known. Returns the readings with their groups, and for each group a text on its difference from the first, "" for
-    the first. Raises InputError if the time of a reading is unknown.
+    Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
+    pump displacement to piston area. This ratio changes if a sensor is replaced by one with another scale, and from
+    machine to machine. `every` is the time between readings [s], by which they are dated in the order of their file
+    names; None if their times are known. Returns the readings with their groups, and for each group a text on its
+    difference from the first group, "" for the first. Raises InputError if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -280,14 +281,17 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
     if unknown := [reading for reading in ordered if reading.start is None]:
         raise InputError(
             f"the time of every recording must be known, got none of {_join_files(unknown)}: put the date into the "
-            "names (press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) where they were made at "
+            "names (press_20240531.csv, press_20240531_0730.csv), or give every (such as 1d) if they were made at "
             "equal intervals, in the order of their names"
         )
     return sorted(ordered, key=lambda reading: reading.start or 0.0)  # no start is None any more
 
 
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
-    """List why each reading is left out: no level, a copy, or another method than most readings; "" if it is used."""
+    """List the reason why each reading is left out: no level, a copy, or a method other than that of most readings.
+
+    The text is "" for a reading that is used.
+    """
     file_of_digest: dict[str, str] = {}
     notes = []
     for reading in readings:
@@ -332,15 +336,19 @@ def _join_files(readings: Iterable[LeakReading]) -> str:
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative difference of two measured ratios of displacement to area; 0 if one is unknown."""
+    """Compute the relative difference of the measured ratio `scale` of displacement to area from the ratio `other`.
+
+    The result is 0 if one of them is unknown.
+    """
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    These are recordings (`ordered` by time) that overlap or, if none do, times that fall while the numbers in the file
-    names rise. Recordings dated without a time of day have the same start and do not count as overlapping.
+    The recordings are `ordered` by time. The first sign is recordings that overlap. If none do, the second sign is
+    times that fall while the numbers in the file names rise, provided that the names seem to be numbered in the order
+    of time. Recordings dated without a time of day have the same start and do not count as overlapping.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

@@ -129,7 +129,10 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Increase of the flow past pump and piston over that of the healthy machine; None if it is not stated."""
+        """Increase of the flow past pump and piston over that of the healthy machine, in the trend's unit.
+
+        None if the decision states no leak and no change was found.
+        """
         value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and interval is not None:
             return Interval(value, *interval)
@@ -323,7 +326,8 @@ def trend(
 def _add_episodes(trend: Trend) -> Trend:
     """Add to a trend the leakage in each comparable recording, the episodes between repairs, and the decision.
 
-    Instead of very many recordings, averages of neighbours are compared; `rows` become the recordings nearest to them.
+    If there are very many recordings, averages of neighbours are compared instead, and `rows` of the result has the
+    recordings nearest to these averages.
     """
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
@@ -349,7 +353,7 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
     points, findings = [*trend.points], [*trend.findings]
     _, excess = outlier_excess(levels)  # part of each level beyond the limit of outliers
     outliers = np.flatnonzero(excess)
-    remark = "apart from the recordings before and after: it counts as if it were near"
+    remark = "far from the recordings before and after, and counted as if nearer"
     for k, row in enumerate(trend.rows):
         value, half_width = float(levels.value[k]), WITHIN_95 * float(levels.error[k])
         note = remark if k in outliers else ""
@@ -362,7 +366,7 @@ def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], t
 
 
 def _count_healthy(trend: Trend) -> int:
-    """Count how many of the first `trend.healthy` different recordings are compared; return at least 1."""
+    """Count the compared recordings among the first `trend.healthy`, without copies; return at least 1."""
     digests = dict.fromkeys(point.digest for point in trend.points)  # in the order of time, copies once
     healthy_digests = list(digests)[: trend.healthy]
     return max(1, sum(trend.points[row].digest in healthy_digests for row in trend.rows))

@@ -75,7 +75,7 @@ class TrendLeak:
         return self.present_leakage
 
     def history(self, onset_s: float | None) -> None:
-        """Return None whatever the onset [s], as the trend itself is the history of the leak."""
+        """Return None for any onset, as the trend itself is the history of the leak."""
 
 
 def decide_trend(
@@ -87,7 +87,7 @@ def decide_trend(
     interval: float,
     years: float,
 ) -> Evidence:
-    """Decide from the comparable recordings since the last repair whether the leakage of a machine has increased.
+    """Decide from the comparable recordings since the last repair if the leakage of a machine has increased.
 
     `points` are in the order of time; `episode` is the result of `find_episodes` for them. `trend_units_per_level` is
     the factor from `LeakReading.level` to the unit of the trend; `pressure` [Pa] is the pressure difference for which a
@@ -162,7 +162,8 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
     """Compute the present leakage at `pressure` [Pa], with an interval that includes the error of the machine's sizes.
 
-    `total` has the interval of its estimate [L/min]; `size_deviation` is the sizes' relative standard error.
+    `total` is the estimate with its own interval [L/min], and `size_deviation` the relative standard error of the
+    machine's sizes.
     """
     half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
@@ -187,8 +188,9 @@ def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
     """Split recordings into those before the onset of the leak and those since the onset.
 
-    `points` are in the order of time. Those that cannot be compared with the last one are left out. Without an onset,
-    the second list is the last recording only.
+    `points` are in the order of time. Recordings of another group than the last one are left out, as they cannot be
+    compared with it. Without an onset, the second list has the recordings at the time of the last one, usually only
+    this one.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -200,8 +202,8 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     """Test the other terms of the volume balance for a change at the onset of the leak, which may explain the increase.
 
     The recordings since the onset are compared with those before. Only recordings whose balance has the same terms as
-    that of the last one are used. The result is empty if none of these is from before the onset, or if the last
-    recording has no balance or several.
+    that of the last one are used. The result is empty if there are none from before or none since the onset, or if the
+    last recording has no balance or several.
     """
     names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
     sums_before, sums_since = (
@@ -221,8 +223,8 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
 def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
     """Test the ringing (RMS of the pressures' wavelet details) of the last recording for a change since the onset.
 
-    It is compared with the recordings before the onset that have the same channels and sampling rate. The result has no
-    observables if there are none, or if the ringing is itself the basis of the trend.
+    The ringing is compared with that of the recordings before the onset that have the same channels and sampling rate.
+    The result has no observables if there are no such recordings, or if the trend is based on the ringing itself.
     """
     judged = points[-1].ringing
     if judged is None or points[-1].basis == "ringing":

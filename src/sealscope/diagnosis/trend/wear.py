@@ -424,7 +424,7 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
     `change_begin` is the index of the first recording after the change that the test has found. If it is None, an even
     growth or decrease over all recordings is estimated, with a wide prior. If the recordings span less than a day,
-    growth and time are NaN.
+    growth and time are NaN. For a single recording the rise (`leak`) has an infinite interval.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -501,10 +501,10 @@ def find_episodes(
 ) -> list[Episode]:
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
-    `years` is the mean time to a false alarm. The first `n_healthy` recordings are known to be healthy.
+    `years` is the mean time to a false alarm [machine-years]. The first `n_healthy` recordings are known to be healthy.
     `allowed_rise`, in the unit of the levels, is the rise at which a repair is due, None if there is no limit. A repair
-    shows as a fall of the level (`_find_repair`). After it a new period begins, whose first recording is taken as
-    healthy; of the earlier periods only the scatter is kept, as prior.
+    shows as a fall of the level (`_find_repair`). A new period begins after it, whose first recording is taken as
+    healthy. Only the scatter of the earlier periods is kept, as the prior for the next one.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
@@ -532,7 +532,8 @@ def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float
 
     A repair is a fall of the leakage level, found by the test for a rise with the sign reversed. `rise` is the result
     of the test for a rise, `days` the mean time to a false alarm [days], and `n_healthy` the number of first recordings
-    that are known to be healthy. If a rise is detected first, a repair is a fall below the worn level since that rise.
+    that are known to be healthy. If a rise is detected first, the search for a fall begins with the recordings that
+    show the rise, at the worn level.
     """
     first = 0  # index of the first recording that is tested for a fall
     fall = score_changes(levels, n_healthy, falls=True)

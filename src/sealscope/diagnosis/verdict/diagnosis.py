@@ -51,11 +51,11 @@ class Diagnosis(Evidence):
     file : str
         Name of the recording.
     false_alarm_probability : float
-        Probability of `leak` on a leak-free recording for which `threshold` was set.
+        Allowed probability of the verdict `leak` on a leak-free recording, from which `threshold` follows.
     quality : tuple of Finding
         Findings on the data.
     baselines : int
-        Number of leak-free recordings that the recording was compared with.
+        Number of leak-free recordings with which the recording was compared.
     machine : AssumedMachine, optional
         Assumed sizes of the machine, and whether they were stated.
     limit : RepairLimit
@@ -74,7 +74,7 @@ class Diagnosis(Evidence):
     >>> import sealscope as ss
     >>> diagnosis = ss.diagnose(ss.simulate(leak="0.05 L/min from 30 s", duration="60 s", seed=1))
     >>> diagnosis
-    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.05077, score=177.1, threshold=18.86)
+    Diagnosis('leak', file='recording', onset_s=29.95, leak_lpm=0.0508, score=175.8, threshold=18.86)
     >>> diagnosis.cause, f"{diagnosis.severity.creep_mm_per_min[0]:.0f} mm/min"
     ('piston or pump leak', '80 mm/min')
     >>> [evidence.detector for evidence in diagnosis.parts if evidence.abstains]
@@ -124,7 +124,7 @@ class Diagnosis(Evidence):
 
     @property
     def limit_lpm(self) -> float | None:
-        """Repair limit as a flow past the piston [L/min]; None for a creep speed if the piston area is unknown."""
+        """Repair limit as a flow past the piston [L/min]; None for a creep speed if nobody stated the piston area."""
         area = self.machine.area if self.machine is not None and self.machine.area_stated else None
         return self.limit.flow_lpm(area)
 
@@ -132,8 +132,10 @@ class Diagnosis(Evidence):
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
 
-        If the plot shows the total leakage, the healthy machine's is added: the median of the plotted flow before the
-        onset, minus the leak if this was open from the start. None without a plot, known limit or healthy leakage.
+        If the plot shows the leak alone, this is `limit_lpm`. If it shows the total leakage, the leakage of the healthy
+        machine is added. This is the median of the plotted flow before the onset or, for a leak that was open from the
+        start, the median over the recording minus the leak. The result is None without a plot or if the limit or the
+        healthy leakage is unknown.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
@@ -153,7 +155,7 @@ class Diagnosis(Evidence):
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Measured over assumed ratio of pump displacement to piston area, with 95 % interval (low, high).
 
-        It is that of the first detector that has measured it, beginning with the deciding one; None if none has.
+        The detectors are searched for a measured ratio, the deciding one first; None if no detector measured it.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -172,7 +174,12 @@ class Diagnosis(Evidence):
 
     @property
     def _condition(self) -> str:
-        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change"."""
+        """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
+
+        The verdict `no leak` has four conditions. If the leakage is known to be healthy, the condition is "no leak" for
+        a recording that may serve as a baseline, else "no leak found". Otherwise only a change within the recording was
+        excluded: the condition is "no change of RMS" if the detector of RMS changes decided, else "no change".
+        """
         if self.verdict != NO_LEAK:
             return self.verdict
         if self.known_healthy:
@@ -181,7 +188,10 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The `cause`; None if it contradicts the verdict, as a leak has a cause in `LEAKS`, and nothing else has."""
+        """The `cause` if it agrees with the verdict, else None.
+
+        The verdict `leak` requires a cause in `LEAKS`. The other verdicts require a cause outside `LEAKS`.
+        """
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -228,7 +238,7 @@ class Diagnosis(Evidence):
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of a test of the deciding detector by the test's `name`; None if there is no such test."""
+        """Find the evidence of a test of the deciding detector, such as `WITHIN`, by its `name`; None if absent."""
         tests = self.parts[0].parts if self.parts else ()  # the deciding detector is the first
         return next((test for test in tests if test.detector == name), None)
 
@@ -303,8 +313,7 @@ class Diagnosis(Evidence):
             matplotlib is not installed.
         """
         if (course := self.course) is None:
-            rule = "a diagnosis must state the leak over time to be drawn"
-            raise InputError(f"{rule}, got one that does not ({self.file})")
+            raise InputError(f"the diagnosis of {self.file} cannot be drawn, as no detector states the leak over time")
         try:
             from matplotlib.figure import Figure
         except ImportError:
@@ -359,6 +368,9 @@ def _is_usual(test: Evidence) -> bool:
 
 
 def find_machine_name(preamble: Mapping[str, str]) -> str | None:
-    """Find the machine's name among the statements at the beginning of a file; None if it is not stated."""
+    """Find the machine's name in the `preamble`, the statements by name at the beginning of a file; None if absent.
+
+    Of several names in `_MACHINE_NAMES`, the first one counts; upper and lower case are not distinguished.
+    """
     names = {name.lower(): text for name, text in preamble.items()}
     return next((names[name] for name in _MACHINE_NAMES if name in names), None)

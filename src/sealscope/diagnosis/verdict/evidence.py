@@ -149,7 +149,8 @@ class Evidence:
     relative : RelativeLeak, optional
         The leak relative to other quantities of the recording; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
-        Measured ratio of displacement to area, relative to the assumed one, and its 95 % interval.
+        Measured ratio of the pump's displacement to the piston's area, divided by the assumed ratio, and its 95 %
+        interval.
     bound_lpm : float, optional
         95 % upper bound of a leak [L/min] if none is reported.
     """
@@ -204,7 +205,10 @@ class Evidence:
 
     @property
     def odds(self) -> str | None:
-        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown."""
+        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown.
+
+        For the verdict `no leak` without an alarm, the words are "shows as much change" instead of "looks like this".
+        """
         if self.stated_chance is None:
             return None
         is_unchanged = self.verdict == NO_LEAK and not self.alarmed

@@ -75,8 +75,9 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
     A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
-    thesis's rig is used. It counts as stated by the recording if this names a rig of the same areas and displacement.
-    Otherwise nobody stated it, and all values are marked as assumptions. Raises InputError if `rig` cannot be read.
+    thesis's rig is used. It counts as stated by the recording if the recording was simulated with a packaged rig of the
+    same areas and displacement. Otherwise nobody stated it, and all values of the returned rig are marked as
+    assumptions. Raises InputError if `rig` cannot be read.
     """
     used_rig = load_rig(_DEFAULT if rig is None else rig)
     stated_by: StatedBy
@@ -107,15 +108,18 @@ def states_rig(rig: Rig) -> bool:
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Return True if a flow meter [m^3/s], the channel `q_pump`, measures the pump's flow, by the channels' `units`."""
+    """Return True if the best source for the flow to the cylinder is a flow meter, the channel `q_pump`, in m^3/s.
+
+    The result is False if the pump's angle or speed is recorded, too. `units` has the unit of each recorded channel.
+    """
     return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:
-    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] by the rig (`pump.G_healthy`).
+    """Return the largest leakage conductance of a healthy pump [m^3/(s Pa)] that the rig gives (`pump.G_healthy`).
 
-    A value marked as an assumption is used only if the same file states the displacement. Otherwise it may belong to
-    another pump, such as that of the default rig, and the result is 0.
+    A value marked as an assumption is used only if a whole rig was stated, and if the same file states the
+    displacement. Otherwise the value may belong to another pump, such as that of the default rig, and the result is 0.
     """
     is_from_same_file = rig.entry("pump.G_healthy").place == rig.entry("pump.q_b").place
     is_of_this_pump = states_rig(rig) and rig.states("pump.q_b") and is_from_same_file
@@ -128,7 +132,10 @@ def unstated_rig() -> Rig:
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:
-    """Return True if a recording was simulated with a packaged rig of the areas and displacement of `rig`."""
+    """Return True if a recording was simulated with a packaged rig of the areas and displacement of `rig`.
+
+    `provenance` is that of the recording. The result is False if the simulation replaced an area or the displacement.
+    """
     experiment = provenance.get("experiment")
     if not isinstance(experiment, Mapping):
         return False

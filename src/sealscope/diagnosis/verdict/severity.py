@@ -22,7 +22,7 @@ Level = Literal["repair", "plan", "monitor"]
 _Figure = tuple[float, float, float] | None
 
 
-#: Power of ten of a number such as 5e-6, whose letter is no unit.
+#: Letter before the power of ten in a number such as 5e-6, which must not be taken for a unit.
 _EXPONENT = re.compile(r"(?<=[\d.])[eE](?=[+-]?\d)")
 
 
@@ -48,16 +48,16 @@ class RepairLimit:
     def parse(cls, text: str | None) -> RepairLimit:
         """Parse a repair limit such as "5 mL/min" or "8 mm/min"; None gives the default of `priors.toml`.
 
-        Raises InputError for a text that is no flow or speed above 0 with a unit.
+        Raises InputError unless the text is a flow or a speed above 0 with its unit.
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
-        without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # its e is no unit
+        without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # the e of 5e-6 is not a unit
         has_unit = any(character.isalpha() for character in without_exponent)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:
                 value = parse_quantity(text, unit, name="limit")
-            except InputError:  # of another dimension, or not a quantity
+            except InputError:  # the text has another dimension, or is not a quantity
                 continue
             if has_unit and value > 0:
                 return cls(value, kind, stated=True)  # type: ignore[arg-type]
@@ -75,7 +75,7 @@ class RepairLimit:
         return None if area is None else self.value * area / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the limit as plain values for JSON; a flow has no creep speed (None), a creep speed no flow."""
+        """Return the limit as plain values for JSON, either as a flow or a creep speed; the other one is None."""
         return {
             "mL_per_min": self.value / ML_PER_MINUTE if self.kind == "flow" else None,
             "creep_mm_per_min": self.value / MM_PER_MINUTE if self.kind == "creep" else None,
@@ -120,7 +120,7 @@ class Severity:
         return "monitor" if high < VERDICT.repair.watch else "plan"
 
     def as_dict(self) -> dict[str, Any]:
-        """Return level, figures and their intervals (such as `of_limit_interval`) for JSON; unknown ones are None."""
+        """Return the level, each figure and its interval (such as `of_limit_interval`) for JSON; None if unknown."""
         plain: dict[str, Any] = {"level": self.level}
         for name in ("mL_per_min", "pump_share", "creep_mm_per_min", "of_limit"):
             figure = getattr(self, name)
@@ -151,8 +151,9 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
     """Convert a leak in L/min to a fraction of the pump's mean flow and to a creep speed of the piston.
 
-    `machine` states displacement and piston area. The result is None if the `evidence` states no L/min. The fraction is
-    None if the pump stands still, or if neither its speed nor its angle is recorded.
+    The flow of the pump follows from its mean speed in the `recording` and the displacement of the `machine`, and the
+    creep speed from the machine's piston area. The result is None if the `evidence` states no leak in L/min. The
+    fraction in it is None if the pump stands still, or if neither its speed nor its angle is recorded in SI units.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None

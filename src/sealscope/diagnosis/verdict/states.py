@@ -27,7 +27,8 @@ class MachineState:
     Attributes
     ----------
     name, symbol : str
-        "good", "check function", "out of specification", "maintenance required" or "failure", and its letter.
+        The state, "good", "check function", "out of specification", "maintenance required" or "failure", and the letter
+        that NE 107 gives it, such as "M".
     health : int
         Number of the state in OPC UA's DeviceHealthEnumeration.
     severity : int
@@ -37,7 +38,7 @@ class MachineState:
     since_s : float or None
         Time at which the state began, on the clock of the samples [s]; None if unknown.
     cause, action : str or None, str
-        Cause of the change, and what is to be done.
+        Cause of the change, None if no cause is known, and the action to take.
     """
 
     name: str
@@ -66,8 +67,9 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    A `cause` that `states.toml` lists determines the action and, unless the condition is a leak past piston or pump
-    (`LEAKING`), also the state. `since_s` is the time at which the state began [s]. `action` replaces the usual action.
+    If `states.toml` lists the `cause` of the change, the action is that for the cause. So is the state, unless the
+    condition is a leak past piston or pump (`LEAKING`). `since_s` is the time at which the state began [s]. A given
+    `action` replaces that of `states.toml`.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]
@@ -87,15 +89,18 @@ def find_separation(cause: str) -> str | None:
 
 @cache
 def joint_causes() -> Mapping[str, tuple[str, ...]]:
-    """Return groups of causes that some data cannot separate, by the joint name of each group in `states.toml`."""
+    """Return groups of causes that some data cannot separate, by the joint name of each group in `states.toml`.
+
+    For example, "external leak or sensor fault" is the joint name of "external leak" and "sensor fault".
+    """
     return {name: tuple(row["joins"]) for name, row in _tables()["causes"].items() if "joins" in row}
 
 
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action of `states.toml` for the cause of a change; without a listed cause, that for the condition.
 
-    `parts` are components that may be mistaken for a worn seal, such as an open "bypass". For a leak past piston or
-    pump, checks of these come first. Raises KeyError for an unknown condition or part.
+    `parts` are components whose leakage may be mistaken for that of a worn seal, such as "bypass". For a leak past
+    piston or pump, the text begins with the check of each of them. Raises KeyError for an unknown condition or part.
     """
     tables = _tables()
     row = tables["causes"].get(cause or "", tables["conditions"][condition])

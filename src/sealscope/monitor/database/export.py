@@ -22,10 +22,10 @@ _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return the numbers of both.
+    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return their two numbers.
 
-    The estimates from the start of an alarm's onset interval until its last mark are labelled: `leak` if the mark is
-    `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
+    The estimates from the start of an alarm's onset interval until the alarm's last mark are labelled: `leak` if the
+    mark is `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
     rows = []

@@ -21,9 +21,10 @@ from sealscope.storage.toml_file import read_toml
 def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
     """Write the mark that a person gave an alarm into the machine's file, and return one line that states the result.
 
-    `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` these samples are
-    added as a healthy recording, unless the machine judges that they leak. After a `valid` mark no recording from the
-    onset on becomes healthy until a repair. Returns "" if `rig` is not a machine's file, or does not store this mark.
+    `rig`: path of the file; `mark`: "valid", "invalid" or "repaired"; `samples`: the last samples before the mark. With
+    the mark `invalid` these samples are added as a healthy recording, unless `with_healthy` of the machine refuses
+    them, for example because they leak. After the mark `valid` no recording from the onset on becomes healthy until a
+    repair. Returns "" for any other mark, or if `rig` is not a machine's file.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
@@ -37,7 +38,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         leak_lpm = None if mark == "invalid" else alarm.leak_lpm
         times = {"date_s": time.time(), "onset_s": alarm.onset_s + shift}
         judgement = JudgedAlarm(alarm=name, mark=mark, leak_lpm=leak_lpm, reason=reason, **times)
-        outcome = "written down"
+        outcome = "mark stored"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
             """Add the marked alarm to a machine, with its samples as a healthy recording if invalid; set `outcome`."""
@@ -46,14 +47,14 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
             if mark == "invalid":
                 try:
                     machine = machine.with_healthy(_combine_samples(samples, shift), file=name)
-                    outcome = "taught as healthy"
+                    outcome = "mark stored, samples added as healthy"
                 except SealscopeError as error:
-                    outcome = f"not taught: {error}"
+                    outcome = f"mark stored, samples not added: {error}"
             return machine
 
         update_machine(path, add_mark)
     except (SealscopeError, ValueError, OverflowError, OSError) as error:
-        outcome = f"not written: {error}"
+        outcome = f"mark not stored: {error}"
     return f"{path.name}: {outcome}"
 
 

@@ -21,7 +21,10 @@ _DRIVERS = ("postgresql", "postgresql+psycopg", "postgresql+psycopg2")
 
 
 def engine_options(url: URL) -> dict[str, Any]:
-    """Build SQLAlchemy's options for PostgreSQL's time limits, unless `url` states them; {} for another database."""
+    """Build SQLAlchemy's options with the time limits for PostgreSQL; return {} for the URL of another database.
+
+    A limit that `url` states itself is left out.
+    """
     if url.drivername not in _DRIVERS:
         return {}
     keepalive = {"keepalives_idle": 5, "keepalives_interval": 2, "keepalives_count": 3}

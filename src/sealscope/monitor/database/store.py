@@ -133,6 +133,7 @@ class MonitorStore:
     """The database of a monitor: a file of SQLite, or a URL. Raises InputError if it cannot be opened."""
 
     def __init__(self, database: str) -> None:
+        """Open the database, a file of SQLite or a URL, and create missing tables; raise InputError if that fails."""
         self.tables = tables
         is_file = "://" not in database
         # one thread writes at a time: SQLite would make the others wait, and then fail
@@ -204,7 +205,7 @@ class MonitorStore:
             return int(connection.execute(query).scalar() or 0)
 
     def select_stored(self, blocks: Iterable[tuple[str, str]]) -> set[tuple[str, str]]:
-        """Select from `blocks`, pairs (actuator, identity), those that are stored already."""
+        """Select the blocks that are stored already from `blocks`, given as pairs (actuator, identity)."""
         # one query per block: SQLite scans the whole table for a list of pairs
         columns = tables.blocks.c
         is_block = (columns.actuator == bindparam("name")) & (columns.identity == bindparam("identity"))
@@ -231,7 +232,8 @@ class MonitorStore:
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Write rows to their tables within the transaction of `connection`, and delete rows that are no longer needed.
 
-        These are the samples before a new checkpoint, and the rows up to `rows.old_blocks` and `rows.old_estimates`.
+        The deleted rows are the samples before a new checkpoint, the identities up to the numbers `rows.old_blocks`,
+        and the estimates up to `rows.old_estimates`.
         """
         actuator = bindparam("name", type_=sa.String)
         if rows.actuators:  # a checkpoint replaces the samples before it
@@ -289,7 +291,8 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        `digest`: hash of the message. Earlier attempts never ended, as the process crashed: the caller can refuse it.
+        `digest`: hash of the message. An attempt that ends is not counted (`end_decoding`): the earlier ones crashed
+        the process, so the caller can refuse the message.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -360,7 +363,8 @@ class MonitorStore:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
         Each row has the mean time `t` [s], flows and interval ends [L/min], and oil temperature [deg C] of a group of
-        successive estimates, with None for unknown ones. `seconds` [s]: length of the history, None for all.
+        successive estimates, with None for unknown values. `seconds` [s]: length of the history up to the last
+        estimate, None for all.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -392,7 +396,7 @@ class MonitorStore:
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
         """Send up to 1000 events that an output has not sent yet, in order, and store the number of the last one sent.
 
-        `send`: sends an event, and returns False if the next call must try this event again.
+        `send`: function that sends an event, and returns False if the next call must try this event again.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):

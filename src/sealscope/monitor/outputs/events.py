@@ -71,6 +71,7 @@ class Webhook:
     part = "webhook"
 
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
+        """Prepare the headers of all requests; the class describes the parameters."""
         self._store, self._url, self._timeout = store, url, timeout
         self._headers = {"Content-Type": "application/json", "User-Agent": "sealscope"}
         if token is not None:

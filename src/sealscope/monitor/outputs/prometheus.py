@@ -48,7 +48,8 @@ def format_metrics(
     """Format the metrics of all actuators and of the monitor in the text format of Prometheus.
 
     `summaries`: summary of each actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`: for
-    each part, such as the database, (True if it works now, number of outages, their total length [s]).
+    each part, such as the database, (True if it works now, number of outages, their total length [s]); `queue_load`:
+    load of the queue of blocks, None for an empty queue.
     """
     families: dict[str, Any] = {}
 

@@ -48,6 +48,7 @@ class SparkplugNode:
         settings: SparkplugSettings,
         password: str | None = None,
     ) -> None:
+        """Build the node and its link to the broker, which `deliver` opens; the class describes the parameters."""
         spb.payload_class()  # fails here rather than at the first message
         self._store, self._summaries, self._count = store, summaries, count
         self._settings, self._broker = settings, broker
@@ -122,6 +123,7 @@ class SparkplugNode:
         """Build topic and payload of the death message, which the broker publishes when the next connection is lost.
 
         Death and birth of a connection have the same number bdSeq (0 to 255), one more than that of the last birth.
+        This number is stored as `_connection_birth_number`.
         """
         self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
@@ -152,7 +154,10 @@ class SparkplugNode:
             self._birth_due.set()
 
     def _send_event(self, event: dict[str, Any]) -> bool:
-        """Send an event and its alarm as a data message of the actuator's device; return False if that fails."""
+        """Send an event and its alarm as a data message of the actuator's device; return False if that fails.
+
+        The event of an actuator that is not in the settings is skipped, and True is returned.
+        """
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
         if alarm["actuator"] not in self._sent_values:  # no birth was sent: it is not in the settings
             return True
@@ -161,7 +166,10 @@ class SparkplugNode:
         return self._send("DDATA", metrics, alarm["actuator"])
 
     def _send_births(self) -> None:
-        """Send the birth messages of the node and of all devices, with the present values of all metrics."""
+        """Send the birth messages of the node and of all devices, with the present values of all metrics.
+
+        The number bdSeq of this birth is stored first, so that it increases after a restart, too.
+        """
         self._store.write_position(_BIRTHS, self._connection_birth_number)
         self._sent_birth_number = self._connection_birth_number
         summaries = self._summaries()

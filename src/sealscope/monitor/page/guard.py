@@ -35,6 +35,7 @@ class Admission:
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
+        """Begin without wrong tokens; the class describes the parameters."""
         self._token, self._now = token, now
         #: By network: number of wrong tokens, and time of the last one [s].
         self._failures: dict[str, tuple[int, float]] = {}
@@ -51,9 +52,10 @@ class Admission:
         return max(0.0, last + pause - self._now())
 
     def admits(self, address: str, token: str, *, session: bool = False) -> bool:
-        """Return True if a token is right; count wrong tokens, for each network, until it sends a right one.
+        """Return True if a token is right; otherwise count it as a wrong token of the client's network.
 
-        `address`: IP address of the client; `session`: True if `token` is the cookie of a browser admitted before.
+        `address`: IP address of the client; `session`: True if `token` is the cookie of a browser admitted before. The
+        count of a network starts anew after a right token, or `_FORGET_S` seconds after the last wrong one.
         """
         expected, network = self.session if session else self._token, _network(address)
         if hmac.compare_digest(token.encode("utf-8", "replace"), expected.encode()):
@@ -90,15 +92,16 @@ def connection_limit() -> int:
 def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asyncio.Protocol]:
     """Build a subclass of uvicorn's HTTP protocol that limits the number of connections and their idle time.
 
-    A connection is closed after `silent_s` seconds without activity. If there are more than `max_connections`, the
-    connection that has been silent for longest is closed, or the new one if all others are being answered.
+    A connection is active when it is made, while it waits for an answer, and while its client reads one. It is closed
+    after `silent_s` seconds without activity. If there are more than `max_connections`, the connection that has been
+    silent for longest is closed, or the new one if all others are being answered.
     """
     from uvicorn.protocols.http.auto import AutoHTTPProtocol
 
     base: Any = AutoHTTPProtocol
 
     class LimitedProtocol(base):  # type: ignore[misc]
-        """A limited connection; `last_activity` [s]: time of its last request, or of reading an answer."""
+        """A limited connection; `last_activity` [s]: time at which it was made, or last found to be active."""
 
         def connection_made(self, transport: Any) -> None:
             """Accept the connection; if there are too many, close the one that has been silent for longest."""
@@ -112,13 +115,13 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
             self.loop.call_later(_CHECK_INTERVAL_S, self.check_silence)
 
         def is_sending_answer(self) -> bool:
-            """Return True if the answer to a request is still being sent."""
+            """Return True if the answer to a request is still being prepared or sent."""
             return self.cycle is not None and not self.cycle.response_complete
 
         def check_silence(self) -> None:
             """Close the connection if it has been silent for too long; otherwise schedule the next check.
 
-            A client that receives an answer counts as active while it reads.
+            A connection that waits for an answer, or whose client reads one, counts as active.
             """
             if self.transport.is_closing():
                 return

@@ -75,7 +75,10 @@ class _Window:
 
 
 class LiveSamples:
-    """The last samples of the viewed actuators; `recall`: returns the stored samples of an actuator, shown first."""
+    """The last samples of the viewed actuators.
+
+    `recall`: function that returns the stored samples of an actuator, which are shown until new ones arrive.
+    """
 
     def __init__(self, recall: Callable[[str], Sequence[Recording]] = lambda name: ()) -> None:
         self._recall = recall
@@ -85,9 +88,10 @@ class LiveSamples:
 
     @contextmanager
     def viewing(self, name: str) -> Iterator[bool]:
-        """Keep the samples of the actuator `name` while the context lasts; yield False if too many others are viewed.
+        """Keep the samples of the actuator `name` while the context lasts, and yield True.
 
-        The last stored samples are shown until new ones arrive.
+        If too many other actuators are viewed, nothing is kept, and False is yielded. The first viewer of an actuator
+        sees the last stored samples until new ones arrive.
         """
         with self._lock:
             is_first = name not in self._windows
@@ -194,8 +198,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
     `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name; `detail_form`:
-    "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has`) than the
-    wavelet transform needs (`needs`), the curves are empty.
+    "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has` in the result)
+    than the wavelet transform and a window of the RMS need (`needs`), or if numbers overflow, there are no curves.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -222,9 +226,10 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
     """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
 
-    The last `_MOTION_S` seconds of the channels (n,), sampled at the times `t` (n,) [s] with the `rate` [Hz], are
-    averaged over bins, groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the means.
-    Returns plain values by name, with only an empty "t" if there are fewer than two bins.
+    The last `_MOTION_S` seconds of the channels (n,) in SI units, sampled at the times `t` (n,) [s] with the `rate`
+    [Hz], are averaged over bins, groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the
+    averages, except a recorded speed of the pump. Returns plain values by name, with only an empty "t" if there are
+    fewer than two bins.
     """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))

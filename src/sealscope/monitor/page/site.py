@@ -75,8 +75,8 @@ def site(
 ) -> Starlette:
     """Build the web application that serves the page of a monitor.
 
-    `token`: needed for all but the login form, None to admit everybody; `queue_load`: function that returns the load of
-    the queue of blocks; `live`: the last samples of the service, by default only the stored ones.
+    `token`: text that is needed for all but the login form, None to admit everybody; `queue_load`: function that
+    returns the load of the queue of blocks; `live`: the last samples of the service, by default only the stored ones.
     """
     pages = _Pages(actuators, token, queue_load, live or LiveSamples(actuators.store.last_samples))
     routes = [
@@ -101,6 +101,7 @@ class _Pages:
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
     ) -> None:
+        """Prepare the answers to requests; `site` describes the parameters."""
         self._actuators, self._store, self._queue_load, self._live = actuators, actuators.store, queue_load, live
         self._supervisor = actuators.supervisor
         self._machines = {name: describe_rig(settings.rig) for name, settings in actuators.settings.items()}
@@ -166,7 +167,7 @@ class _Pages:
             note = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
             alarm = await asyncio.to_thread(self._actuators.apply_mark, name, values.get("mark", ""), **note)
         except TimeoutError:
-            return _make_refusal(f"a request must have come within {_BODY_S:g} s", 408)
+            return _make_refusal(f"a request must arrive within {_BODY_S:g} s", 408)
         except ValueError as error:
             return _make_refusal(str(error), 400)
         return JSONResponse(alarm.as_dict())
@@ -174,10 +175,11 @@ class _Pages:
     async def changes(self, request: Request) -> Response:
         """Answer with a stream of server-sent events that keeps the page up to date.
 
-        An event without a name tells the page to load results, alarms and outages again. It has the number of their
-        changes so far, and is sent after each change and after `_KEEP_ALIVE_S` [s] without one. An event "live" has the
-        curves of the last samples of an actuator (`LiveSamples.curves`). Query: `actuator`, the name of this actuator;
-        `pressure`, "p_A" or "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their RMS.
+        An event without a name tells the page to load results, alarms and outages again. Its data is the number of
+        changes so far; it is sent after each change, and after `_KEEP_ALIVE_S` [s] without a change. An event "live"
+        has the curves of the last samples of an actuator (`LiveSamples.curves`). Query: `actuator`, the name of this
+        actuator; `pressure`, "p_A" or "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their
+        RMS. A wrong query is refused, and so is any request if there are too many listeners.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -223,12 +225,15 @@ class _Pages:
         return Response(self._render_metrics(self._actuators.summaries()), media_type=CONTENT_TYPE)
 
     def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
-        """Format the metrics for Prometheus. `summaries`: summary of each actuator, {} in a database outage."""
+        """Format the metrics for Prometheus from the summary of each actuator; `summaries` is {} in an outage."""
         totals, load = self._supervisor.outage_totals(), self._queue_load()
         return format_metrics(summaries, self._actuators.counters, totals, load)
 
     async def answer_outage(self, request: Request, error: Exception) -> Response:
-        """Answer with status 503 in an outage of the database and report the outage; raise any other error again."""
+        """Answer with status 503 in an outage of the database and report the outage; raise any other error again.
+
+        The path /metrics is answered with the metrics that need no database, other paths with JSON.
+        """
         reason = outage_reason(error)
         if reason is None:
             raise error
@@ -262,7 +267,12 @@ class _Pages:
         return Response(read_package_file("login.html", _PACKAGE), status, media_type="text/html")
 
     def _find_refusal(self, request: Request) -> Response | None:
-        """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it."""
+        """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it.
+
+        Every request is admitted if the page has no token, and the login form always is. Without a valid token, a
+        request for the page is redirected to the form, and any other is refused with status 401. A client that must
+        wait after wrong tokens gets status 429.
+        """
         admission = self._admission
         if admission is None or request.url.path in ("/login", "/login.css"):
             return None
@@ -348,6 +358,7 @@ class PageServer:
         queue_load: Callable[[], QueueLoad] = QueueLoad,
         live: LiveSamples | None = None,
     ) -> None:
+        """Open the port, and start the thread that serves the page; the class describes the parameters."""
         token = read_secret(settings.token_file, "page.token_file")
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, queue_load, live)
@@ -368,7 +379,10 @@ class PageServer:
             raise InputError(f"page.port must be free, got {error.strerror or error} ({place})") from None
 
     def _serve(self) -> None:
-        """Serve the page until `leave` is called; uvicorn closes the socket at the end."""
+        """Serve the page until `leave` is called; uvicorn closes the socket at the end.
+
+        Raises RuntimeError if the server ends before, so that the supervisor starts it again.
+        """
         page_socket = self._socket or self._open_socket()  # opened again after an error, which closes it
         self._socket = None
         config = uvicorn.Config(
@@ -390,13 +404,13 @@ class PageServer:
             raise RuntimeError("the page's server has ended")
 
     def leave(self) -> None:
-        """Tell the web server to end, and return at once."""
+        """Tell the web server and its open event streams to end, and return at once."""
         self._actuators.closed = True
         if self._server is not None:
             self._server.should_exit = True
 
     def close(self) -> None:
-        """End the server and wait for its thread."""
+        """End the server, wait up to 1 s for its thread, and close the socket if it is still open."""
         self.leave()
         self._thread.join(timeout=1.0)
         if self._socket is not None:

@@ -44,7 +44,7 @@ _log = logging.getLogger(__name__)
 _SESSION_S, _IN_FLIGHT, _MAX_PACKET_BYTES = 30 * 86_400, 256, 16_000_000
 #: Queued messages, and their bytes, up to which another message of QoS 0 is accepted.
 _MAX_QUEUE, _MAX_QUEUE_BYTES = 256, 64_000_000
-#: ... and up to which another message of QoS 1 is accepted.
+#: Queued messages, and their bytes, up to which another message of QoS 1 is accepted.
 _MAX_QOS1_QUEUE, _MAX_QOS1_BYTES = 2048, 192_000_000
 #: Size above which the start of decoding a message is stored [bytes], and most attempts to decode a message.
 _NOTED_BYTES, _MAX_ATTEMPTS = 256_000, 2
@@ -74,6 +74,7 @@ class _Connection:
     """The connection of a monitor to its MQTT broker, by which blocks arrive and alarms are published."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
+        """Prepare the connection and its callbacks; `run` opens it."""
         self._settings, self._service = settings, service
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
@@ -87,7 +88,7 @@ class _Connection:
             self._host = SparkplugHost(service.settings.actuator, self._client.publish, service.count)
         self._connected_ms = self._connection = 0  # time of the connection [ms since 1970], and its number
         self._overfull_connection = -1  # number of the connection whose further messages stay unacknowledged
-        self._overfull_socket: Any = None  # its socket, which will be closed
+        self._overfull_socket: Any = None  # socket of this connection, which will be closed
         self._ended = threading.Event()
         self._published_states: dict[str, str] = {}
         self._states_due = 0.0
@@ -208,6 +209,7 @@ class _Connection:
         number, qos = message.mid, message.qos
 
         def acknowledge() -> None:
+            """Acknowledge the message to the broker, if it has QoS 1 and came by the present connection."""
             # on a new connection the number may be that of another message, and the broker sends this one again
             if qos and connection == self._connection:
                 self._client.ack(number, qos)
@@ -233,7 +235,8 @@ class _Connection:
     def _note_decoding(self, message: Any) -> Iterator[None]:
         """Store in the database, until the context ends, that a large or repeated message of QoS 1 is being decoded.
 
-        Raises RefusedMessage if it began `_MAX_ATTEMPTS` times and never ended, because the process died each time.
+        Raises RefusedMessage if its decoding has begun `_MAX_ATTEMPTS` times before and never ended, because the
+        process died each time.
         """
         if not message.qos or not (message.dup or len(message.payload) > _NOTED_BYTES):
             yield
@@ -244,8 +247,8 @@ class _Connection:
             n_starts = store.begin_decoding(self._name, digest)
         try:
             if n_starts >= _MAX_ATTEMPTS:
-                rule = f"a message must be decoded in {_MAX_ATTEMPTS} attempts"
-                raise RefusedMessage(UNENDED, f"{rule}, got no end of them")
+                rule = "the decoding of a message must end"
+                raise RefusedMessage(UNENDED, f"{rule}, got no end in {_MAX_ATTEMPTS} attempts")
             yield
         finally:
             with suppress(SQLAlchemyError):

@@ -72,6 +72,7 @@ class WatchedFolder:
         is_stored: Callable[[str, str], bool],
         newest_s: float = -math.inf,
     ) -> None:
+        """Prepare reading the folder in the settings of its actuator; the class describes the parameters."""
         assert settings.folder is not None
         self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
         self.settle_s, self._is_stored = settle_s, is_stored
@@ -125,7 +126,10 @@ class WatchedFolder:
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted."""
+        """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted.
+
+        A file that could not be read before is due only when it can no longer be unfinished.
+        """
         is_incomplete = file.identity in self._unreadable and self._may_be_incomplete(file)
         if is_incomplete or self._unchanged_s(file) < self.settle_s:
             return False
@@ -179,14 +183,16 @@ class WatchedFolder:
             return ""
         # [:19]: without the time zone
         dates = (datetime.fromtimestamp(t, UTC).isoformat(" ", "seconds")[:19] for t in (start, self._newest_s))
-        return "{} must not be older than what was watched, got {} after {}".format(_printable(path.name), *dates)
+        return "{} must not be older than the recordings before, got {} after {}".format(_printable(path.name), *dates)
 
     def _judge_block(self, block: SourceBlock, recording: Recording, path: Path) -> SourceBlock:
         """Add a recording's samples to a block, and the verdict on the recording if its machine is commissioned.
 
         The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
         recording without a time of day begins `_GAP_S` after the previous one of its day. An oil temperature in the
-        file's header becomes the channel `T_oil`. Raises PartAway if the file of the machine cannot be read.
+        file's header becomes the channel `T_oil`. If the comparison with the machine's healthy recordings raises an
+        error, the error is logged, and the block gets no verdict. Raises PartAway if the file of the machine cannot be
+        read.
         """
         start = file_seconds(recording, path)
         # long gaps, which the correction fills in, become NaN again
@@ -216,7 +222,10 @@ class WatchedFolder:
         return replace(block, samples=Recording(times, channels, units, corrected_samples.rate), verdict=verdict)
 
     def _files(self) -> Iterator[_FoundFile]:
-        """Yield the files that match the pattern, except hidden or unfinished ones, and links out of the folder."""
+        """Yield the files that match the pattern, except hidden or unfinished ones, and links out of the folder.
+
+        Raises PartAway if the folder cannot be read.
+        """
         try:
             root = self.folder.resolve()
             entries = list(self.folder.iterdir())
@@ -240,7 +249,10 @@ class WatchedFolder:
 
 
 def watch_folders(service: BlockReceiver, *, once: bool) -> None:
-    """Submit new files of the actuators' folders as blocks until the service stops; `once`: only those found now."""
+    """Submit new files of the actuators' folders as blocks until the service stops.
+
+    `once`: True to submit only the files that are found now, and then return.
+    """
     settle_s = 0.0 if once else service.settings.settle_s
     part, summaries = service.supervisor.part, service.summaries()
     folders: dict[SupervisedPart, WatchedFolder] = {}

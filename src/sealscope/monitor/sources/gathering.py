@@ -68,6 +68,7 @@ class ValueGatherer:
         count: Callable[[str], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
+        """Begin without values; `channels`: names of the channels of a block."""
         self.rate, self._length = rate, max(1, round(block_s * rate))
         self._max_lead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
         self._channels = {name: _Channel() for name in channels}
@@ -80,7 +81,8 @@ class ValueGatherer:
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
         is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
         by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
-        as much, all earlier values are discarded; only a channel's first value may be so old: it has not changed since.
+        as much, the clock was set, and all earlier values are discarded. The first value of a channel is an exception:
+        it may have such an old time if it has not changed since, and counts as the present value.
         """
         # sample numbers up to 2^52 are exact as doubles
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
@@ -105,7 +107,7 @@ class ValueGatherer:
     def _add_values(self, target: _Channel, first: int, values: Sequence[float]) -> None:
         """Add values to the channel `target` from index `first` of the time axis on; drop those before the next block.
 
-        Before the first block, only the newest `_max_lead` values are kept: another channel may never send any.
+        Before the first block, which waits for a value of every channel, only the newest `_max_lead` values are kept.
         """
         for k, value in enumerate(values, first):
             if self._start is not None and k < self._start:
@@ -125,7 +127,10 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks for which all channels have values, except those silent for `SILENT_S` [s]."""
+        """Remove and return the blocks for which every channel has values.
+
+        A channel that has been silent for `SILENT_S` [s] counts as constant; if all channels are silent, no block ends.
+        """
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)

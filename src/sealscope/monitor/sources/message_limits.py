@@ -78,8 +78,8 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons in them (`check_json`). A decoder
-    keeps only the last value of a repeated key: there are then fewer pairs than colons outside texts.
+    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons in the payload (`check_json`). A
+    decoder keeps only the last value of a repeated key: there are then fewer pairs than colons outside texts.
     """
     if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -87,15 +87,16 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that a decoded message has `n_pairs` key-value pairs, like its bytes; raise MessageLimit otherwise.
+    """Check that the decoded message `values` has `n_pairs` key-value pairs; raise MessageLimit otherwise.
 
-    It has fewer if a key is repeated, as a decoder keeps only the last value of the key.
+    `n_pairs`: number of pairs in the bytes of the message. The decoded message has fewer if a key is repeated, as a
+    decoder keeps only the last value of the key.
     """
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return
     n_decoded = _count_pairs(values)
     if n_decoded != n_pairs:
-        raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} again")
+        raise MessageLimit(f"keys must differ, got {n_pairs - n_decoded} repeated")
 
 
 def _count_shallow_pairs(values: Any) -> int:
@@ -125,10 +126,11 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Read the argument of a CBOR item, a number; return it and the position after it, or -1 if the data end before.
+    """Read the argument of a CBOR item, a number; return the number and the position after it.
 
-    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of that byte,
-    the argument itself if below 24; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain it.
+    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of that byte.
+    An `info` below 24 is the argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain the argument.
+    Returns 0 and the position -1 if the data end before.
     """
     if info < 24:
         return info, position

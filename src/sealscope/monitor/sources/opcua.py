@@ -37,7 +37,10 @@ _NO_NUMBER = "OPC UA values that are no number"
 
 
 def opcua_source(settings: OpcUaSettings) -> Callable[[BlockReceiver], None]:
-    """Build a source that submits the values of an OPC UA server as blocks; raise MissingExtra without asyncua."""
+    """Build a source that submits the values of an OPC UA server as blocks.
+
+    Raises MissingExtra if asyncua is not installed, and InputError if the password cannot be read.
+    """
     if find_spec("asyncua") is None:  # before the service starts
         raise MissingExtra("OPC UA needs asyncua: pip install 'sealscope[opcua]'")
     password = read_secret(settings.password_file, "opcua.password_file")
@@ -48,6 +51,7 @@ class _OpcUaSession:
     """The connection of a service to an OPC UA server, with its subscriptions."""
 
     def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
+        """Prepare gathering values and their conversion to SI units, for each actuator that has nodes."""
         self._settings, self._password, self._service = settings, password, service
         self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
@@ -107,7 +111,7 @@ class _OpcUaSession:
                 )
                 for (node, channel), result in zip(nodes.items(), results, strict=True):
                     if not isinstance(result, int):
-                        raise ConnectionError(f"{actuator.name}: {channel} is no node, got {node.nodeid} ({result})")
+                        raise ConnectionError(f"{actuator.name}: no node {node.nodeid} for {channel} ({result})")
             self._server.end_outage()
             while not self._service.stopping.is_set():
                 await client.check_connection()

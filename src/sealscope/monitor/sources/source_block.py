@@ -78,6 +78,7 @@ class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     def __init__(
         self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = lambda: None
     ) -> None:
+        """Store the reason and the first bytes of the refused `contents`; `message`: text of the error."""
         super().__init__(message)
         self.reason, self.done = reason, done
         self.size, self.beginning = len(contents), contents[:_N_KEPT_BYTES]
@@ -163,7 +164,7 @@ def decode_message(
     values = _parse_mapping(payload)
     unknown = sorted(_abbreviate(name) for name in values if name not in _KNOWN_NAMES)
     if unknown:
-        raise RefusedMessage(NO_MAPPING, f"a message must hold {', '.join(sorted(_KNOWN_NAMES))}, got {unknown[0]!r}")
+        raise RefusedMessage(NO_MAPPING, f"entries must be {', '.join(sorted(_KNOWN_NAMES))}, got {unknown[0]!r}")
     name, units = values.get("actuator", actuator), values.get("units", {})
     if not isinstance(name, str) or (actuator is not None and name != actuator):
         raise RefusedMessage(WRONG_ACTUATOR, f"a message must name its actuator, got {_abbreviate(name)!r}")
@@ -290,7 +291,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
 
 
 def convert_to_si(values: Any, unit: object, channel: str) -> Any:
-    """Convert values of a channel from `unit` (None for SI) to SI; raise RefusedMessage for the wrong dimension."""
+    """Convert values of a channel from `unit` (None for SI) to SI; raise RefusedMessage if the unit does not fit."""
     try:
         return values if unit is None else to_si(values, _abbreviate(unit), CHANNEL_UNITS[channel], name=channel)
     except InputError as error:

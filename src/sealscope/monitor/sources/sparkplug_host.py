@@ -62,7 +62,10 @@ class _Birth:
 
     @classmethod
     def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
-        """Select the metrics of a birth that are channels of an actuator, or its rate; "[unit]" may follow a name."""
+        """Select the metrics of a birth that are channels of an actuator, or its sampling rate.
+
+        A metric has the name that `map` of the actuator states, by default that of the channel; "[unit]" may follow it.
+        """
         birth = cls()
         # channel by name of its metric
         channel_of = {actuator.map.get(channel, channel): channel for channel in (*CHANNELS, _RATE)}
@@ -135,6 +138,7 @@ class SparkplugHost:
         publish: Callable[[str, bytes], object],
         count_event: Callable[[str], None],
     ) -> None:
+        """Prepare the sessions of all nodes in the settings of the actuators; nothing is sent."""
         spb.payload_class()  # fails here rather than at the first message
         self._publish, self._count_event = publish, count_event
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
@@ -150,7 +154,10 @@ class SparkplugHost:
         return [f"{spb.topic_of(group, '+', node)}/#" for group, node in self._nodes]
 
     def request_all_births(self) -> None:
-        """Request a birth, which states all metrics, from each node, as a new connection may have missed messages."""
+        """Request a birth, which states all metrics, from each node, as a new connection may have missed messages.
+
+        Until its birth arrives, the session of a node counts as incomplete, and messages with aliases are refused.
+        """
         for (group, node), state in self._nodes.items():
             state.is_complete = False
             self._request_birth(group, node)
@@ -211,8 +218,8 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         A birth of a node (NBIRTH) begins its session, and a death (NDEATH) ends it; both discard the births of its
-        devices. A gap in the sequence is counted, and a birth requested. Raises RefusedMessage for a message without a
-        sequence number or before the birth, and for the death of an earlier connection.
+        devices. After a gap in the sequence, which is counted, a birth is requested. Raises RefusedMessage for a
+        message without a sequence number or before the birth, and for the death of an earlier connection.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):
@@ -240,9 +247,10 @@ class SparkplugHost:
     ) -> Recording | None:
         """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
-        `sent_ms` [ms since 1970]: time of sending, used for metrics without a time. A single value of a slow channel,
-        such as the oil temperature, is not a sample: the `birth` of the actuator stores it, and all recordings repeat
-        it until the next value. Raises RefusedMessage if the samples cannot be used.
+        `metrics`: metrics of channels or of the sampling rate, with names; `sent_ms` [ms since 1970]: time of sending,
+        used for metrics without a time. A single value of a slow channel, such as the oil temperature, is not a sample:
+        the `birth` of the actuator stores it, and all recordings repeat it until the next value. Raises RefusedMessage
+        if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -262,7 +270,7 @@ class SparkplugHost:
             size = next(iter(piece.values())).size
             pieces.append({"t": self._sample_times(actuator.name, timestamp / 1000.0, size, rate), **piece})
         if (n_samples := sum(piece["t"].size for piece in pieces)) > MAX_SAMPLES:
-            raise RefusedMessage(blocks.OVERSIZED, f"{MAX_SAMPLES} samples are the most, got {n_samples}")
+            raise RefusedMessage(blocks.OVERSIZED, f"there must be at most {MAX_SAMPLES} samples, got {n_samples}")
         t = np.concatenate([piece["t"] for piece in pieces])
         values = {}
         for channel in CHANNELS:  # NaN where a piece lacks the channel
@@ -282,9 +290,10 @@ class SparkplugHost:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
         `t` is truncated or rounded to whole milliseconds. The expected start is one sampling interval after the
-        actuator's previous sample. If rounding explains its distance from `t`, the times begin there. If the distance
-        is larger, they are shifted from there towards `t`, by at most `_MAX_SHIFT` samples. From three times `_LATE_S`
-        on, and for the first samples, they begin at `t`: samples are missing, or the clock was set.
+        actuator's previous sample. The times begin at the expected start, if rounding explains the distance between the
+        expected start and `t`. For a larger distance they begin nearer to `t`, by at most `_MAX_SHIFT` samples. They
+        begin at `t` itself if the distance is three times `_LATE_S` or more, as after missing samples or a change of
+        the clock, and for the first samples of an actuator.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
         # rounding explains up to `_LATE_S`
@@ -311,7 +320,7 @@ def _simultaneous_samples(
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}
         sizes = {values.size for values in piece.values()}
         if len(sizes) != 1 or 0 in sizes or any(values.dtype != np.float64 for values in piece.values()):
-            raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of equally many numbers")
+            raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of numbers of one length")
         return piece
     birth.metrics.update({metric.name: metric for metric in group.values()})
     last_values = {channel: birth.metrics[name].value for name, channel in channel_of.items() if channel not in SLOW}

@@ -29,17 +29,17 @@ _SAVED = ("first", "follows")
 class StreamRecorder:
     """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s`.
 
-    A recording also ends before a gap, a clock set back, or a change of channels, units or rate, and at `_MAX_BYTES`.
-    Those shorter than the first of `recording.lengths` (`priors.toml`) are dropped. The first after such an end is
-    shorter than `duration_s`, by up to a half that depends on the `actuator`'s name: recordings of many actuators then
-    do not end at the same moment.
+    A recording also ends at `_MAX_BYTES`, and before a gap, a clock set back, or a change of channels, units or rate.
+    Recordings shorter than the first of `recording.lengths` (`priors.toml`) are dropped. The first recording of all,
+    and the first after a gap, such a clock or such a change, is shorter than `duration_s` by up to a half. This
+    fraction depends on the `actuator`'s name, so that the recordings of many actuators do not end at the same moment.
 
     Attributes
     ----------
     first : int
         Running number of the first collected block, 0 if none is collected.
     follows : bool
-        True if the collected blocks follow a recording that ended at its full length.
+        True if the collected blocks follow a recording that ended at its full length or at `_MAX_BYTES`.
     """
 
     actuator: str
@@ -51,8 +51,9 @@ class StreamRecorder:
     def take(self, number: int, samples: Recording) -> Recording | None:
         """Collect the block of samples with the running `number`; return the recording that ends, if it is long enough.
 
-        A recording that reaches its full length contains `samples`; one that ends for another reason does not. The
-        times of the result are those of the blocks.
+        A recording that reaches its full length or `_MAX_BYTES` contains `samples`; one that ends for another reason
+        does not. The times of the result are those of the blocks. Returns None if no recording ends, or a too short
+        one.
         """
         if not len(samples):
             return None
@@ -67,9 +68,9 @@ class StreamRecorder:
         return self._end(follows=True) if is_full or self._duration() >= self._full_duration() else None
 
     def _end(self, *, follows: bool) -> Recording | None:
-        """Join and forget the collected blocks; return None if they are shorter than `_MIN_DURATION_S`.
+        """Join the collected blocks to a recording, and forget them; return None if it is too short.
 
-        `follows`: True if the next block continues the stream.
+        The shortest recording has `_MIN_DURATION_S`. `follows`: True if the next block continues the stream.
         """
         blocks, duration = self.blocks, self._duration()
         self.clear()
@@ -85,7 +86,10 @@ class StreamRecorder:
         return float(np.nanmax(self.blocks[-1].t) - np.nanmin(self.blocks[0].t)) if self.blocks else 0.0
 
     def _full_duration(self) -> float:
-        """Compute the length at which the present recording ends [s]."""
+        """Compute the length at which the present recording ends [s].
+
+        It is `duration_s`, or less for the first recording of all or after a gap; at least `_MIN_DURATION_S`.
+        """
         digest = blake2b(self.actuator.encode(), digest_size=4).digest()
         fraction = 1.0 if self.follows else 0.5 + 0.5 * int.from_bytes(digest) / 2**32
         return max(_MIN_DURATION_S, fraction * self.duration_s)
@@ -95,23 +99,24 @@ class StreamRecorder:
         self.first, self.follows, self.blocks = 0, False, []
 
     def state(self) -> dict[str, Any]:
-        """Convert the attributes, without the blocks, to plain values."""
+        """Convert the attributes `first` and `follows` to plain values; the blocks are stored elsewhere."""
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the values that `state` saved."""
+        """Restore the attributes `first` and `follows` from the plain values that the method `state` made."""
         restore_attributes(self, _SAVED, state)
 
     def refill(self, number: int, samples: Recording) -> None:
-        """Collect a stored block again after `load_state`, if it belongs to the present recording."""
+        """Collect the stored block with the running `number` again, if it belongs to the present recording."""
         if 0 < self.first <= number and len(samples):
             self.blocks.append(samples)
 
 
 def _continues(earlier: Recording, samples: Recording) -> bool:
-    """Test whether `samples` continue the block `earlier`: the same channels, units and rate, and at most a short gap.
+    """Return True if `samples` continue the block `earlier`: the same channels, units and rate, after a short time.
 
-    Samples without a finite time do not.
+    The time from the last sample of `earlier` to the first new one must be finite, above 0, and at most `recording.gap`
+    of `priors.toml` [s].
     """
     has_same_format = (samples.units, samples.rate) == (earlier.units, earlier.rate)
     gap = float(samples.t[0] - earlier.t[-1])

@@ -47,7 +47,7 @@ def advance(
       method changes the speed controller's integral only at the end of each step (`rk4_step`).
     - `u`, `G`, `C`, `F` (n, nodes): inputs at the times within each step that the method needs (`step_nodes`). They are
       the command [V], the leakage coefficients [m^3/(s Pa)] and [m^3/(s Pa^0.5)] of the piston (`piston_leakage`), and
-      a load [N] in addition to the rig's own. Without such a load `F` is (0, 0).
+      a load [N] in addition to the rig's own. Without such a load `F` is an empty array of shape (0, 0).
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs.
     """
     z = state_of(y)
@@ -82,7 +82,7 @@ def advance_closed(
     - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `euler_integral`: as in `advance`.
     - `y` (14,): the state, changed in place. `h` [s]: the step; there is an output before each `every`-th step.
     - `G`, `C`, `F` (n, nodes): leakage coefficients of the piston, laminar and of an orifice, and additional load [N],
-      at the times (nodes) within each of n steps that the method needs; `F` is (0, 0) without an additional load.
+      at the times (nodes) within each of n steps that the method needs; without a load `F` has the shape (0, 0).
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
       in rows[0], counted from the beginning of the run.
 

@@ -15,7 +15,7 @@ DECAY_LIMIT = 2.785
 
 
 def _end_volumes(p: RigNumbers) -> tuple[tuple[float, float], ...]:
-    """Compute the oil volumes (V_A, V_B) [m^3] at each end of the stroke, one pair if they are constant."""
+    """Compute the oil volumes (V_A, V_B) [m^3] at each end of the stroke; a single pair if volumes are constant."""
     if not p.position_dependent:
         return ((p.V_A, p.V_B),)
     return tuple((p.V_A + p.A_A * x, p.V_B - p.A_B * x) for x in (-0.5 * p.L, 0.5 * p.L))

@@ -100,7 +100,7 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
     """Add the solver's output at time `t` [s] to the totals of a group of runs; return the new totals.
 
     The totals are listed at `N_TOTALS`. `z`: states of the runs; `leak`: parameters of their leaks, listed at
-    `LEAK_ROWS`, of which the last two are conductance G and orifice C of the leak past the piston; `q`: parameters of
+    `LEAK_ROWS`, of which the last two are the coefficients G and C of the leak whose flow is summed; `q`: parameters of
     the rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals

@@ -57,8 +57,9 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     5. speeds without a sign;
     6. gaps, which are interpolated or bridged, and incomplete rows at the ends, which are cut off.
 
-    Steps 3 to 6 are reported as findings. Channels without any value are left out, except chamber pressures. A chamber
-    pressure that is stuck in more than `MAX_STUCK_FRACTION` of the rows stays as it is, and is named as unusable.
+    Steps 3, 5 and 6 are reported as findings, except for short gaps that are interpolated. Channels without any value
+    are left out, except chamber pressures. A chamber pressure that is stuck in more than `MAX_STUCK_FRACTION` of the
+    rows stays as it is, and is named as unusable.
     """
     part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
     is_frozen = flag_frozen_rows(part)
@@ -78,7 +79,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     if part.bridged is not None:
         bridged = np.flatnonzero(part.bridged)
         gaps = format_count(len(find_runs(part.bridged)), "gap")
-        text = f"{format_count(bridged.size, 'missing sample')} in {gaps} bridged: what a long one touches counts less"
+        text = f"{format_count(bridged.size, 'missing sample')} in {gaps} bridged: blocks with a long gap count less"
         findings.append(Finding("gaps_bridged", "note", None, bridged.size, float(part.t[bridged[0]]), text))
     part = _cut_to_complete(part, needed)
     n_within = int(np.count_nonzero((recording.t >= part.t[0]) & (recording.t <= part.t[-1]))) if len(part) else 0
@@ -90,7 +91,10 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to the rows from the first to the last with values in all `needed` channels, or to no rows."""
+    """Cut a recording to the rows from the first to the last one that has values in all `needed` channels.
+
+    No rows are left if there is none. Without `needed` channels, nothing is cut.
+    """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording
@@ -102,6 +106,7 @@ def remove_holes(recording: Recording) -> Recording:
     """Replace the filled samples of long gaps by NaN, for detectors that cannot give filled samples a lower weight.
 
     All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, but are no longer marked as `bridged`.
+    A recording without long gaps is returned unchanged, with its marks.
     """
     is_hole = flag_holes(recording)
     if not is_hole.any():

@@ -45,7 +45,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         # sign of the side of zero on which the channel stays
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
-        text = f"{name}: the {quantity} has no sign while the piston moves both ways: taken from {source}"
+        text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
         findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
     return (replace(recording, channels=channels) if findings else recording), findings
 
@@ -62,8 +62,9 @@ def _has_one_sign(values: Array) -> bool:
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
-    They are fitted to the position (`_fit_signs`), or are those of the command if there is none. Returns (None, "") if
-    neither is recorded, correlates with the `magnitude` (n,) of the flow, and moves in both directions.
+    They are fitted to the position (`_fit_signs`) or, if there is no position, are those of the command. Returns (None,
+    "") if neither is recorded, or if the one used does not move in both directions or hardly correlates with the
+    `magnitude` (n,) of the speed or flow.
     """
     if "x" in recording:
         speed = _piston_speed(recording["x"], recording.rate)
@@ -77,7 +78,10 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
-    """Compute the piston speed (n,) [m/s] from positions `x` (n,) [m] `unsigned.half` [s] before and after a sample."""
+    """Compute the piston speed (n,) [m/s] from positions `x` (n,) [m] `unsigned.half` [s] before and after a sample.
+
+    `rate`: sampling rate [Hz]. Missing positions are interpolated; the speed is 0 if all are missing.
+    """
     n_half = max(1, round(_PRIORS.half * rate))
     known = np.isfinite(x)
     x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
@@ -89,7 +93,8 @@ def _piston_speed(x: Array, rate: float) -> Array:
 def _moves_both_ways(values: Array) -> bool:
     """Test whether a speed or command (n,) moves far enough in both directions.
 
-    The sum of its values on one side of zero must exceed `unsigned.least` (`priors.toml`) times that on the other.
+    Of the sum of its positive values and that of its negative values, the smaller must exceed `unsigned.least`
+    (`priors.toml`) times the larger in magnitude.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -106,8 +111,9 @@ def _correlation(first: Array, second: Array) -> float:
 def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     """Estimate the signs (n,) of the flow into chamber A from the piston speed and the chamber pressures.
 
-    The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s] and a coefficient a
-    for each direction. Fits alternate with searches for the signs, at first those of the speed, until none changes.
+    The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s], a coefficient a for
+    each direction and the leakage conductance c. Without both pressures the last term is omitted. Fits alternate with
+    searches for the signs, at first those of the speed, until no sign changes or `_MAX_ITERATIONS` are reached.
     """
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
@@ -144,10 +150,11 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,).
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    It is half the median of the locally averaged squared differences of samples that are 2 `half` (`_PRIORS`) seconds
-    apart. Motion changes only some of these averages, and hardly their median. 0 for a shorter recording.
+    It is half the median of the locally averaged squared differences of samples that are twice `unsigned.half`
+    (`priors.toml`) apart. Motion changes only some of these averages, and hardly their median. The result is 0 for a
+    recording that is shorter than this distance.
     """
     n_lag = max(1, round(2.0 * _PRIORS.half * rate))
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -166,9 +173,10 @@ def _average_nearby(values: Array, rate: float) -> Array:
 def _draw_noise_signs(values: Array, rate: float) -> Array:
     """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
 
-    The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Noise alone is
-    recorded where the ratio of local mean to local standard deviation, from second differences, of the `values` (n,) is
-    at most 1.32 plus three standard errors. Elsewhere the values stay. The signs are the same in every call.
+    The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Where the ratio
+    of the local mean of `values` (n,) to their local standard deviation, from second differences, is at most 1.32 plus
+    three standard errors, they are taken for noise and get random signs. Elsewhere they stay. The signs are the same in
+    every call. `rate`: sampling rate [Hz].
     """
     if values.size < 3:
         return values
@@ -190,8 +198,9 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     """Find the most likely sequence of signs (n,), +1 or -1, by the Viterbi algorithm.
 
     `log_odds` l (n,): log odds of a positive over a negative sign, from each sample alone; `cost_of_change` c (n - 1,):
-    log odds against a change of sign after each sample. The log odds of the best path up to sample k are o_k = l_k +
-    min(max(o_(k-1), -c_(k-1)), c_(k-1)). Sample k has the sign of o_k if |o_k| > c_k, else that of sample k + 1.
+    log odds against a change of sign after each sample. From the best paths up to sample k, the log odds of its sign
+    are o_k = l_k + min(max(o_(k-1), -c_(k-1)), c_(k-1)). Sample k has the sign of o_k if |o_k| > c_k, else that of
+    sample k + 1; the last sample has the sign of its o_k.
     """
     path_odds = np.empty(log_odds.size)
     odds = 0.0

@@ -72,7 +72,8 @@ def is_value(cell: str, decimal: str) -> bool:
 def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[int], str]) -> tuple[Array, list[int]]:
     """Parse a column's cells to doubles (n,), NaN for words and missing samples; also return the indices of words.
 
-    `format_place`: index of a cell -> its place, for messages. Raises InputError for an infinite number.
+    `decimal`: decimal separator, "." or ","; `format_place`: index of a cell -> its place, for messages. Raises
+    InputError for an infinite number.
     """
     # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -91,7 +92,10 @@ def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[in
 
 
 def _parse_number(cell: str, cell_with_point: str, decimal: str) -> float:
-    """Parse a cell to a double, NaN if it is no number; `cell_with_point` has "." as the decimal separator."""
+    """Parse a cell to a double, NaN if it is not a number; thousands separators and Fortran exponents are allowed.
+
+    `decimal`: decimal separator of the cell; `cell_with_point`: the same cell with "." as the decimal separator.
+    """
     with suppress(ValueError):
         return np.nan if "_" in cell_with_point else float(cell_with_point)  # Python takes 1_000 for a number
     text = cell.strip().replace("\u2212", "-")
@@ -135,7 +139,10 @@ def _trailing_unit(cell: str) -> str | None:
 
 
 def find_cell_units(rows: Sequence[Sequence[str]]) -> dict[int, str]:
-    """Find the most frequent unit in the cells of each column, if over half of the `rows` have one: column -> unit."""
+    """Find the most frequent unit in the cells of each column; return column -> unit.
+
+    A column is left out unless over half of the `rows` have a known unit in it.
+    """
     is_known: dict[str, bool] = {}
     counts: dict[int, Counter[str]] = {}
     for row in rows:
@@ -157,7 +164,10 @@ def remove_units(line: str, units: Iterable[str]) -> str:
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units in cells, column -> unit, to headings without one; raise InputError if a heading states another."""
+    """Add the units in cells, column -> unit, to headings that state none.
+
+    Raises InputError if a heading states another unit, or one that is not known. `place`: the file, for messages.
+    """
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)
@@ -186,5 +196,5 @@ def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Call
         # another unit, or a number without a unit that has a digit other than 0
         elif _trailing_unit(text) is not None or (text[:1] in "+-\u2212.,0123456789" and text.strip("+-\u22120.,")):
             place = format_place(index)
-            raise InputError(f"a cell must be in {unit}, as others of its column, got {text[:40]!r} {place}")
+            raise InputError(f"a cell must be in {unit}, like others in its column, got {text[:40]!r} {place}")
     return result

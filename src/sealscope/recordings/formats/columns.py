@@ -141,7 +141,10 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map from channel to column and unit that a recording was read with, from its provenance."""
+    """Reconstruct the map by which a recording was read, from its provenance: channel -> column and unit.
+
+    Without an entry `columns` in the provenance, the map is empty.
+    """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
     proposed = proposed_map([Label.parse(heading) for heading in columns.values()])
@@ -164,8 +167,8 @@ def _find_column(labels: Sequence[Label], name: str, description: str, mapped: b
     """Find the index of the column called `name`; None if there is none.
 
     Names are compared by criteria from strict to loose; the first that a column meets decides. With `mapped`, the last
-    words of a column's name are enough, such as `ch2`. A name such as `#4` may also be a number, counted from 1. Raises
-    InputError, which calls the column `description`, if several columns meet the criterion.
+    words of a column's name are enough, such as `ch2` for `ADC1_Channel_2`. A name such as `#4` may also be a number,
+    counted from 1. Raises InputError, which calls the column `description`, if several columns meet that criterion.
     """
     folded = name.casefold()
     for matches_name in (
@@ -216,7 +219,7 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
         factors[column] = factors.get(column, 0.0) + factor
     units = {_find_unit(labels[column], channel) for column in factors}
     if formula.unit is None and len(units) > 1:
-        raise InputError(f"{description} must state its unit, got columns in different ones")
+        raise InputError(f"{description} must state its unit, got columns with different units")
     return Formula(factors, formula.constant, units.pop() if formula.unit is None else formula.unit)
 
 
@@ -261,7 +264,10 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Complete `choice` with the channels and the time column that the names of columns show."""
+    """Complete `choice` with the channels and the time column that the names of columns show.
+
+    Channels, columns and a time column that are already chosen stay as they are.
+    """
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
@@ -380,8 +386,8 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
 
     With a requested rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the
     map contains "auto", other columns are chosen by their names and units (`proposed_map`). A column in the map takes
-    precedence over a column with the channel's name. Raises InputError if a mapped column does not exist, no
-    column is a channel, there is neither a time nor a rate, or a unit has the wrong dimension.
+    precedence over a column with the channel's name. Raises InputError if a mapped column does not exist, no column is
+    a channel, there is neither a time nor a rate, or a unit has the wrong dimension.
     """
     choice = ColumnMap(labels, stated_rate)
     columns, rate = explicit_columns(request.map), request.rate

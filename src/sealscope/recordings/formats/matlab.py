@@ -47,7 +47,11 @@ def is_matlab_4(head: bytes) -> bool:
 
 
 def read_matlab(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a MATLAB file to the fields of a recording; raise MissingExtra without mat-io."""
+    """Read the requested columns of a MATLAB file to the fields of a recording; raise MissingExtra without mat-io.
+
+    A file of signal streams (`_read_streams`) needs no mat-io. Raises InputError if a variable has more than
+    `MAX_VALUES` values, or if the file refers to other files.
+    """
     import h5py
 
     size = path.stat().st_size
@@ -90,6 +94,7 @@ def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
     Each signal has `CompressedTime` (first time, step, number of samples) and `DataR2` (the number of its stream).
+    Signals of another form are left out.
     """
     import h5py
 

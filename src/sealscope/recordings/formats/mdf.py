@@ -65,7 +65,8 @@ def _read_times(file: Any, group: int, start: np.datetime64 | None) -> tuple[Arr
 def _read_values(file: Any, group: int, index: int) -> NDArray[Any]:
     """Read the samples (n,) of the channel `index` of a `group` of an open MDF file.
 
-    Up to the fraction `MAX_WORD_FRACTION` of texts among numbers, such as `SNA`, becomes NaN.
+    Texts among numbers, such as `SNA`, become NaN if they are at most the fraction `MAX_WORD_FRACTION` of the samples.
+    With more texts, or without numbers, the samples are returned as texts.
     """
     values = np.asarray(file.get(group=group, index=index).samples)
     if values.dtype.kind not in "OSU":

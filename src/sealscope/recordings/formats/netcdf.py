@@ -108,7 +108,7 @@ def _first_number(value: Any) -> float:
 
 
 def _parse_label(name: str, data: Any) -> Label:
-    """Make the heading of the data set `name` from its name and its attribute of units."""
+    """Make the heading of the data set `name` from its name and its attribute `units` or `unit`."""
     unit = next(
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
@@ -119,7 +119,7 @@ def _parse_label(name: str, data: Any) -> Label:
 def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:
     """Read the data set `name` as texts (n,), or as doubles (n,) by the scale, offset and fill values of CF files.
 
-    Raises InputError for other types.
+    Raises InputError for other types, and for samples in other files. `file_size` [bytes]: see `_read_texts`.
     """
     check_internal(name, data)
     if data.dtype.kind in "OSU":
@@ -190,7 +190,8 @@ def write_netcdf(
 ) -> None:
     """Write the content of `Recording.series` as a NetCDF-4 file without loss of precision.
 
-    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
+    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
+    history. The file is made in memory first, because libhdf5 aborts the process if the disk is full.
     """
     import h5netcdf
 

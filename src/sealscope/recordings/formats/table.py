@@ -96,7 +96,10 @@ class Series:
 def uniform_clock(
     key: Hashable, count: int, step: float, first: float = 0.0, start: np.datetime64 | None = None
 ) -> Clock:
-    """Build the clock of `count` samples every `step` [s], from `first` [s] after the time stamp `start` on."""
+    """Build the clock of `count` samples every `step` [s], the first one `first` [s] after the time stamp `start`.
+
+    `start`: None if unknown. Clocks are equal if `key`, `start` and all numbers are equal.
+    """
     return Clock((key, count, step, first, start), lambda: (first + step * np.arange(count, dtype=np.float64), start))
 
 
@@ -181,14 +184,15 @@ def convert_columns(
     description: Mapping[str, Any] | None = None,
     state: TimeState | None = None,
 ) -> RecordingFields:
-    """Convert the columns of a table that were read to the fields of a recording.
+    """Convert the columns that were read from a table to the fields of a recording.
 
-    - `columns`: column -> values (n,), doubles or, for the time, datetime64.
+    - `choice`: the columns and their meaning; `columns`: column -> values (n,), doubles or, for the time, datetime64.
     - `kind`: format of the file in words; `remarks`: entries in its header; `notes`: lines for the history.
     - `description`: rate, provenance and history in a file that Sealscope has written; None for other files.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
-    Raises InputError if there are no rows, or only dates in place of times.
+    Rows that begin with the last sample are reversed. Raises InputError if there are no rows, or only dates in place of
+    times.
     """
     label, start = choice.time_label, dict[str, Any]()
     remarks = remarks or {}
@@ -255,8 +259,8 @@ def _convert_channels(
 def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: Label, notes: list[str]) -> NDArray[Any]:
     """Combine the columns that form the time, such as date and hours, and add a line for the history to `notes`.
 
-    If their values cannot be parts of one time, the time column is returned unchanged; if it is that of the hours,
-    InputError is raised. `columns`: column -> values (n,); `label`: heading of the time column.
+    If their values cannot be parts of one time, the time column is returned unchanged, or InputError is raised if it is
+    the column of hours. `columns`: column -> values (n,); `label`: heading of the time column.
     """
     assert choice.time is not None
     parts = {part: np.asarray(columns[column], dtype=np.float64) for part, column in choice.parts.items()}
@@ -266,15 +270,15 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
         return time
     if choice.time == choice.parts.get("hour"):
         raise InputError(
-            f"time must be whole hours below 24, whole minutes and seconds below 60, got others in columns "
+            f"a time must have whole hours below 24, and whole minutes and seconds below 60, got others in columns "
             f"{label.whole}"
         )
-    notes.append(f"{', '.join(parts)} beside column {label.whole} not used: no parts of its seconds")
+    notes.append(f"{', '.join(parts)} not used: not parts of the seconds in column {label.whole}")
     return columns[choice.time]
 
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:
-    """Test whether `time` (n,) has a date stamp with a time of day other than midnight."""
+    """Test whether `time` (n,) has a date stamp with a time of day other than midnight; False for numbers."""
     known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
@@ -282,8 +286,8 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
     """Assign sampling times to the series that have none, from the column of times in the same group of the file.
 
-    These columns are then left out; if the file has only one, it stays as the time of all groups. A series that is
-    alone in its group gets the group's name if its own name says nothing, such as `data` or `value`.
+    The columns of times are then left out. If the file has only one such column, it stays as the time of all groups. A
+    series that is alone in its group gets the group's name if its own name says nothing, such as `data` or `value`.
     """
     time_of_group: dict[str, Series] = {}
     for member in series:
@@ -365,7 +369,8 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
     """Read the samples (n,) of a series as doubles or, with `as_time`, as datetime64; raise InputError for other types.
 
-    In a column of texts, words become NaN, up to the fraction `MAX_WORD_FRACTION` of the cells.
+    Durations become seconds. In a column of texts, words become NaN if they are at most the fraction
+    `MAX_WORD_FRACTION` of the cells.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -389,9 +394,9 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
 def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
     """Resample the columns to read, column -> series in `used`, to the sampling times of the chamber pressures.
 
-    If there are none, the times are those of the pressures at the pump, or of the longest series. Returns column ->
-    values (n,), including the time, and lines for the history. Raises InputError if no series has sampling times, or
-    one without them has another number of samples.
+    Without chamber pressures, the times are those of the pressures at the pump, or of the longest series. Rows without
+    a time are left out. Returns column -> values (n,), including the time, and lines for the history. Raises InputError
+    if no series has sampling times, or one without them has another number of samples.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -427,8 +432,9 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
     """Resample the samples `values` of the series `member` to the times `t` (n,) [s] after the time stamp `start`.
 
-    Samples that are slower than `t` or equally fast are interpolated linearly, with NaN within long intervals; faster
-    ones are averaged around the times. The series' times must increase. Also returns a note for the history, or "".
+    Samples that are slower than `t` or equally fast are interpolated linearly, with NaN within long intervals and
+    beyond the ends; faster ones are averaged around the times. Samples that have the times `t` already are returned
+    unchanged. Also returns a note for the history, or "". Raises InputError unless the series' times increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -483,9 +489,10 @@ def _read_long_channel(
 ) -> tuple[Array, Array, np.datetime64 | None]:
     """Read a channel of a long table, in which each row is one sample of a named channel; `rows` (k,) are its rows.
 
-    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `table`: column -> cells. The
-    rows with a time are read like a recording with the only channel `u`, in counts, so that values are not converted.
-    Raises InputError if too many samples are words.
+    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `table`: column -> cells;
+    `value_column`: column of the values; `label`: heading of the channel. The rows with a time are read like a
+    recording with the only channel `u`, in counts, so that values are not converted. Raises InputError if too many
+    samples are words.
     """
     assert choice.time is not None
     times = table[choice.time][rows]
@@ -507,7 +514,7 @@ def _read_long_channel(
 
 
 def _count_request(value_column: int) -> Request:
-    """Request the column of values of a long table as a channel `u` in counts, so that they are not converted."""
+    """Request the column of values of a long table as a channel `u` in counts, so that the values are not converted."""
     return Request({"u": f"#{value_column + 1} count"})
 
 
@@ -516,8 +523,9 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit" and "valid". Samples called
-    invalid become NaN. Also returns lines for the history. Raises InputError without a time, or for too many names.
+    `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit" and "valid"; `prepare`: as for
+    `build_fields`. Values with a 0 in the column "valid" become NaN. Also returns lines for the history. Raises
+    InputError without a time, or for too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -565,7 +573,8 @@ def _pivot_long_table(
 def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> None:
     """Raise InputError if a table has more than `MAX_VALUES` values, or more than its file can hold.
 
-    A file, which may be compressed, holds up to `_MAX_EXPANSION` times its size [bytes] in doubles, or `_MIN_LIMIT`.
+    A file, which may be compressed, can hold doubles of up to `_MAX_EXPANSION` times its size [bytes], or of
+    `_MIN_LIMIT` [bytes] if this is more. Without `file_size`, only the first limit applies.
     """
     if n_rows * n_columns > MAX_VALUES:
         raise InputError(
@@ -579,7 +588,10 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError if the texts of the column `name` are too many (`count`) or too long (`width` [bytes])."""
+    """Raise InputError if the texts of the column `name` are too many, too long or too large in all.
+
+    `count`: number of texts; `width` [bytes]: length of the longest one.
+    """
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "
@@ -604,7 +616,10 @@ def _convert_numpy(value: Any) -> Any:
 
 
 def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]:
-    """Parse a description from `make_description`; raise InputError if it is damaged, or of a newer version."""
+    """Parse a description from `make_description` to "rate" [Hz], "provenance" and "history".
+
+    Raises InputError if it is damaged, or of a newer version.
+    """
     try:
         parsed = source if isinstance(source, Mapping) else json.loads(source)
         version, rate = int(parsed["format"]), float(parsed["rate"])
@@ -612,7 +627,7 @@ def parse_description(source: str | bytes | Mapping[str, Any]) -> dict[str, Any]
     except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError) as error:
         raise InputError("the recording's description must be whole, got damaged JSON") from error
     if version > FORMAT_VERSION:
-        raise InputError(f"format must be at most {FORMAT_VERSION}, got {version}: newer software")
+        raise InputError(f"format must be at most {FORMAT_VERSION}, got {version}: it was written by newer software")
     if not (np.isfinite(rate) and rate > 0):
         raise InputError(f"rate must be > 0 Hz, got {rate}")
     return {"rate": rate, "provenance": provenance, "history": history}

@@ -147,7 +147,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
 
 
 def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int], request: Request) -> RecordingFields:
-    """Read a log in which each channel has its own sampling times, in the nearest of the `time_columns` before it.
+    """Read a log in which each channel has its own sampling times, in the last of the `time_columns` before its column.
 
     If there are no `time_columns`, the log is a long table: each row is one sample of a named channel.
     """
@@ -196,7 +196,10 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup a log's blocks into lists of `size` rows in all, or a single list if inf; the last may have fewer."""
+    """Regroup a log's blocks into lists of blocks with `size` rows in all; the last list may have fewer rows.
+
+    Blocks are divided where necessary. If `size` is inf, all blocks are in a single list.
+    """
     group: list[_Block] = []
     missing_rows = size
     for block in blocks:
@@ -238,7 +241,7 @@ class _Block:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return the rows of a slice."""
+        """Return the block of the rows in a slice."""
         first, stop, _ = rows.indices(len(self))
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
@@ -259,7 +262,7 @@ class _Log:
         self.layout = layout
         self.kinds = kinds
         self.date = date
-        self.min_cells = max(kinds) + 1  # that a row needs
+        self.min_cells = max(kinds) + 1  # fewest cells that a row must have
         self.n_rows = self.n_repeated = self.n_text_lines = 0  # rows, repeated heading lines, lines of text until now
         self.first_text_line = ""  # the first line of text with its place, for messages
         is_delimited = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
@@ -367,7 +370,10 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the indices of lines with samples, from `first` on: no comments, blank lines or repeated headings."""
+        """List the indices of lines with samples, from `first` on: no comments, blank lines or repeated headings.
+
+        Repeated headings are counted in `n_repeated`.
+        """
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
@@ -494,7 +500,8 @@ class _Log:
         """Parse cells of the time column to time stamps (n,), NaT for empty cells and words (texts without digits).
 
         Also returns the indices of the words. At the first ambiguous date, such as 05/06/2024, the log's dates decide
-        `day_first`. Numbers that are no stamps raise InputError; `format_place`: index of a cell -> its place.
+        `day_first`. Raises InputError for texts with digits that are not stamps. `format_place`: index of a cell -> its
+        place.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
@@ -515,9 +522,10 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
     def _detect_day_first(self) -> bool:
-        """Detect if the day precedes the month in the log's dates, reading on to the first with a number over 12.
+        """Detect if the day precedes the month in the log's dates.
 
-        Without such a date, the order is guessed (`is_day_first`), and `order_note` says so.
+        The log is read from its beginning to the first date with a number over 12. Without such a date, the order is
+        guessed (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
@@ -576,7 +584,10 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe for the history which lines of text were left out; raise InputError if they are too many."""
+        """Describe, for the history, the lines of text and repeated headings that were left out.
+
+        Raises InputError if there are too many lines of text.
+        """
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         lines = format_count(self.n_text_lines, "line")
@@ -642,7 +653,8 @@ def write_text(
 ) -> None:
     """Write a text log: `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss.
 
-    `values`, `units`, `description`: as from `Recording.series`. Raises InputError for an infinite sample.
+    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
+    history. Missing samples become empty cells. Raises InputError for an infinite sample.
     """
     for name, series in values.items():
         if np.isinf(series).any():

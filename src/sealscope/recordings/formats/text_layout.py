@@ -73,7 +73,8 @@ class Layout:
 def detect_encoding(head: bytes) -> str | None:
     """Detect the encoding of a text from the first bytes of its file; None if they are not text.
 
-    The first that fits is chosen: a byte order mark's, UTF-16, UTF-8, gb18030 or Shift-JIS with a known word, cp1252.
+    The first that fits is chosen of these: the encoding of a byte order mark, UTF-16, UTF-8, gb18030 or Shift-JIS if
+    the text has a known word, and cp1252 if control characters are rare.
     """
     for mark, name in (
         (codecs.BOM_UTF8, "utf-8-sig"),
@@ -106,9 +107,10 @@ def split_at_blanks(line: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells at the `delimiter`, but not within quotation marks; a blank stands for blanks and tabs.
+    """Split a line into cells at the `delimiter`, but not within quotation marks.
 
-    Quotation marks are removed, and mean nothing if the delimiter is a blank.
+    A blank as the delimiter stands for any blanks and tabs. Quotation marks are removed; if the delimiter is a blank,
+    they have no meaning and stay.
     """
     if delimiter == " ":
         return split_at_blanks(line)
@@ -127,8 +129,10 @@ def _used_width(row: Sequence[str]) -> int:
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
     """Detect (delimiter, decimal separator, number of cells in a row) from lines of a log; (",", ".", 1) if unclear.
 
-    For each pair of separators in `_DIALECTS`, the table is the rows of one width, that with most values (numbers and
-    time stamps), at least half of all. The best pair has most values in its table, relative to all cells not missing.
+    Each pair of separators in `_DIALECTS` is tried. The table consists of the rows of one width, namely the width with
+    most values (numbers and time stamps). It must contain at least half of all values. The pair is chosen whose table
+    has the most values, relative to the number of cells that are not missing, in rows of any width with a value. Rows
+    of a single cell are ignored.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)
@@ -156,7 +160,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
     If the `delimiter` is a blank, a unit in brackets stays with its name. If this does not give `width` names, but a
-    split at wider spaces does, the latter is used.
+    split at tabs and at two or more blanks does, this split is used.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -278,7 +282,7 @@ def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:
 
 
 def _is_ruler(row: Sequence[str]) -> bool:
-    """Test whether a row is a ruler such as `----`, or repeats one text in all cells that is not a unit."""
+    """Test whether a row is a ruler such as `----`, or has the same text, which is not a unit, in all its cells."""
     cells = [cell.strip() for cell in row if cell.strip()]
     is_repeated = len(set(cells)) == 1 < len(cells) and _parse_unit_row(cells) is None
     return is_repeated or all(_RULER.fullmatch(cell) for cell in cells)

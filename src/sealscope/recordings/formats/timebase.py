@@ -207,7 +207,7 @@ def _is_datetime(text: str) -> bool:
 
 
 def counts_from_1970(clock: float) -> bool:
-    """Test whether a clock reading [s] counts from 1970: it must then mean a time from March 1973 to 5138."""
+    """Test whether a clock reading [s] counts from 1970, i.e. would then be a time from March 1973 to the year 5138."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
 
 
@@ -234,7 +234,10 @@ def parse_epoch(stamp: str) -> float | None:
 
 
 def _format_clock(text: str) -> str:
-    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`."""
+    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`.
+
+    `12:00` and other times in this form stay as they are, except that a decimal comma becomes a point.
+    """
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -293,6 +296,8 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 
     Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
     hour are removed. In dated stamps a single jump by an hour in the night, due to daylight saving time, is removed.
+    Returns the times (n,) [s], the provenance of the start, and lines for the history. Raises InputError if all stamps
+    are missing.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -346,7 +351,9 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     """Convert a time column of numbers (n,) to seconds.
 
     `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only the
-    guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log.
+    guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log. Returns
+    the times (n,) [s], the provenance of the start, and lines for the history. Raises InputError if no number is
+    finite.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -373,7 +380,8 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     """Convert a time column of numbers (n,) without a unit to seconds; `finite` (m,) are the finite ones of `values`.
 
     A long log is read in parts. The finite values of the first part, which `state` keeps, tell for all parts whether
-    the numbers are days or seconds, and from which date they count. Raises InputError if they only count rows.
+    the numbers are days or seconds, and from which date they count. Returns the times (n,) [s], the provenance of the
+    start, and lines for the history, which call the column `name`. Raises InputError if the numbers only count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None
@@ -421,7 +429,7 @@ def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
         if _EXCEL_RANGE[0] <= first - _DATENUM_OFFSET <= _EXCEL_RANGE[1]:
             return origin - np.timedelta64(_DATENUM_OFFSET, "D"), "days, as MATLAB counts"
     if step <= _MAX_FRACTION_STEP and values.min() >= 0.0 and values.max() <= 1.0:
-        return None, "a share of the day"
+        return None, "fractions of a day"
     return None
 
 

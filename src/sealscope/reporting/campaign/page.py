@@ -39,12 +39,15 @@ _MAX_NAMED, _MAX_PARAMETERS = 3, 6
 
 
 def _format_area(area: Area) -> str:
-    """Format the area under an ROC curve with its interval."""
+    """Format the area under an ROC curve with its confidence interval, such as "0.912 (0.880–0.941)"."""
     return f"{area.value:.3f} ({area.low:.3f}–{area.high:.3f})"
 
 
 def column_sizes(judgement: Judgement) -> list[float]:
-    """List the leak sizes that get columns in the main table; [nan], for any size, if there are none or too many."""
+    """List the sizes of leaks that have a column in the main table of a campaign, the smallest first.
+
+    If there are no leaks or more than `_MAX_SIZES` sizes, the list is [nan], for one column of all sizes together.
+    """
     sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
     return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
 
@@ -80,7 +83,7 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
 
 
 def _format_knowledge(known: PriorKnowledge | None) -> str:
-    """Format the information that a detector was given as "true onset", "rig", both, or a dash."""
+    """Format the information that a detector was given as "true onset", "rig" or both; a dash if there is none."""
     if known is None:
         return "–"
     facts = [*(["true onset"] if known.onset else []), *(["rig"] if known.rig else [])]
@@ -88,10 +91,10 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format the leak size a90 of a detector, detected with a probability of 90 %, and its upper 95 % bound a90/95.
+    """Format a90, the leak size that is detected with a probability of 90 %, and its upper 95 % bound a90/95.
 
-    `pod`: probability of detection (POD) over the size. A size above all tested sizes is written "> LARGEST", an
-    unknown size as a dash.
+    `pod`: probability of detection over the size, for one detector. A size above the largest tested one, such as 2, is
+    written "> 2". An unknown size is a dash.
     """
     if pod is None or pod.curve is None:
         return "–", "–"
@@ -107,7 +110,8 @@ def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
     At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
-    of 90 %. Those without an a90 within the tested sizes follow, ordered by the fraction of the largest leaks found.
+    of 90 %. Detectors without an a90 within the tested sizes come last, ordered by the fraction of the largest leaks
+    that they find. The text ends with the number of judged records and the number of detectors that are not described.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -132,7 +136,7 @@ def result_text(result: CampaignResult) -> str:
 
 
 def campaign_text(result: CampaignResult) -> str:
-    """Format the main table of a campaign and the notes on it as text for the terminal."""
+    """Format the title, the main table and the notes of a campaign as text for the terminal."""
     heads, rows = main_table(result)
     widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
     lines = []
@@ -169,7 +173,10 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format a note for each set of channels and for each rig that detectors were given, naming these detectors."""
+    """Format notes on the channels and rigs that detectors were given, one for each set of channels and each rig.
+
+    A note names the detectors concerned. Only the note on channels names none if all detectors were given the same.
+    """
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -181,17 +188,24 @@ def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
 
 
 def _is_batched(result: CampaignResult) -> bool:
-    """Return True if the records of a campaign were simulated in batches, not run by run."""
+    """Return True if a campaign's records were simulated in batches; False if one by one, or for recordings."""
     return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
-    """Write the page of a campaign's result as HTML, with links to `files` in its folder, and return its path."""
+    """Write the page of a campaign's result as HTML, and return its path.
+
+    `files`: names of files with tables in the folder of the page, to which the page has links.
+    """
     return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
-    """Render the page of a campaign's result as HTML, with links to the `files` with tables in the same folder."""
+    """Render the page of a campaign's result as HTML.
+
+    `files`: names of files with tables in the folder of the page, to which the page has links. At most 200 failed
+    records are listed.
+    """
     judgement, plan = result.judgement, result.plan
     heads, rows = main_table(result)
     failed = [
@@ -221,8 +235,9 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
     """List the conditions of a campaign for its page, as pairs of label and text.
 
-    For recordings of machines there is a pair for each set of files. For simulated records the pairs are: rig, records,
-    factors, seed, mode, the channels in each view (the channels a detector is given), any assumed rig, and leak flows.
+    For recordings of machines there is a pair for each set of files. For simulated records the pairs are: rig; duration
+    and onset; each factor; base seed; mode, if simulated in batches; channels of each view (those that a detector is
+    given); the rig that detectors assume, if any do; and the achieved flow for each planned size of the leak.
     """
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
@@ -246,7 +261,10 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
 
 
 def _describe_assumed_machine(plan: SimulatedPlan) -> str:
-    """Describe the rig that the detectors assume, with a few parameters that differ from those of the simulated rig."""
+    """Describe the rig that detectors assume, with the parameters that differ from the simulated rig's.
+
+    At most `_MAX_PARAMETERS` of them are named, and the others counted. If no parameter differs, the text says so.
+    """
     if plan.assumed == plan.rig:
         return f"the rig {plan.rig.name} as it stands, not the machine that was drawn"
     simulated_values = {row.name: row.value for row in plan.rig.table()}
@@ -260,9 +278,9 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
     """Build the template's values for the section of one detector on a campaign's page.
 
-    The section has plots, the areas under the ROC curves, and a table: the fractions of alarms by leak size and by the
-    levels of the campaign's factors. The table is empty if there are no factors or too many sizes. `pod`: the
-    detector's probability of detection over the leak size, in `unit`.
+    The section has a description of the score, plots, the areas under the ROC curves, and a table of the fractions of
+    alarms by leak size and by the levels of the campaign's factors. The table is empty if there are no factors or more
+    than `_MAX_SIZES` leak sizes. `pod`: the detector's probability of detection over the leak size, in `unit`.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -294,7 +312,11 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed."""
+    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
+
+    `name`: the detector's name in the plan. In a name such as "diagnose @ pressures", the word after the "@" is the
+    view, i.e. the set of channels that the detector is given. The text also states the view.
+    """
     detector = parse_detector_name(name)
     view_text = f", given the channels of {detector.view} alone" if detector.view else ""
     if detector.scorer is not None:
@@ -314,10 +336,12 @@ class _PlotCurve(NamedTuple):
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw a detector's fraction of detections over the leak size in `unit`, logarithmic; None for less than two sizes.
+    """Draw the fraction of leaks that a detector finds over the leak size, on a logarithmic axis.
 
-    The picture has the fractions with their intervals, the fitted curve with its band, and the sizes a90 (detected with
-    a probability of 90 %) and a90/95 (upper bound of a90).
+    `pod`: these fractions, and a curve fitted to them; `unit`: unit of the size. The picture shows the fractions with
+    their intervals, if there are at most `_MAX_FRACTIONS`, and the curve with its band. It marks the sizes a90
+    (detected with a probability of 90 %) and a90/95 (upper bound of a90). Returns title and picture by name for the
+    page's template, or None for fewer than two sizes.
     """
     if len(pod.sizes) < 2:
         return None
@@ -344,7 +368,11 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw ROC curves (detections over false alarms), one for each leak size in `unit`; None if there are none."""
+    """Draw the ROC curves of a detector, detections over false alarms, one for each leak size in `unit`.
+
+    A single curve is drawn with its confidence band. Returns title and picture by name for the page's template, or None
+    if there are no curves.
+    """
     if not rocs:
         return None
     curves = []
@@ -357,7 +385,10 @@ def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
 
 
 def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction over `x_label`, each of at most `_MAX_CURVE_POINTS` points, with axes."""
+    """Draw curves of the detected fraction into `picture`, with grid, frame, and labels of both axes.
+
+    `x_label`: label of the x axis. Of each curve at most `_MAX_CURVE_POINTS` points are drawn.
+    """
     thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))

@@ -14,7 +14,7 @@ from sealscope.evaluation.binomial import IntervalEstimate, Proportion
 
 
 def percent(proportion: Proportion | None) -> str:
-    """Format a proportion with its interval in percent; a dash if it counts no records or is None."""
+    """Format a proportion with its interval, such as "98.5 % (95.1–99.6)"; a dash for None or without records."""
     if proportion is None or proportion.n == 0:
         return "–"
     value, low, high = map(_format_percent, (proportion.value, proportion.low, proportion.high))
@@ -22,7 +22,7 @@ def percent(proportion: Proportion | None) -> str:
 
 
 def _format_percent(fraction: float) -> str:
-    """Format a fraction as a percentage: two decimals below 9.95, none if it is whole or above 99.95, else one."""
+    """Format a fraction in percent: two decimals below 9.95, else one, or none if it is whole or above 99.95."""
     value = 100.0 * fraction
     digits = 2 if value < 9.95 else 0 if value > 99.95 or value == round(value) else 1
     return f"{value:.{digits}f}"
@@ -86,7 +86,10 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Build a table for each detector that counts the causes it named (columns) by the true cause (rows)."""
+    """Build a table for each detector: fractions of records by true cause (rows) and by named cause (columns).
+
+    A true cause without records has no row.
+    """
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion
@@ -102,7 +105,10 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:
-    """Format a quantile with its interval; a dash stands for a value or an end that is not finite."""
+    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a dash for a quantile that is not finite.
+
+    An end of the interval that is not finite is a dash, too. If neither is finite, the interval is left out.
+    """
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):

@@ -79,7 +79,8 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
 
     `ordered`: recordings in the order of their start; if a date is missing, the axis counts the recordings from 1. For
-    verdicts other than `leak`, the upper bound of a leak is drawn. Returns None if no flow and no bound is known.
+    verdicts other than `leak`, the upper bound of a leak is drawn. Values far above the median are symbols at the top.
+    Returns None if no flow and no bound is known.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -123,7 +124,8 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
     """Return the leak flow [L/min] of a diagnosis as (estimate, low, high); None if it is not known.
 
-    For verdicts other than `leak`, the result is the upper bound of a leak, as (bound, None, bound).
+    A lower end that is not finite becomes 0. For verdicts other than `leak`, the result is the upper bound of a leak,
+    as (bound, None, bound).
     """
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":

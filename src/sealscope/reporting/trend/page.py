@@ -77,7 +77,7 @@ def level_pictures(
 
 
 def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
-    """Draw the leakage in a trend's recordings over time, as a picture for each of the `SIZES`, or None if unknown."""
+    """Draw the leakage over time as a picture for each of the `SIZES`; return None if no leakage is known."""
     if trend.wear is None or all(point.value is None for point in trend.points):
         return None
     days = trend.points[0].day, trend.points[-1].day
@@ -88,9 +88,9 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 def _draw_trend(trend: Trend, picture: Picture) -> None:
     """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
 
-    An episode (recordings from one repair to the next) is drawn as the range of healthy recordings and the fitted line,
-    a recording as a point with its interval or, if the leakage is unknown, as a symbol at the bottom, and an alarm or a
-    repair as a vertical line.
+    A recording is a point with its interval or, if its leakage is unknown, a symbol at the bottom. An episode, i.e. the
+    recordings from one repair to the next, has a box for the range of healthy recordings, and a fitted line. Alarms and
+    repairs are vertical lines.
     """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
@@ -118,8 +118,8 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 def _y_limits(trend: Trend) -> tuple[float, float]:
     """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit, with a margin.
 
-    They include the intervals of all recordings, the healthy ranges and, in L/min, zero. They include the repair limit
-    only if it is less than 2.5 times the largest of these: a higher one would flatten the curve.
+    They include the intervals of all recordings, the healthy ranges and, in L/min, zero. The repair limit is included
+    only if it is less than 2.5 times the largest of these values, because a higher limit would flatten the curve.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]

@@ -32,7 +32,10 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date, with the time of day if the span of all shown times is below 3 days."""
+    """Format a time [s since 1970] as a date in UTC, with the time of day if `span_days` is below 3.
+
+    `span_days` [days]: span of all times that are shown together.
+    """
     text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
@@ -47,7 +50,11 @@ def recordings_text(trend: Trend) -> str:
 
 
 def headline(trend: Trend) -> str:
-    """Format a trend in one line: verdict, onset of the leak or, without a leak, last repair, and the recordings."""
+    """Format a trend in one line: the verdict, the date since which it holds, and the recordings.
+
+    The date is that of the last repair if the verdict is "no leak" and there was a repair, else that of the onset. It
+    is left out if the onset is not known.
+    """
     key, since = "trend", ""  # neither an onset nor a repair
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
         key = "trend_fell"
@@ -59,7 +66,10 @@ def headline(trend: Trend) -> str:
 
 
 def verdict_sentence(trend: Trend) -> str:
-    """Format the verdict of a trend as a sentence for the heading of its page."""
+    """Format the verdict of a trend as a sentence for the heading of its page.
+
+    If another cause than a leak was found, the sentence names this cause.
+    """
     if trend.decision.summary != trend.verdict:  # the summary names another cause than a leak
         return trend.decision.summary.capitalize()
     if trend.verdict == "no leak":
@@ -89,7 +99,7 @@ def figures(trend: Trend) -> dict[str, str]:
     reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high
-    remark = "95 of 100 recordings" if is_whole else "cut off at the limit: healthy recordings lie above, too"
+    remark = "95 of 100 recordings" if is_whole else "cut off at the limit; some healthy recordings lie above"
     healthy = f"{number(wear.healthy.low, 2)} to {number(high, 2)} {trend.unit}{reference}, {remark}"
     since, growth = "", "not stated: the recordings are too few, or span less than a day"
     if wear.onset is not None:
@@ -126,9 +136,9 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [d]: time from the last recording until then. No date is stated if the
-    limit is reached, the date too far away, or the recordings too few. Without an alarm only the earliest date is
-    stated (95 % confidence).
+    `limit`: in the unit of the trend; `reach` [days]: time from the last recording until then. There is no date if the
+    limit is reached already, the date is too far away, or the recordings are too few. Without an alarm only the
+    earliest date is stated (95 % confidence).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day
@@ -137,7 +147,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     if reach.value == 0.0:
         return f"{limit_text} is reached"
     if trend.alarm is not None and reach.value <= max_days:
-        return f"{limit_text}, reached {expected} ({earliest} to {latest}) if it goes on so"
+        return f"{limit_text}, reached {expected} ({earliest} to {latest}) at this rate"
     if reach.low > max_days:
         return f"{limit_text}, not within {max_days / DAYS_PER_YEAR:.0f} years"
     # no date is stated that is nearer than the mean interval between recordings
@@ -152,7 +162,7 @@ def assumptions_text(trend: Trend) -> str:
     if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
         if trend.unit == "L/min":
-            machine = f"L/min rest on {machine_text(trend.machine)}. "
+            machine = f"Flows in L/min: {machine_text(trend.machine)}. "
     basis = "" if trend.basis is None else say(f"trend_basis.{trend.basis}")
     is_known = [point.temperature is not None for point in trend.points if point.value is not None]
     # the effect of the oil temperature is removed only if it is known in all recordings

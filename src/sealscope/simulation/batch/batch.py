@@ -192,7 +192,10 @@ def simulate_batch(
         set_fraction = len(experiment_set.members) / n
 
         def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the batch's progress from the set's `fraction`; the defaults keep the values of this pass."""
+            """Report the batch's progress, given the completed `fraction` of this set.
+
+            `before`: fraction of the batch in the sets before. Default values bind the values of this pass of the loop.
+            """
             if progress is not None:
                 progress(min(1.0, before + fraction * set_fraction))
 

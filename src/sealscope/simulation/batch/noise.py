@@ -37,7 +37,10 @@ def _result_type(arg_types: Any) -> Any:
 
 
 def noise_keys(seeds: list[int]) -> Array:
-    """Compute the 64-bit key of each run's noise from its seed, (runs,), stored in doubles for loading as vectors."""
+    """Compute the 64-bit key (runs,) of each run's noise from its seed.
+
+    The bits of a key are stored as those of a double, because compiled code loads vectors of doubles only.
+    """
     states = [np.random.SeedSequence(seed).generate_state(1, np.uint64) for seed in seeds]
     return np.concatenate(states).view(np.float64)
 

@@ -81,7 +81,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
     if len(leaks) > 1:
         violated_rules.append(f"at most one leak, got {len(leaks)}")
     if leaks and leaks[0].opening.rise is None:
-        violated_rules.append(f"a leak that opens abruptly or evenly, got {leaks[0].opening}")
+        violated_rules.append(f"a leak that opens abruptly or linearly, got {leaks[0].opening}")
     if rig.motor.integrator == "euler":
         violated_rules.append("motor.integrator = state, got euler")
     if any(fault.row.is_sensor_fault for fault in experiment.faults):
@@ -100,7 +100,10 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets for joint integration; raise InputError for any that cannot be in the batch."""
+    """Group experiments into sets for joint integration; raise InputError for any that cannot be in the batch.
+
+    The experiments of a set have the same waveform of the command, load, choices of the model, method, step and error.
+    """
     from sealscope.physics.rig import CHOICES
 
     if not experiments:
@@ -155,7 +158,8 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
 
     The columns are G and C of the leak that acts in the run, from `coefficients` (runs,); start [s] and slope [1/s] of
     its opening; and G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,). Both arguments
-    differ only in the first run of the search for a coefficient, which is without a leak.
+    are equal, except for leaks of coefficient 0 while coefficients are searched for: their flow is then computed for a
+    coefficient of 1 (`batch._size_leaks`).
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -414,8 +418,8 @@ class SetRun:
 
         A group of runs fills a vector register. If segments of time are defined (`bounds`), the pressures are sampled
         after each chunk as the sensors read them, and the squares of their wavelet details are added to the sums of the
-        segments. `add_progress` is called after each chunk with its share of the whole set's work. A cell is a
-        piece of time whose inputs are one entry of `table`.
+        segments. `add_progress` is called after each chunk with its share of the whole set's work. A cell is a span of
+        outputs with constant parameters (`Cells`); `table` has the parameters of the chunk's cells.
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
@@ -526,9 +530,8 @@ class SetRun:
                 refuse_long(self.step, limit, f"the hard stop (cylinder.k_stop, d_stop) of run {member.row}")
             if min_pressure < VACUUM:
                 raise SimulationFailed(
-                    f"pressures of run {member.row} must stay above vacuum ({VACUUM:g} Pa gauge: the model has no "
-                    f"cavitation), got {min_pressure:.4g} Pa before t = {time:.4g} s; simulate it by itself for the "
-                    "place"
+                    f"pressures of run {member.row} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does "
+                    f"not boil), got {min_pressure:.4g} Pa before t = {time:.4g} s; simulate it by itself to find where"
                 )
 
     def rms(self) -> Array:

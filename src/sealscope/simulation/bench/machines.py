@@ -32,10 +32,10 @@ _PATH_STEP = 0.05
 class BenchMachine:
     """One healthy machine in one recording: how it deviates from the designed rig, its drifts, its command and load.
 
-    `profile`, `seed`: from which the machine was drawn; `rig`: the designed rig; `overrides`: parameters in which the
-    machine deviates, by dotted name, in SI units; `duration` [s] of the recording; `closed`: closed fraction of both
-    throttles; `command`: voltage command or position target; `controller`: name of the controller that follows a
-    target, with the parameters of the designed rig.
+    `profile`, `seed`: name of the profile and seed with which the machine was drawn; `rig`: the designed rig;
+    `overrides`: parameters in which the machine deviates, by dotted name, in SI units; `duration` [s]: length of the
+    recording; `closed`: closed fraction of both throttles; `command`: voltage command or position target; `controller`:
+    name of the controller that follows a target, with the parameters of the designed rig.
     """
 
     profile: str
@@ -100,7 +100,10 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
-    """Make the random generator of a nuisance (a difference between machines), independent of others in the profile."""
+    """Make the random generator for one part of a machine, such as a nuisance (a difference between machines).
+
+    Generators with other names are independent of it. Equal seeds and names give equal generators.
+    """
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
@@ -162,7 +165,7 @@ def draw(
 ) -> BenchMachine:
     """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    Drawn are uncertain parameters and their drifts, and the duty: command and its amplitude, throttles, load and
+    Uncertain parameters and their drifts are drawn, and so is the duty: command and its amplitude, throttles, load and
     controller. `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the
     parameters drift; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed
     below 0, a duration that is not positive and finite, or an unknown rig, profile or family.

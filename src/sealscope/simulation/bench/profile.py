@@ -125,7 +125,7 @@ class Duty:
             if self.controllers and not isinstance(command, Position):
                 raise InputError(f"a controller must have a target to follow, got {text!r}")
             if self.amplitude != (1.0, 1.0) and not hasattr(command, "amplitude"):
-                raise InputError(f"{text!r} has no amplitude to be drawn")
+                raise InputError(f"a range of amplitudes needs commands with an amplitude, got {text!r}")
         for text in self.loads:
             parse_force(text)
 
@@ -158,7 +158,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
     if entry.values is not None:
         if len(kinds) > 1 or entry.range or entry.scale or entry.drift or entry.each:
             raise InputError(
-                "a list of values must be of parameters of one kind and unit, with neither range nor drift"
+                "an entry with values must have parameters of one kind and unit, and no range, scale, drift or each"
             )
         return NuisanceChoice(entry.name, parameters, _convert_values(entry, choices, si_unit), entry.why)
     if any(kind_choices for kind_choices, _ in kinds):
@@ -174,14 +174,18 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
             )
         low, high = (to_si(value, entry.unit, si_unit, name="range") for value in entry.range)
     else:
-        raise InputError("there must be a range with its unit or a scale without one")
+        raise InputError("there must be a range with a unit, or a scale without a unit")
     drift = None if entry.drift is None else _parse_drift(entry.drift, parameters, si_unit)
     scales = entry.scale is not None
     return Nuisance(entry.name, parameters, low, high, scales=scales, each=entry.each, drift=drift, why=entry.why)
 
 
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Convert a parameter's possible values to SI units, unless they are `choices`; raise InputError for others."""
+    """Convert the listed values of a parameter to SI units; leave them as they are for a choice.
+
+    `choices`: the parameter's options, () for a number. Raises InputError for a value that is not among the options, or
+    for a text or a missing unit where numbers are needed.
+    """
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -194,14 +198,18 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert a drift of `parameters` to `si_unit`, or to a fraction of them; raise InputError for an invalid drift."""
+    """Convert the drift in an entry to `si_unit`, or to a fraction of the parameters' values if the drift is relative.
+
+    Raises InputError if one of the `parameters` cannot drift, or if the drift's size or course is invalid.
+    """
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
     can_fall = entry.oil != 1.0  # with weight 1 the drift follows the oil, which only warms
     if low < 0 or (not absolute and can_fall and high >= 1):
-        raise InputError(f"size of the drift must be >= 0 and < 100 %, got {low:g} to {high:g}")
+        limit = "" if absolute else " and < 100 %"
+        raise InputError(f"size of the drift must be >= 0{limit}, got {low:g} to {high:g}")
     if entry.shapes is not None and entry.oil is not None:
         raise InputError("the drift must have shapes or oil, got both")
     shapes = entry.shapes or (("linear", "wander") if entry.oil is None else ("wander",))
@@ -221,7 +229,7 @@ def _check_distinct(nuisances: tuple[AnyNuisance, ...]) -> tuple[AnyNuisance, ..
 def _check_distinct_names(entries: _Entries) -> _Entries:
     """Return the entries of a profile; raise InputError if two have the same name."""
     if len({entry.name for entry in entries}) < len(entries):
-        raise InputError("they must have names of their own")
+        raise InputError("must have different names")
     return entries
 
 
@@ -295,7 +303,10 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Read a profile of how healthy machines differ, by its packaged name or path; InputError if it breaks a rule."""
+    """Read a profile of the differences between healthy machines, by the name of a packaged profile or by path.
+
+    Raises InputError if there is no such profile, or if its file breaks a rule.
+    """
     text = os.fspath(name_or_path)
     if text in profile_names():
         return _read_profile(_PACKAGED / f"{text}.toml", f"profiles/{text}.toml")

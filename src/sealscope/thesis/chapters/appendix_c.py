@@ -51,7 +51,8 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
     The cells are chamber, detail, geometric mean change of the RMS with the leak [%], simulated and measured, geometric
     mean and standard deviation of the simulated over the measured RMS without the leak, number of tests in which both
-    RMS change in the same direction, and correlation of the log changes. Without `measured`, its cells are None.
+    RMS change in the same direction, and correlation of the log changes. Without a `measured` sheet, the five cells
+    that need it are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
@@ -72,7 +73,7 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
 
 def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate how well the simulated data sheet agrees with the measured one, and for each chamber both sheets."""
+    """Tabulate the agreement of the simulated data sheet with the measured one, and for each chamber both sheets."""
     table, sheet = simulated_sheet(context, "leak")
     notes = f"{table.notes} Means are geometric." + ("" if context.sheet else " No measured sheet was given.")
     summary = item.table(compare_sheets(sheet, context.sheet), notes, resolved=table.resolved)

@@ -40,9 +40,9 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
     """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
 
-    Each entry under `drifts` in `cases.toml` lists parameters, which all step by one relative size: it is drawn
-    uniformly from the entry's range and given a random sign. `half`: time of the step [s]; `draw`: 0, 1, .. for
-    different draws of the test `number`. The random numbers depend on `number` and `draw` only.
+    Each entry under `drifts` in `cases.toml` lists parameters that step together by the same relative size. This size
+    is drawn uniformly from the entry's range, and its sign at random. `half`: time of the step [s]; `draw`: 0, 1, ..
+    for different draws of the test `number`. The random numbers depend on `number` and `draw` only.
     """
     rng = np.random.default_rng([_SEEDS["drift"], draw, number])
     drifts = load_texts("cases.toml")["drifts"].values()
@@ -90,7 +90,10 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe what changes in the middle of a test: "leak opened", drifts "NAME x FACTOR", or "nothing"."""
+    """Describe the change in the middle of a test: "leak opened", "nothing", or each drifting parameter.
+
+    A parameter is written with the factor of its step, such as "fluid.K_oil x 0.970".
+    """
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -102,7 +105,8 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
     """Compute the RMS of the wavelet details of both chamber pressures in each part of a recording.
 
     `parts`: begin and end [s] of each part. Returns the RMS in each part, by chamber and detail: d1..d4 [psi] and the
-    product d3d4 [psi^2]. Parts are shortened by the reach of the wavelet's filters, which would use samples outside.
+    product d3d4 [psi^2]. Samples near the ends of a part are left out, because their details depend on samples outside
+    it.
     """
     before, after = reach("db8", 4)[-1]  # numbers of earlier and later samples on which d4 depends
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -161,7 +165,7 @@ def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details in both halves.
 
     `item.inputs` states the kind of the runs. With the leak, the first test of each operating condition is repeated
-    with half the solver's step, except in a quick reproduction.
+    with half the solver's step, except in a quick reproduction. The halves of a quick reproduction are shorter.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows = []

@@ -108,8 +108,8 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, and the
-    record is mirrored at its ends. The time b is the centre of the wavelet's energy. Returns (scales, n), a column for
-    b at each sample [unit of x times s^0.5].
+    record is mirrored at its ends. The time b is that of the centre of the wavelet's energy. Returns the transform
+    (scales, n) [unit of x times s^0.5], with b at the time of each sample.
     """
     # db8 is 15 samples long at scale 1; 16 leaves a margin
     wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))
@@ -284,7 +284,11 @@ def _width(t: Array, values: Array) -> float:
 
 
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw the wavelet transform of a simulated, ringing p_A without and with a leak, with and without noise."""
+    """Draw the wavelet transform of the simulated pressure p_A, which rings, before and after a leak opens.
+
+    The panels are the pressure, its transform with and without the noise of the instruments, and the rms of the
+    transform without noise over the times before and after the leak opens.
+    """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
     rate = 1.0 / float(t[1] - t[0])
@@ -330,7 +334,11 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2: the spectrum of the signal of eq. (3.3) has two lines of phase 0 and is 0 elsewhere."""
+    """Judge claims 3.1 and 3.2 on the spectrum of the signal of eq. (3.3).
+
+    3.1: it has lines of the stated amplitudes at 100 and 30 Hz, and is 0 elsewhere. 3.2: both lines are cosines, i.e.
+    have the phase 0.
+    """
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]

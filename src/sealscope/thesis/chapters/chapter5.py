@@ -151,7 +151,8 @@ class FigureView:
     def draw_leak(self) -> PanelsAndNumbers:
         """Draw the leak flow and both chamber pressures of the test as three panels.
 
-        Numbers: mean leak, simulated and in the thesis, and the 5 to 95 % range of each pressure without and with it.
+        The numbers are the mean leak, simulated and in the thesis, and the range of each pressure between its 5 % and
+        95 % quantiles, without and with the leak.
         """
         recording = self.recording
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
@@ -169,7 +170,10 @@ class FigureView:
         return panels, numbers
 
     def draw_details(self) -> PanelsAndNumbers:
-        """Draw the wavelet details d1 to d4 and d3d4 of the pressure as five panels; the numbers are their RMS."""
+        """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure as five panels.
+
+        The numbers are the RMS of each detail without and with the leak, and the change.
+        """
         series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
         return panels, self._rms_changes(QUANTITIES)
@@ -177,7 +181,8 @@ class FigureView:
     def draw_windowed_rms(self) -> PanelsAndNumbers:
         """Draw the windowed RMS of the wavelet details d3, d4 and d3d4 of one chamber's pressure as three panels.
 
-        Horizontal lines, and the numbers, state the RMS over the parts without and with the leak.
+        The RMS over the whole part without and with the leak are drawn as horizontal lines, and listed as numbers with
+        their changes.
         """
         t, curves = windowed_detail_rms(self.recording, self.chamber)
         rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
@@ -208,7 +213,11 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of Figs. 5.1 to 5.89, which show a whole test or the time around the leak's opening."""
+    """Yield (id, title, inputs) of each of Figs. 5.1 to 5.89.
+
+    A figure shows one view of a test, such as its leak flow and pressures, for the whole duration or for 10 s on either
+    side of the opening of the leak.
+    """
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -269,7 +278,7 @@ class LeakTestMeasures:
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
     """Estimate the time [s] at which a series `y` (n,) over `t` (n,) [s] changes its mean, by least squares.
 
-    It is halfway between two points, with at least `min_points` points on each side.
+    The time is halfway between two points, with at least `min_points` points on each side.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)

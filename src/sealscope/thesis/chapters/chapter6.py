@@ -73,7 +73,10 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Compute the conductance [m^3/(s Pa)] of a leak of `lpm` [L/min] under 2 kN: flow / (LOAD / piston area A_A)."""
+    """Compute the conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
+
+    The pressure difference at the leak is then LOAD divided by the piston area A_A.
+    """
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
 
 
@@ -89,7 +92,10 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the flow [m^3/s] from a valve's supply: Q_A into chamber A for a spool position x_s > 0, else -Q_B."""
+    """Compute the flow [m^3/s] (n,) from the supply of a servo valve.
+
+    It is Q_A, the flow into chamber A, for a spool position x_s > 0, and otherwise -Q_B, the flow into chamber B.
+    """
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
@@ -227,7 +233,8 @@ def _figure_over_leak(
 ) -> Figure:
     """Draw some columns of a table over the leak, one panel each.
 
-    `roles`: line style of each curve, by the first cells of its rows in `table`; `columns`: columns to draw.
+    `roles`: line style of each curve, by the first cells of its rows in `table`; `columns`: columns to draw; `log_y`:
+    True for logarithmic y axes. The logarithmic x axis shows a leak of 0 at 0.001 L/min.
     """
     panels = []
     for head in columns:
@@ -243,8 +250,9 @@ def _figure_over_leak(
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers.
 
-    In the open loop, in which a sine of the voltage moves the piston, the columns are the amplitude of the motion, its
-    drift, and this drift minus that without a leak.
+    In the open loop a sine of the voltage moves the piston. Its columns are the amplitude of the motion, its drift, and
+    this drift minus that without a leak. The last two columns are the drifts with the controllers "pi" and
+    "fault-tolerant".
     """
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
@@ -395,7 +403,10 @@ def _load_claim(context: Context) -> Claim:
 
 
 def _valve_claim(context: Context) -> Claim:
-    """Judge claim 6.2.4: pump and valve differ in efficiency and tracking error by more than a factor of 1.5."""
+    """Judge claim 6.2.4: pump and valve differ in efficiency and tracking error by more than a factor of 1.5.
+
+    Both are compared with the PI controller and without a leak.
+    """
     table = first_table(context, "sec-6.2-valve")
     tests = []
     for head in ("efficiency against a damper [%]", _ERROR):

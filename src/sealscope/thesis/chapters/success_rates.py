@@ -56,7 +56,10 @@ CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format a rule's firings, a mask (tests,), as four cells: k/n, rate [%], 95 % interval [%]; all empty for None."""
+    """Format the count of a rule's firings as four cells: k/n, rate [%], and both ends of its 95 % interval [%].
+
+    `fires`: mask (tests,) of the tests in which the rule fires; all cells are empty for None.
+    """
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -65,7 +68,10 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build column heads for a count (named `count`), its rate and both ends of its interval on the sheet `source`."""
+    """Build the heads of the four columns for a count on a data sheet, its rate, and both ends of the rate's interval.
+
+    `source`: name of the sheet; `count`: name of the count, such as "fires".
+    """
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
@@ -85,10 +91,11 @@ THRESHOLDS = (
 
 
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count in how many tests each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
+    """Count the tests in which each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
 
     `measured`: measured sheet, None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without leak,
-    and without leak but with drifting parameters. Two more rows are for rules that always and that never fire.
+    and without leak but with drifting parameters. Two more rows are for rules that always and that never fire. The last
+    cell of a row is the rate with leak minus the rate with drift [percentage points].
     """
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
@@ -143,9 +150,10 @@ def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
     """Count the leaks that each rule on a single wavelet detail finds if its RMS must change by more than a threshold.
 
-    The change of the log RMS counts in the direction in which a leak should move it (`DIRECTION`). 5 % of the tests
-    without a leak would exceed the threshold: `d1_threshold` for the `measured` sheet, None if not given, and
-    `drift_threshold` over `drift` for the sheet simulated with a `leak`. Returns rows with the columns `THRESHOLDS`.
+    The change of the log RMS counts in the direction in which a leak should move it (`DIRECTION`). Without a leak, 5 %
+    of the tests would exceed the threshold. For the `measured` sheet, None if not given, it is `d1_threshold`. For the
+    sheet simulated with a `leak`, it is `drift_threshold` of the sheet simulated with `drift` alone. Returns rows with
+    the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):

@@ -27,7 +27,10 @@ def _claim_order(claim: Claim) -> tuple[int, ...]:
 
 
 def claims_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the claims of all chapters with their verdicts, and the number of claims with each verdict."""
+    """Tabulate the claims of all chapters with their verdicts, and the number of claims with each verdict.
+
+    The claims are those of the items that `item` needs.
+    """
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_claim_order)
     verdicts = Counter(claim.verdict for claim in claims)

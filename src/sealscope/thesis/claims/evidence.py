@@ -98,7 +98,10 @@ class SheetClaim:
 
 
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format the number of tests (n,) that passed as `k/n = rate % (low to high %)`, with the exact 95 % interval."""
+    """Format the number of tests that passed, as in `34/41 = 82.9 % (68 to 93 %)` with the exact 95 % interval.
+
+    `tests` (n,): True for each test that passed.
+    """
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
@@ -110,9 +113,9 @@ def log_change_to_percent(change: Array | float) -> float:
 
 
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the p-values of sign tests on the columns of a data sheet, corrected by Holm; keys are (chamber, detail).
+    """Compute the p-values of sign tests on the columns of a data sheet, corrected by Holm, by (chamber, detail).
 
-    Hypothesis of a test: with the leak the RMS rises or falls with probability 1/2 (two-sided).
+    The null hypothesis of each two-sided test is that, with the leak, the RMS rises or falls with equal probability.
     """
     # a row begins with chamber and detail, and ends with the corrected p-value and whether it is below 5 %
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
@@ -121,7 +124,8 @@ def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
     """Return True if the RMS of a wavelet detail changes with the leak significantly and as the thesis states.
 
-    It must fall in most tests for p_A, or rise in most for p_B, with a corrected p-value below 5 % (`holm_p_values`).
+    For p_A it must fall in more tests than it rises, for p_B the reverse. The p-value, corrected by Holm, must be below
+    5 % (`holm_p_values`).
     """
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]  # > 0: in the thesis's direction
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
@@ -148,7 +152,10 @@ def condition_design() -> Array:
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the correlation of the residuals of `x` and `y` (n,) after least squares on `controls` (n, k)."""
+    """Compute the partial correlation of `x` and `y` (n,), with the effect of `controls` (n, k) removed.
+
+    It is the correlation of the residuals of two least-squares fits, of `x` and of `y` by the columns of `controls`.
+    """
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
@@ -174,9 +181,10 @@ def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "cond
     """Classify the halves of the tests as leaking or not by the RMS of wavelet details, without a healthy baseline.
 
     The inputs for a half of a test, without or with the leak, are the logarithms of the RMS of d1 to d4 of p_A and p_B.
-    A logistic regression with an L2 penalty (C = 1) on standardised columns is cross-validated, leaving out one test,
-    or all tests of one command and closing of the throttles, at a time (`leave_out`). Returns the fraction of halves
-    classified correctly, and the area under the ROC curve. Raises MissingExtra if scikit-learn is not installed.
+    They are standardised and classified by a logistic regression with an L2 penalty (C = 1). Each half is judged by a
+    regression without its test (`leave_out` "test") or without all tests of its command and closing of the throttles
+    ("condition"). Returns the fraction of halves classified correctly, and the area under the ROC curve. Raises
+    MissingExtra if scikit-learn is not installed.
     """
     try:
         from sklearn.linear_model import LogisticRegression

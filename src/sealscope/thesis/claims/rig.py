@@ -124,7 +124,8 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 def _d3_sign_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 5.7.6: a fall of the RMS of the wavelet detail d3 of p_A indicates a leak.
 
-    The RMS must fall in fewer than 5 % of the tests simulated without a leak, with constant or drifting parameters.
+    Without a leak the RMS must fall in fewer than 5 % of the simulated tests, both with constant and with drifting
+    parameters.
     """
     d3_rule = CLAIMED[0]  # d3 of p_A falls
     sheets = {"leak": evidence.leak_sheet, "no_leak": evidence.no_leak_sheet, "drift": evidence.drift_sheet}
@@ -163,7 +164,8 @@ def _agreement_claim(evidence: ClaimEvidence) -> Claim:
 
     For each chamber and each wavelet detail d1 to d4, the ratio of simulated to measured RMS without leak, averaged
     geometrically over the tests, must be from 1/1.25 to 1.25. In at least 39 of the 41 tests, the leak must change the
-    RMS of d3 of p_A in the same direction in both. Without measured values (`measured_sheet`) nothing is judged.
+    RMS of d3 of p_A in the same direction in simulation and measurement. Without the measured data sheet the claim
+    cannot be tested.
     """
     measured, leak = evidence.measured_sheet, evidence.leak_sheet
     if measured is None:

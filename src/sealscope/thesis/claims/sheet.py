@@ -64,19 +64,26 @@ _A_D3, _, _A_D3D4, _, _, _B_D3D4, _BOTH_D3D4 = CLAIMED
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
     """Find the tests in which the RMS of a wavelet detail falls (p_A) or rises (p_B) with the leak beyond the noise.
 
-    The limit is the change that noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a mask (tests,).
+    The change must exceed a limit that noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a mask
+    (tests,).
     """
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
-    """Format how often a rule of Table 5.1 fires in simulations without a leak, that is, its false alarms."""
+    """Format the false-alarm rates of a rule of Table 5.1, from simulations without a leak.
+
+    These are simulated with constant and with drifting parameters.
+    """
     no_leak, drift = (format_rate(rule.fires(sheet)) for sheet in (evidence.no_leak_sheet, evidence.drift_sheet))
     return f"In simulation the rule fires in {no_leak} with no leak and in {drift} with drift alone"
 
 
 def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim that a rule of Table 5.1 has its printed success rate; `where`: its section or figure."""
+    """Build the claim that a rule of Table 5.1 has the success rate that the thesis prints for it.
+
+    `where`: section or figure of the thesis that states the rate.
+    """
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance = 0.5 ** len(rule.details)
     printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]
@@ -84,8 +91,9 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
         """Test that the rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
 
-        By chance, each of the rule's k details moves as a leak would move it with probability 1/2, which gives a rate
-        of 1/2^k. The one-sided binomial p-value must be below 0.05/10. Yields the rate as text, and both results.
+        By chance, a detail moves in the direction of a leak with probability 1/2, and all k details of the rule do so
+        with probability 1/2^k. The one-sided binomial p-value must be below 0.05/10. Yields the rate as text, and the
+        results of both tests.
         """
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
@@ -96,8 +104,8 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
         """Make the values that fill the placeholders of the claim's texts, by name.
 
-        "product" is a remark on the printed rate of d3d4 in both chambers, "" for other rules; "controls" are the false
-        alarms in the simulations of `evidence`.
+        "product" is a remark on the printed rate of d3d4 in both chambers, "" for other rules. "controls" are the
+        rule's false alarms in the simulations of `evidence`.
         """
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
         product = (
@@ -139,9 +147,10 @@ def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.2: at each leak level, the detail d3 of p_A falls beyond noise in 80 % of the tests or more.
+    """Test claim 5.6.2: at each leak level, the detail d3 of p_A falls beyond the noise in at least 80 % of the tests.
 
-    Yields for each level the rate of such tests as text, and whether it is at least 80 %.
+    The fall must exceed a limit that noise alone exceeds in 5 % of the tests. Yields for each level, such as "large",
+    the rate of such falls as text, and True if it is at least 80 %.
     """
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
@@ -152,7 +161,7 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 def _test_smallest_leak(sheet: DataSheet, rules: tuple[Rule, ...] = CLAIMED_CELLS) -> Iterator[Finding]:
     """Test claim 5.6.3: each rule of Table 5.1 detects the leak, that is fires, in the test with the smallest leak.
 
-    Yields for each of `rules` the changes of its details [%] as text, and whether it fires.
+    Yields for each of `rules` the changes [%] of the RMS of its details as text, and True if the rule fires.
     """
     row = int(np.argmin(mean_leaks()))
     for rule in rules:
@@ -175,8 +184,9 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 6.1.1: d3d4 falls in p_A and rises in p_B down to 0.0048 L/min, and in over 80 % of the tests.
+    """Test claim 6.1.1: the RMS of d3d4 falls in p_A and rises in p_B down to a leak of 0.0048 L/min.
 
+    The smallest leak of a test with both changes must be 0.0048 L/min, and over 80 % of all tests must have them.
     Yields for both conditions a text, and whether it is met.
     """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
@@ -201,7 +211,7 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
     """Format the success of detecting leaks without a healthy baseline for claim a.1; `evidence` is unused.
 
     Each text has the accuracy and the area under the ROC curve of a cross-validated classifier, with single tests left
-    out of the fit ("tests") or whole operating conditions ("conditions").
+    out of the fit ("tests") or whole operating conditions ("conditions"). Without scikit-learn the texts say only this.
     """
     try:
         pairs = {
@@ -214,16 +224,20 @@ def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]
 
 
 def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format rates of the rule that d3 of p_A falls: false alarms ("controls") and falls beyond the noise ("finds")."""
+    """Format two rates of the rule that d3 of p_A falls with the leak, by name.
+
+    "controls" are its false alarms in simulations without a leak, and "finds" is the rate of falls beyond the noise in
+    the data sheet.
+    """
     return {"controls": _format_controls(evidence, _A_D3), "finds": format_rate(_exceeds_noise(sheet, "p_A", "d3"))}
 
 
 def _test_trend(chamber: str, sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.3 (p_A) or 5.5.4 (p_B): each detail's log change is correlated with the mean leak.
 
-    The sign must be negative for p_A and positive for p_B, both of the plain correlation and of the partial correlation
-    given the operating condition, at the 5 % level. Yields for each detail both correlations as text, and for each
-    whether it is as claimed.
+    The sign must be negative for p_A and positive for p_B. This must hold at the 5 % level for the plain correlation,
+    and for the partial correlation given the operating condition (command and throttles). Yields for each detail both
+    correlations as text, and for each whether it is as claimed.
     """
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
     for name in SENSITIVE:
@@ -238,7 +252,7 @@ def _test_trend(chamber: str, sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Compute how well two linear regressions predict the mean leak of a test, for the texts of claims 5.5.3 and 5.5.4.
+    """Compute the accuracy with which two linear regressions predict a test's mean leak, for claims 5.5.3 and 5.5.4.
 
     Returns the leave-one-out R^2 of the regression on the operating condition ("condition"), and on the log changes of
     the RMS of both chambers' details ("changes"). `evidence` is unused.
@@ -380,8 +394,9 @@ def _test_rows(
 ) -> tuple[str, list[bool]]:
     """Test that the RMS of wavelet details change by more than the noise in the row of the data sheet for `test`.
 
-    `names`: the details; `falls`: True if only falls count. Returns a text, and True or False for each detail. If
-    several rows can be the test of chapter 5, the text also counts how many of them change beyond the noise.
+    `names`: the details; `falls`: True if only falls count, False for changes in either direction. Returns a text, and
+    True or False for each detail. If several rows can be the test of chapter 5, the text also counts those that change
+    beyond the noise.
     """
     row = test.condition.number - 1
     limit = d1_threshold(sheet, chamber, either_side=not falls)

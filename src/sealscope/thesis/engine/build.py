@@ -119,7 +119,11 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the job of each item in `ready`, whose needed items are all finished, and report it as in work."""
+            """Yield the job of each item in `ready`, and report the item as in work.
+
+            `ready`: ids of items that can be made, because all items they need are finished. A job does not have the
+            products of needed items that failed.
+            """
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
@@ -159,7 +163,7 @@ def _empty_runs_folder(store: Path) -> Path:
 
 
 def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
-    """Compute for each item a digest of all inputs of its products and files, by id.
+    """Compute a digest for each item, by id, that changes with any input of the item's products and files.
 
     `sheet_key`: digest of the data sheet, "" if not given; `quick`: True if less is simulated; `is_published`: True if
     files are written.
@@ -191,7 +195,8 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
-    `row`: stored result or None. The item is "kept" if this is no error and all its files exist in `folder`.
+    It is "left out" if it cannot be made without the data sheet, and `sheet` is None. It is "kept" if its stored result
+    `row` has no error, and all files of the result exist in `folder`.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
@@ -206,7 +211,8 @@ def _make_item(
     """Make one item (a figure, table or claims) and write its files; return the result, or the error, to be stored.
 
     `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the files, None
-    to write none; `folder`: folder of the results; `runs`: folder of simulated runs.
+    to write none; `folder`: folder of the results; `runs`: folder of simulated runs; `job`: the item, its key, and the
+    products of the items it needs.
     """
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)

@@ -50,7 +50,8 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    `prove`: True to repeat the run with half the solver's step; a large change does not count as a failure.
+    `prove`: True to repeat the run with half the solver's step, and to state in the result if it changed little. A
+    large change does not count as a failure.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)
@@ -98,7 +99,7 @@ class Context:
         Raises InputError if the needed item failed, or if the item to be made does not name it in its `needs`.
         """
         if name not in self.needs:
-            raise InputError(f"{self.name} must name {name} among its needs to ask for its products")
+            raise InputError(f"{self.name} must list {name} in `needs` to use the products of {name}")
         if name not in self.products:
             raise InputError(f"needs {name}, which failed")
         return self.products[name]

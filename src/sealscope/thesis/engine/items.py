@@ -85,8 +85,8 @@ def load_items() -> tuple[Item, ...]:
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     """Yield the items (figures, tables, claims) that a row of `items.toml` with the key `name` describes.
 
-    Entries of the row that are no fields of `Item` become its `inputs`. An entry `each` names a function that yields
-    (id, title, inputs) of several items.
+    Entries of the row that are not fields of `Item` become its `inputs`. An entry `each` names a function that yields
+    (id, title, inputs) of several items; otherwise the row describes one item with the id `name`.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
@@ -109,7 +109,8 @@ def _import_function(name: str) -> Any:
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
     """Select items (figures, tables, claims) by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
 
-    They keep the order of `items`. Raises InputError, with the closest ids, if a pattern matches nothing.
+    The selected items keep the order of `items`. No patterns select all. Raises InputError, with the closest ids, if a
+    pattern matches nothing.
     """
     ids = [item.id for item in items]
     selected: set[str] = set()

@@ -132,7 +132,8 @@ class Claim:
 def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
     """Judge a claim by the results of tests of its parts; None, for a test that cannot be made, is ignored.
 
-    It `holds` if all pass, `does not hold` if none does, else `holds in part`, or `cannot be tested` without results.
+    The verdict is "holds" if all tests pass, "does not hold" if none passes, and "holds in part" if only some pass.
+    Without any result it is "cannot be tested".
     """
     results = {bool(test) for test in tests if test is not None}
     if len(results) == 1:

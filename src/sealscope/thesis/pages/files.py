@@ -21,9 +21,9 @@ _NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
     """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
-    These are `figures/ID.svg`, `figures/ID.png` and `tables/ID.csv` for each figure or table. Claims go to
-    `tables/ID.csv` of their item, or to `tables/ID-claims.csv` if the item has a table. Raises ValueError for an id
-    that is no file name.
+    These are `figures/ID.svg` and `figures/ID.png` for each figure, and `tables/ID.csv` for each figure or table.
+    Claims go to `tables/ID.csv` of their item, or to `tables/ID-claims.csv` if the item has a table of this name.
+    Raises ValueError for an id that is not a valid file name.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
@@ -43,7 +43,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 
     for product in products:
         if not isinstance(product, Claim) and not _NAME.fullmatch(product.id):
-            raise ValueError(f"an id must be of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
+            raise ValueError(f"an id must consist of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
         if isinstance(product, Figure):
             svg, png = draw(product)
             write_bytes(f"figures/{product.id}.svg", svg)

@@ -198,7 +198,10 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
 
 
 def _use_plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis of less than four decades with plain numbers such as 0.2, 1 and 50."""
+    """Label a logarithmic axis of fewer than four decades with plain numbers such as 0.2, 1 and 50.
+
+    The labels of minor ticks are removed on any axis.
+    """
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -211,8 +214,8 @@ def _use_plain_numbers(axis: Axis) -> None:
 def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
     """Select the points (x, y) of a curve that are drawn.
 
-    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, unless x is not rising. A
-    line is then thinned to about `_MAX_POINTS` points that preserve its peaks.
+    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, if its x never decreases.
+    A line is then thinned to about `_MAX_POINTS` points that preserve its peaks.
     """
     x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
     if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):

@@ -37,9 +37,9 @@ _NEIGHBOURS = _PRIORS.neighbours
 def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
-    A change of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one.
-    The recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks
-    of whole cycles.
+    Returns a test for each amplitude, or an empty list. A change of what the machine is commanded to do (its duty)
+    changes both amplitudes alike; a leak changes only one. The recording is divided into `BLOCKS` blocks of equal
+    length, or with a position and a periodic motion into blocks of whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -101,7 +101,8 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
     """Test the log amplitudes (K,) of command and motion in K blocks for a step; one test for each.
 
-    `time` (K,): middles of the blocks [s]. The list is empty if one of them cannot be tested (`feature_step_test`).
+    `time` (K,): middles of the blocks [s]. The list is empty if one of the amplitudes cannot be tested
+    (`feature_step_test`).
     """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
     possible_tests = [test for test in tests if test is not None]
@@ -156,8 +157,10 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
     """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
 
     The features (`SENSOR_FEATURES`) are the correlation of p_A - p_B with the flow, the noise of both pressures, the
-    difference of their noise, and the hum at the frequencies of the mains. The first word of a name is its kind of data
-    (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate [Hz].
+    difference of their noise, and the hum at the frequencies of the mains. The correlation is left out if no motion is
+    recorded, and a hum if the sampling rate is too low. Noise is a log variance. The first word of a name is its kind
+    of data (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate
+    [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -216,7 +219,8 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
-    `time` (K,): middles of the blocks [s]. Return None for constant, missing or fewer than `MIN_BLOCKS` values.
+    `time` (K,): middles of the blocks [s]. Return None if the values are constant or fewer than `MIN_BLOCKS`, or if one
+    of them is missing.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None

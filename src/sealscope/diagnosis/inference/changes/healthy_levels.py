@@ -111,8 +111,8 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
     `judged`, `healthy`: summaries of the recordings. Of up to two estimates of the friction (`FRICTION_KEYS`), the one
-    whose logarithm scatters less between the healthy recordings is compared. Return None if the judged recording has no
-    usable value of it, or if fewer than `MIN_HEALTHY` healthy recordings have one.
+    whose logarithm scatters less between the healthy recordings is compared. Return None if this estimate is not usable
+    in the judged recording, or if neither estimate is usable in `MIN_HEALTHY` healthy recordings.
     """
     prior = CHANGES.healthy
     choices = [
@@ -134,7 +134,8 @@ def _log_frictions(
 ) -> tuple[Estimate | None, list[Estimate]]:
     """Compute the logarithm of the friction in the judged recording and in the healthy ones, with standard errors.
 
-    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries.
+    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries. If the judged recording or all
+    healthy ones lack these keys, the result is None and an empty list.
 
     - The sign that stands for friction against the motion depends on which channel measured the motion. It is the sign
       of the sum of friction / error over the healthy recordings.

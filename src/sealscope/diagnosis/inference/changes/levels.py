@@ -123,7 +123,8 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
     The samples in motion are fitted by p = level + half sign(v) + b v + c dv/dt + d x. Level and half difference are
     free in each block; the slopes b, c and d on speed v, acceleration and position x are common to the recording.
     Without a recorded motion the levels are means and the half differences zero. Several block lengths are tried, whole
-    cycles first; the first with enough samples of both directions in every block is used. Return None if none has.
+    cycles first; the first with enough samples of both directions in every block is used. Return None if there is no
+    such length, or if a pressure is not recorded.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -154,7 +155,8 @@ def pressure_level_rows(
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
     `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures, against rounding; `max_speed`: highest
-    speed, by default `top_speed`, below whose fraction `levels.slowest` (`priors.toml`) a sample is at rest.
+    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of
+    `max_speed`.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -208,7 +210,8 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
     A step takes time, so that the block in which it begins shows neither the old nor the new levels. The tests are
     therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
-    second pass. The p-values are those of the first pass, with all blocks.
+    second pass. The p-values are those of the first pass, with all blocks. With fewer than `MIN_BLOCKS` + 2 blocks
+    there is no second pass.
     """
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]
@@ -227,7 +230,8 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested.
 
-    A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels.
+    A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels. The
+    results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
     """
     whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
@@ -273,7 +277,7 @@ def _whitening_matrix(values: Array) -> Array:
     The matrix W is a root of the inverse of S, W' W = S^-1. S is the maximum-likelihood estimate of the scatter matrix
     of the differences between neighbouring blocks, under a multivariate t distribution, so that the large differences
     at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
-    `PressureLevels.values`; c of its columns are not constant.
+    `PressureLevels.values`; c: number of its columns that are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # a machine that never moves has constant levels
     differences = np.diff(values[:, varying], axis=0)
@@ -294,10 +298,11 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
-    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if a direction cannot be tested.
+    `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if the vectors are zero, or if a direction
+    cannot be tested.
 
-    The score counts only the directions of the pattern, each with its own variance. For the rank, by which patterns
-    are compared, all directions have one variance in common.
+    The score counts only the directions of the pattern, each with its own variance. For the rank, by which patterns are
+    compared, all directions have one variance in common. The formulas are in the module's docstring.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones

@@ -5,7 +5,7 @@ A pressure, or p_A - p_B, is fitted by
     p = level(x) + half sign(v) + b v + c dv/dt [+ drift t/T],
 
 with position x, speed v, and the time t over the recording's duration T. The level is linear in the position between
-`KNOTS` values. The drift is fitted only where it is asked for: few strokes do not tell it from friction. Loads that
+`KNOTS` values. The drift is fitted only on request: few strokes do not distinguish it from friction. Loads that
 change slowly, as work does, are removed on request (`remove_slow_changes`), and friction reverses faster. The fit is
 iteratively reweighted least squares with redescending weights, so that contact with a workpiece hardly counts. Standard
 errors are those of a jackknife, which leaves out groups of rows in turn: strokes for a drift, else equal parts of the
@@ -55,9 +55,10 @@ TIME, DIRECTION, SPEED = 1, 0, 1
 class Motion(NamedTuple):
     """Samples in which the piston moves, with the design matrix of their fit.
 
-    `rows` (n,): indices of the samples; `design` (n, m): sign of the speed, time, speed, acceleration, and a hat
-    function of the position for each knot (`_hat_functions`); `strokes` (n,): number of the stroke, a motion in one
-    direction without a rest; `top_speed`: speed that counts as 1 in the column of the speed.
+    `rows` (n,): indices of the samples; `design` (n, m): sign of the speed; time over the duration; speed and
+    acceleration, each over the 99 % quantile of its magnitude; and a hat function of the position for each knot
+    (`_hat_functions`). `strokes` (n,): number of the stroke, a motion in one direction without a rest; `top_speed`:
+    this quantile of the speed.
     """
 
     rows: NDArray[np.intp]
@@ -69,10 +70,11 @@ class Motion(NamedTuple):
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit.
 
-    The piston moves if its speed, averaged over `AVERAGING_TIME`, exceeds both the noise of the speed and the fraction
-    `healthy.slowest` (`priors.toml`) of the mean speed (`max_rest_rate`). At rest, friction may have any value between
-    those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber pressure or a
-    channel of the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
+    The motion is that of the first recorded channel of x, theta, omega and u. The piston moves if the speed, averaged
+    over `AVERAGING_TIME`, exceeds both three standard deviations of its noise and the fraction `healthy.slowest`
+    (`priors.toml`) of the mean speed (`max_rest_rate`). Samples at rest are left out, since friction may then have any
+    value between those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber
+    pressure or the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
     """
     name = next((channel for channel in ("x", "theta", "omega", "u") if channel in recording.channels), None)
     if name is None or len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
@@ -113,7 +115,7 @@ def _hat_functions(position: Array, n_knots: int) -> Array:
     """Evaluate hat functions at positions (n,), without those that are 0 at every position; shape (n, k).
 
     A hat function is 1 at its knot and falls linearly to 0 at the neighbouring knots. The `n_knots` knots are equally
-    spaced from the least to the largest position.
+    spaced from the least to the largest position. If all positions are equal, the result is one column of ones.
     """
     distance = (n_knots - 1) * (position - position.min()) / max(float(np.ptp(position)), TINY)
     hats = np.maximum(1.0 - np.abs(distance[:, None] - np.arange(n_knots)), 0.0)
@@ -141,9 +143,10 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
     """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
-    The weights are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE` times the median of abs(residual),
-    plus `MIN_RESIDUAL`. It is run twice: from equal weights, and from weights that are small far from the median of the
-    values, as in contact with a workpiece. Returns coefficients and weights of the fit with the smaller scale.
+    The weights, by which the rows are multiplied, are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE`
+    times the median of abs(residual), plus `MIN_RESIDUAL`. The fit is run twice: from equal weights, and from weights
+    that are small for values far from their median, such as those in contact with a workpiece. Returns the coefficients
+    and weights (n,) of the run with the smaller median.
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -166,9 +169,10 @@ def _robust_weight(residual: Array) -> Array:
 def influence_factor(weight: Array) -> float:
     """Compute the factor by which a robust fit has larger standard errors than a fit with fixed weights.
 
-    `weight` (n,): final weights of the robust fit (`fit_robustly`). With u = residual / scale and w = 1/(1 + u^2), this
-    fit solves sum psi(u) row = 0 with psi = u w^2. The slope of psi is 4 w^3 - 3 w^2; with fixed weights it would be
-    w^2. The factor is the mean of w^2 over the mean of the slope, at most 10.
+    `weight` (n,): final weights of the robust fit (`fit_robustly`). With u = residual / scale and w = 1/(1 + u^2), the
+    robust coefficients make the sum of psi(u) times the row of the design zero, where psi = u w^2. The slope of psi is
+    4 w^3 - 3 w^2; with fixed weights it would be w^2. The factor is the mean of w^2 over the mean of the slope, at most
+    10.
     """
     squares = float((weight**2).mean())
     slopes = float((4.0 * weight**3 - 3.0 * weight**2).mean())
@@ -187,10 +191,11 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
 
         error^2 = (P - 1) / P sum over groups of (c_k - c)^2.
 
-    Residuals may be correlated within a group. An error is infinite if all rows, or all but those of one group, do not
-    determine the coefficient. `design` (n, m), `values` (n,): the rows in the order of time, multiplied by the weights
-    of the fit; `columns`: indices of the coefficients; `groups` (n,): number of each row's group, in increasing order.
-    More than `GROUPS` groups are merged with their neighbours.
+    Residuals may be correlated within a group. An error is infinite if the coefficient is not determined by all rows,
+    or by all but those of one group. All errors are infinite for a single group. `design` (n, m), `values` (n,): the
+    rows in the order of time, multiplied by the weights of the fit; `columns`: indices of the coefficients; `groups`
+    (n,): number of each row's group, from 0, in increasing order. More than `GROUPS` groups are merged with their
+    neighbours.
     """
     n_groups = min(int(groups[-1]) + 1, GROUPS)
     if n_groups < 2:
@@ -237,7 +242,9 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous drop.
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
-    viscous drop of a steady motion. The result is computed only once; it is None if too few samples are in motion.
+    viscous drop of a steady motion. The result is computed only once for a recording. It is None if too few samples are
+    in motion (`select_motion`), or if a value or its error is not finite, as for a piston that moves in one direction
+    only.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
     return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
@@ -245,9 +252,10 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`); None if too few samples are in motion.
+    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`).
 
-    The standard errors allow for residuals that are correlated within `equal_parts` of the rows.
+    The standard errors allow for residuals that are correlated within each of the `equal_parts` of the rows. Return
+    None in the same cases as `fit_difference`.
     """
     motion = select_motion(recording)
     if motion is None:

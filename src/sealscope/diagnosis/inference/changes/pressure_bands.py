@@ -145,8 +145,10 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
     """Test for a new low-pass filter of one pressure, such as a clogged line, against healthy recordings.
 
     `judged`, `healthy`: spectra of each recording for pairs of channels, by their names in `PAIRS`. The result is named
-    after the pressure that is more probably filtered; its size is the most probable cut-off frequency [Hz]. Healthy
-    recordings with fewer octaves of a pair than the judged one are left out. Return None if too few remain.
+    after the pressure that is most probably filtered. Its size is the most probable cut-off frequency [Hz], its p-value
+    the inverse of the Bayes factor of a filter, averaged over the pairs, or 1 for a factor below 1. Its score is twice
+    the log of this factor, or 0. Healthy recordings with fewer octaves of a pair than the judged one are left out.
+    Return None if too few remain for every pair.
     """
     from scipy.special import logsumexp
 

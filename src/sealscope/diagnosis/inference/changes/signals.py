@@ -33,7 +33,7 @@ def _test_signals(recording: Recording) -> Observed:
     """Test a recording's signals for changes (`observe_signals`); report only a reason if it is too short."""
     shortest = CHANGES.features.shortest  # length of a block [s]
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
-        return Observed(SIGNALS, lack="too short for changes of its signals")
+        return Observed(SIGNALS, lack="too short to test its signals for changes")
     observables = run_tests(
         lambda: duty_observables(duty_tests(recording)),
         lambda: sensor_observables(sensor_tests(recording)),

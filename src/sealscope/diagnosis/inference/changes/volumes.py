@@ -70,16 +70,18 @@ def volume_observables(
 
     A leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1.
     The coefficients of the motion are tested together, for a change of their common scale. The `advantage` of a result
-    comes from the priors on its size and on the power, the sensor offset, and the oil that the accumulator lost.
+    comes from the priors on its size and on the power, from the sensor offset, and from the oil that the accumulator
+    lost or the fall of the charge pressure.
 
     - `blocks`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks.
     - `plain`: its blocks with the pressures as recorded, for all other tests.
-    - `balances`, `columns`: the equations, and the roles of their columns.
+    - `balances`, `columns`: the volume balances, and the roles of their columns.
     - `oil_loss`: for each external leak, by the name of its term, a step test of the oil that the accumulator lost.
     - `volume_ratio`: ratio of piston area to pump displacement as measured, over that assumed.
     - `charge`: trend of the charge pressure, None if it is unknown.
     - `flow_scale`: true flow over the flow that the balance gives with the assumed sizes.
-    - `with_orifice`: false with few blocks, in which an orifice's flow looks like a change of the motion's scale.
+    - `with_orifice`: also test the coefficient of an orifice's flow; false with few blocks, in which this flow looks
+      like a change of the motion's scale.
     """
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
@@ -124,9 +126,9 @@ def volume_observables(
 def _pressure_scale(conductance: Information, step: StepTest) -> LogScale | None:
     """Compute the scale of both pressures that would make a leak's conductance appear to rise by a step.
 
-    The leakage stays the same, so that scaled pressures change the apparent conductance from G_1 to G_2 = G_1 / scale.
-    `conductance`: its likelihood in the blocks of the recording; `step`: test for the step. Return None if a mean
-    before or after the onset is not positive.
+    If both pressures are scaled and the leakage stays the same, the apparent conductance becomes G_2 = G_1 / scale
+    instead of G_1. `conductance`: its likelihood in the blocks of the recording; `step`: test for the step. Return None
+    if no block lies before or after the onset, or if the mean conductance of these blocks is not positive.
     """
     history = fit_history(conductance, step, with_step=True)
     is_after = np.asarray(conductance.time > step.onsets[step.best])
@@ -144,9 +146,9 @@ def _size_penalty(
 ) -> float:
     """Compute how improbable the size of a step is: -2 log(prior density / largest density).
 
-    It is 0 if there is no prior on the size, and for small steps where the prior only limits it (`above`). `name`: name
-    of the coefficient in the volume balance that changes by `size`; `names`: names of the columns of `blocks`.
-    `volume_ratio` and `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
+    It is 0 without a prior on the size. A prior that only limits the size (`above`) also gives 0 for steps below its
+    limit. `name`: name of the coefficient in the volume balance that changes by `size`; `names`: names of the columns
+    of `blocks`. `volume_ratio` and `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -162,7 +164,7 @@ def _size_penalty(
 
 
 def _law_log_prior(name: str) -> float:
-    """Compute the log prior odds of a leak's flow law, the power of p_A - p_B that it follows, to laminar flow.
+    """Compute the log prior odds of a leak whose flow follows a power of p_A - p_B to a laminar leak.
 
     `name`: name of the tested step, which states the power. The result is 0 for a laminar leak and for other steps.
     """
@@ -176,10 +178,10 @@ def _step_hypotheses(
     """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
     `centred`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks;
-    `recorded`: blocks with the pressures as recorded, for all other tests; `columns`: roles of the columns of each
-    equation; `has_accumulator`: true if the accumulator's volume shows external leaks. Yields for each step its name,
-    the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, and the change (K,) of the
-    coefficient by a unit step, None if it is 1 in every block.
+    `recorded`: blocks with the pressures as recorded, for all other tests; `terms`: terms of the first equation;
+    `columns`: roles of the columns of each equation; `has_accumulator`: true if the accumulator's volume shows external
+    leaks. Yields for each step its name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K
+    blocks, and the change (K,) of the coefficient by a unit step, None if it is 1 in every block.
     """
     first = columns[0]
     for term in terms:
@@ -204,8 +206,8 @@ def _step_hypotheses(
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    A coefficient is left out if it changes only together with others, or if another test covers its steps.
-    `has_accumulator`: true if the recording shows the volume of an accumulator.
+    A coefficient is left out if it changes only together with others, or if another test covers its steps. `roles`:
+    roles of the balance's columns; `has_accumulator`: true if the recording shows the volume of an accumulator.
     """
     # The coefficients of motion change together, with an area, the displacement or a sensor's scale: the test of SCALE
     # covers them. The motion of one recording varies too little to test SPEED_LOSS. A leaking piston raises HOLDING as

@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
 
-    Without regular strokes it is the period of the strongest spectral line, or None for fewer than `MIN_BLOCKS` of
-    these periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
+    Without regular strokes it is the period of the strongest spectral line, or None if the recording has fewer than
+    `MIN_BLOCKS` such periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:

@@ -42,7 +42,8 @@ def reduce_to_tested(
 
     The estimate of the coefficient is moment / precision. `gram` (m, m): Gram matrix of the columns; `products` (m,):
     their products with the left side, or with a residual; `tested`, `nuisance`: columns of the tested coefficient and
-    of the eliminated ones; `prior`: precisions of the priors on the latter.
+    of the eliminated ones; `prior`: precisions of the priors on the eliminated coefficients, whose means are 0; None
+    without priors.
     """
     cross = gram[nuisance, tested]
     matrix = gram[np.ix_(nuisance, nuisance)]
@@ -55,8 +56,8 @@ def reduce_to_tested(
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
     """Estimate the log ratio of a recording's motion coefficient (area of the piston) to that of healthy recordings.
 
-    Returns it with its standard error, without the error of the healthy fit. The ratio differs from 1 if area over
-    displacement changed: another machine, or another scale of a sensor.
+    Returns the log ratio and its standard error, which excludes the error of the healthy fit. The ratio differs from 1
+    if piston area over pump displacement changed, as on another machine or by another scale of a sensor.
 
     `judged`, `healthy`: Gram matrices (m, m) of the volume balance in the recording and of the sum of the healthy ones.
     Each of the two fits gives a coefficient for each direction of the motion and each loaded side. Their mean, weighted
@@ -86,10 +87,10 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
-    These have no prior on differences between recordings. The leakage of a pump that holds the load, which counts only
-    within a recording, is not eliminated but set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram
-    matrices of E equations; `columns`: roles of their columns. In the result, the Schur complement, the rows and
-    columns of these coefficients are zero.
+    Their `between_deviation` is infinite, i.e. nothing is known of their differences between recordings. The leakage of
+    a pump that holds the load, which counts only within a recording, is not eliminated but set to zero first
+    (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations; `columns`: roles of their columns. In the
+    result, the Schur complement, the rows and columns of these coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):

@@ -235,8 +235,12 @@ def _candidate_covariances(
     """Build g candidate covariances (g, n + 1, n + 1) of transformed leak coefficients, with log priors (g,).
 
     The transform z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
+    The candidates differ in the standard deviation between sessions. If the oil is unknown and no healthy recording is
+    of the judged recording's session, they also differ in the oil of this session, which is either like that of the
+    healthy sessions or unlike it.
 
     - `sessions` (n + 1,): session number of each recording, the judged one last;
+    - `oil`: hypothesis on the oil's effect on the leakage of each recording;
     - `relative_slopes` (n + 1,): change of z per relative change of each recording's leak coefficient;
     - `oil_deviation`: standard deviation of z between sessions by unknown oil, 0 if the oil is known;
     - `session_deviation`: prior standard deviation of z between sessions with the same oil;

@@ -37,7 +37,8 @@ class OilHypothesis(NamedTuple):
 def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
     """Predict the rise of each recording's log leakage by thinner oil, shape (n + 1,), the judged recording last.
 
-    The rise is relative to the healthy mean. It is 0 if nothing shows the oil's viscosity.
+    The rise is relative to the healthy mean, and follows from the most probable of the `oil_hypotheses`. It is 0 if
+    nothing shows the oil's viscosity.
     """
     return oil_hypotheses(recordings)[0].thinning
 
@@ -68,7 +69,7 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
 
     `recordings`: the healthy ones, then the judged one. The resistance to the motion at the top speed v, friction +
     drop v, is known well. Friction and viscous drop are known less well, since friction varies with speed and load.
-    There are two hypotheses:
+    There are two hypotheses, only the first if the judged or the usual healthy friction is not positive:
 
     - Friction changed, as if seals wore, and the drop is the fitted one.
     - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
@@ -78,12 +79,13 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     density is proportional to S^(-(n - 1) / 2), where S is the sum of two kinds of squares: of the logarithms of the
     drops about their mean, and of the relative errors of the drops.
 
-    Either has a small probability, `oil.drop_misleads`, that something other than the oil, such as a swollen seal,
-    changed the judged drop.
+    Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small
+    probability `oil.drop_misleads`, without this sign, as if something else, such as a swollen seal, had changed the
+    judged drop.
 
     A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
     error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
-    if the judged recording or all healthy ones have no drop.
+    if the judged recording has no drop, or none of the healthy ones has.
     """
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
     friction, friction_error, drop, drop_error, speed = np.array(

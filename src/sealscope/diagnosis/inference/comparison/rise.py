@@ -123,8 +123,9 @@ class Rise(NamedTuple):
         """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
 
         `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
-        of the logarithm of the true rise about log(`rise`); 0 if the true rise is exactly `rise`. In that case, and if
-        `may_be_partial`, `value` may contain any fraction of the rise; the likelihood is averaged over the fraction.
+        of the logarithm of the true rise about log(`rise`); 0 if the true rise is exactly `rise`. If `log_deviation` is
+        0 and `may_be_partial` is true, `value` may contain any fraction of the rise, and the likelihood is averaged
+        over the fraction.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -136,7 +137,7 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
-        """Compute the log likelihood ratio between a rise by `rise` and no rise, robust to outlying estimates.
+        """Compute the log likelihood ratio of a rise by `rise` to no rise, robust to an outlying estimate `value`.
 
         Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
         recording. An estimate that is improbable with the rise and without it is therefore evidence for neither.
@@ -195,8 +196,9 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     """Estimate the rise of a judged value over the value that healthy recordings predict for it.
 
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
-    ...), with log weights. Their difference follows the mixture over all estimates. The rise is its median, and the
-    standard deviation is half the width of its central 68 % interval.
+    ...), with log weights. The difference of judged and predicted value follows the mixture over all estimates, without
+    parts of negligible weight. The rise is the median of this difference, and the standard deviation is half the width
+    of the central 68 % interval.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()

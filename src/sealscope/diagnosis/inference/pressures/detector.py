@@ -54,10 +54,12 @@ class PressureResponse:
         """
         leak = self.reading(recording)
         if leak is None:
-            return Observed(self.name, lack="no response to the command that a pump-driven piston would give")
+            return Observed(
+                self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
+            )
         leak = replace(leak, healthy=[summary["level"] for summary in healthy_summaries(self, baseline)])
         if leak.step is None and leak.rise is None:
-            return Observed(self.name, lack="too little moves: no leak would show")
+            return Observed(self.name, lack="too little motion: no leak would show")
         is_known = np.ones(len(recording), bool) if recording.bridged is None else ~recording.bridged
         judged_until = (np.flatnonzero(is_known)[-1] + 1.0) / len(is_known) if is_known.any() else 0.0
         observables = score_response_steps(leak.parameters)

@@ -76,8 +76,8 @@ class Linearisation(NamedTuple):
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
     p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends`:
-    simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of all simulated parameter sets,
-    first `theta`.
+    simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of `theta` and of the further
+    parameter sets that were simulated with it.
     """
 
     theta: Array
@@ -180,10 +180,11 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and the factor by which its correlation raises the variance of fits.
+    """Compute the variance of the residual [Pa^2], and how much its correlation inflates the variance of parameters.
 
-    The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1. `deviations`
-    (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: the tested index.
+    The second result is a factor: the variance of the scores (`Block`) over their variance under white noise, at least
+    1. `deviations` (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index
+    of the tested parameter.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

@@ -49,6 +49,8 @@ class ResponseLeak:
     - `pump_flow`: mean flow of the pump [m^3/s] over the recording, and while the pump delivers; both are equal here.
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
     - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
+
+    The other fields are explained in `LeakMeasure`.
     """
 
     parameters: Mapping[str, Information]
@@ -124,7 +126,8 @@ class ResponseLeak:
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above that of these recordings, otherwise on a leak that
-        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance.
+        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance, and the
+        largest usual error of the scale (`conductance_scale_error`).
         """
         test = self.step if self.rise is None else self.rise
         if test is None:

@@ -70,7 +70,7 @@ _MAX_STEP, _SEGMENT = 1.01e-3, 256
 def _direction_factor(v: float, theta: Parameters) -> float:
     """Compute the factor on the friction for the direction of the piston's speed v [m/s].
 
-    It is 1 + theta[SIDE] for motion out (v >= 0) and 1 - theta[SIDE] for motion in.
+    It is 1 + s for motion out (v >= 0) and 1 - s for motion in, with the parameter s = `theta[SIDE]`.
     """
     return select(v < 0.0, 1.0 - theta[SIDE], 1.0 + theta[SIDE])  # type: ignore[no-any-return]
 
@@ -209,9 +209,9 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
     A prior has a centre, a width and a wander (`Priors`), by the table `[response]` of `priors.toml`; that of the
-    contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. They are relative to the rig's value,
-    or absolute if the rig has none. The Coulomb friction is that at the charge pressure. The bias, a speed, has a prior
-    in volts of the command, which are multiplied by the gain.
+    contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. These three numbers are multiplied by
+    the rig's value of the parameter, or are absolute if the rig has none. The Coulomb friction is that at the charge
+    pressure. The prior of the bias, a speed, is in volts of the command and is multiplied by the gain.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
@@ -249,7 +249,8 @@ class Machine(NamedTuple):
         """Simulate p_A - p_B [Pa] at n samples for each of up to 16 parameter sets (m, p).
 
         `command` (n + 1,): command [V] at the sample before the first and at each of the n samples; `states` (8, m):
-        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the last states.
+        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the states (8, m) at
+        the last sample.
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)  # without scale and offset
@@ -269,11 +270,12 @@ class Machine(NamedTuple):
         return float(2.0 * math.pi * self.rate * math.sqrt(m.V * m.M_eq / (2.0 * stiffness)) / m.A_A)
 
     def ringing_stiffnesses(self, dp: Array, total: Array, priors: Priors) -> Array:
-        """Find the two stiffnesses of the oil [Pa] that correspond to the strongest ringing of p_A - p_B, shape (2,).
+        """Find the stiffnesses of the oil [Pa] for the two strongest ringing frequencies of p_A - p_B, shape (2,).
 
         The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus that of `total` (n,), i.e. p_A + p_B
-        [Pa], which has the same noise and hum but does not ring. If no frequency of the spectrum lies within the prior
-        of the stiffness, both results are the centre of this prior.
+        [Pa], which has the same noise and hum but does not ring. If there is only one peak, both results are equal.
+        `priors`: priors of the parameters. If no frequency of the spectrum lies within the prior of the stiffness, both
+        results are the centre of this prior.
         """
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies

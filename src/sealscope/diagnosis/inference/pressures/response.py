@@ -105,7 +105,8 @@ class Segment:
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
         """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of mains hum to each row.
 
-        Returns the smoothed rows (m, n), their products with the waves, and the waves' amplitudes, (m, k) each.
+        Returns the smoothed rows (m, n), their products with the waves, and the waves' amplitudes, (m, k) each. The
+        argument `rows` itself may be overwritten.
         """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
@@ -151,10 +152,11 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the derivatives (3, n) of the response by three parameters without simulation.
+        """Compute the derivatives (3, n) of scale * response by three parameters without simulation.
 
-        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B, in units of
-        `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
+        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B. The
+        derivatives are per unit of `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B
+        [Pa].
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # accurate to fourth order, since the ringing is fast
@@ -274,7 +276,8 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
     """Fit the parameters to the samples `segment` from several starts (s, p), and return the best fit.
 
-    A few Gauss-Newton steps from all starts are followed by more from the `n_best` best. `noise`: variance [Pa^2].
+    A few Gauss-Newton steps from all starts are followed by more from the `n_best` best. `noise`: variance of the noise
+    [Pa^2].
     """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
@@ -331,7 +334,10 @@ class Follower:
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
-        """Refine the parameters by filtering the beginning of a recording, then return to its first sample."""
+        """Refine the parameters by filtering the beginning of a recording, then return to its first sample.
+
+        The refined `theta` is kept; covariance and states are those from before, and there is no previous sample.
+        """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
         # blocks that begin before `stop` lie within the recording
@@ -362,7 +368,8 @@ class Follower:
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit.
 
-        At the start or after a gap the stroke is centred, and samples have no weight until the drive has settled.
+        At the start or after a gap the stroke is centred, and samples have no weight until the drive has settled. The
+        attributes `last` and `states` are then changed.
         """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
@@ -438,9 +445,10 @@ class Follower:
 
 
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
-    """Fit the pressure response of a recording that meets its requirements; None if no parameters describe it.
+    """Fit the pressure response of a recording; None if no parameters describe it.
 
-    `rig`: assumed machine, which gives sizes and priors. The result is computed only once for a recording.
+    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and
+    priors. The result is computed only once for a recording.
     """
 
     def compute_fit(recording: Recording) -> Joint | None:

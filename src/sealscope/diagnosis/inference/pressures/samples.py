@@ -25,26 +25,26 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
     """
     blocks = PRESSURE.blocks
     if not rig.circuit.pump_feeds_chambers:
-        return f"a machine that is {rig.circuit.name} needs a position"
+        return f"a {rig.circuit.name} machine needs a position"
     if rig.cylinder.single_rod:
-        return "needs a cylinder of two like areas: on a single rod a position is needed"
+        return "needs a cylinder with two equal areas; a single rod needs a position"
     for name, unit in {"u": "V", "p_A": "Pa", "p_B": "Pa"}.items():
         if name not in recording:
             return f"needs {name}"
         if recording.units[name] != unit:
-            return f"needs {name} in a unit, got counts"
+            return f"needs {name} in {unit}, got counts"
     if recording.duration < MIN_BLOCKS * blocks.shortest:
         return f"needs {MIN_BLOCKS * blocks.shortest:g} s or more, got {recording.duration:.3g} s"
     if recording.rate < blocks.slowest:
-        slow = f"got {recording.rate:.3g} Hz: the ringing after a reversal is not seen"
+        slow = f"got {recording.rate:.3g} Hz, too slow for the ringing after a reversal"
         return f"needs {blocks.slowest:g} Hz or more, {slow}"
     for name in ("u", "p_A", "p_B"):
         if not np.all(np.isfinite(recording[name])) or not np.ptp(recording[name]) > 0.0:
             return f"{name} is constant or has missing samples"
         if not np.max(np.abs(recording[name])) < MAX_READING:
-            return f"{name} is no reading: it exceeds {MAX_READING:g} {recording.units[name]}"
+            return f"{name} is not plausible: it exceeds {MAX_READING:g} {recording.units[name]}"
         if name != "u" and is_mostly_clipped(recording[name]):
-            return f"{name} is mostly cut off at an end of its range"
+            return f"{name} is mostly clipped at an end of its range"
     return None
 
 

@@ -139,8 +139,9 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
-    Their mean relative change is then below `TOLERANCE`, or the median residual is 0. `values`, `ends`, `column_order`,
-    `workspace`: as in `weigh_rows`; weights and residuals of the workspace are replaced.
+    The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0.
+    `values`, `ends`, `column_order`, `workspace`: as in `weigh_rows`. Weights and residuals in the workspace are
+    replaced.
     """
     count, left, block = len(values), len(column_order) - 1, 0  # left: position of the left side in `column_order`
     for r in range(count):

@@ -74,7 +74,10 @@ def _transposed_test_function(rate: float) -> Array:
 
 
 def _variance_inflation() -> float:
-    """Compute the factor by which the overlap of test functions inflates the variance of a sum over their rows."""
+    """Compute the factor by which the overlap of test functions inflates the variance of a sum over their rows.
+
+    The noise of the samples is assumed to be white.
+    """
     phi = test_function(_FINE_RATE).ravel()
     stride, energy = len(phi) // SPAN, float(phi @ phi)
     return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))

@@ -74,10 +74,11 @@ class BalanceLeak:
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause it, too.
-        - "piston leak" if a servo valve drives the cylinder, or if the leakage is measured in holds, i.e. while shut
-          valves separate the pump from the loaded cylinder. Either the balance already assumes that they do so at every
-          rest, or the leakage in the holds must be too high for a healthy machine.
+        - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
+          too.
+        - "piston leak" if a servo valve drives the cylinder, or if holds measure the leakage, i.e. times in which shut
+          valves separate the pump from the loaded cylinder. Then `rise` must be the rise in holds. In addition, the
+          balance must already assume shut valves at every rest, or the rise must be too high for a healthy machine.
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
@@ -97,7 +98,7 @@ class BalanceLeak:
     def step_flow(self) -> Flow:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        It is averaged over the laws, growths and onsets of the leak, and combined with the flow in holds
+        The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow in holds
         (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
@@ -112,7 +113,7 @@ class BalanceLeak:
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Flow) -> Flow:
-        """Add the uncertainty of a leak's law, the fraction `size.law` (`priors.toml`), to a flow's standard error."""
+        """Add the uncertainty of a leak's law, the fraction `size.law` (`priors.toml`) of the flow, to its error."""
         law: float = INFERENCE.size.law
         return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
@@ -165,7 +166,10 @@ class BalanceLeak:
 
     @cached_property
     def rise_flow(self) -> Flow:
-        """Mean flow [m^3/s] of the leakage above healthy recordings since its onset; of all leakage without any."""
+        """Mean flow [m^3/s], since its onset, of the leakage above that of healthy recordings.
+
+        Without healthy recordings it is the mean flow of the total leakage.
+        """
         balance = self.balance
         if self.rise is None:
             value, low, high = (balance.mean_pressure() * conductance for conductance in balance.conductance)
@@ -305,8 +309,9 @@ class BalanceLeak:
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings the bound is on the leakage above theirs (`_hold_bound` if holds measure it), otherwise
-        on a leak that begins within the recording. The uncertain scale of flows and the uncertain law raise the bound.
+        With healthy recordings it is a bound on the leakage above theirs, which also uses the holds (`_hold_bound`) if
+        they measure the leakage. Otherwise it is a bound on a leak that begins within the recording. The uncertain
+        scale of the flows and the uncertain law of the leak raise the bound.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -359,8 +364,9 @@ class BalanceLeak:
         """Leakage above that of healthy recordings, and the evidence for its causes (`LeakRise`).
 
         The causes are a leak that began within the recording, as the step shows, and an older leak. If shut valves hold
-        the load after the step's onset, `step_log_ratio` compares the rise in these holds with the whole step, else the
-        mean rise with the part of the step that the mean contains. None without healthy recordings.
+        the load after the step's onset, `step_log_ratio` compares the rise in these holds with the whole step.
+        Otherwise it compares the mean rise over the recording with the part of the step that this mean contains. None
+        without healthy recordings. Without a step test, all fields but `rise` keep their defaults.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
@@ -387,12 +393,13 @@ class BalanceLeak:
         return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
 
     def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
-        """Test whether a leak older than the recording explains the rise of the leakage above healthy recordings.
+        """Compare the rise of the leakage above healthy recordings with the size of a leak older than the recording.
 
-        The leak's size, estimated from how its flow bends over the pressure, should agree with the rise. The result is
-        the log likelihood ratio of this agreement to no rise, and the flow, None if holds measure it better: the fields
-        `older_log_ratio` and `older_flow` of `LeakRise`. `log_ratios`: those of `older_log_ratios`; `noise`: as in
-        `estimate_bend_flows`; `motion_rise`: the rise from the motion alone.
+        This size is estimated from the curvature of the leak's flow over the pressure. Returns the fields
+        `older_log_ratio` and `older_flow` of `LeakRise`: the log likelihood ratio of a rise of this size to no rise,
+        and the mean flow of the older leak [m^3/s]. The flow is None if holds measure it better. The result is (0,
+        None) if the curvature is unknown. `log_ratios`: those of `older_log_ratios`; `noise`: as in
+        `estimate_bend_flows`; `motion_rise`: the rise in the whole recording.
         """
         balance, total_rise = self.balance, self.rise
         assert total_rise is not None
@@ -521,7 +528,7 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient over healthy recordings.
 
     It is a mixture of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `value`:
-    estimated rise, a negative one counting as 0; `rise`: gives the distribution of the error of this estimate; `unit`:
+    estimated rise, a negative one counting as 0; `rise`: source of the distribution of this estimate's error; `unit`:
     mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient that uncertain
     properties of the oil cause.
     """

@@ -60,7 +60,8 @@ def compensates_leakage(balance: RecordedBalance) -> bool:
     """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
 
     The pump does so if a control loop holds the piston or returns it. The balance then shows at least the leakage of
-    the pump itself: the lower end of its interval must exceed `held.share` (`priors.toml`) of the flow.
+    the pump itself: the lower end of the 95 % interval of the leakage must exceed the fraction `held.share`
+    (`priors.toml`) of the pump's mean flow.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
@@ -114,8 +115,8 @@ class VolumeBalance:
         """Set up the volume balance of a recording; return None if its channels or its length allow no balance.
 
         `odds`: log odds, before this recording, that valves cut a resting pump off from the cylinder; `is_locked`: true
-        if healthy recordings show that they do; `sign_log_odds` (E,): log odds by healthy recordings that the recorded
-        flow has the right sign, for each of E balance equations.
+        if healthy recordings show that they do; `sign_log_odds` (E,): log odds from healthy recordings that the
+        recorded flow has the right sign, for each of E balance equations.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
@@ -145,7 +146,10 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks for a volume balance with a position, once for a recording; None if it allows none."""
+        """Compute the blocks for a volume balance with a position, only once for each recording.
+
+        Return None if the channels or the length of the recording allow no such balance.
+        """
         if not equations(self.rig, frozenset(recording.channels)):
             return None
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
@@ -153,7 +157,7 @@ class VolumeBalance:
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
         """Build the volume balance of a recording from its blocks under one assumption on the valves at rest.
 
-        `regime`: these blocks, with the assumption whether valves are open or shut while the piston rests.
+        `regime`: these blocks, either for open or for shut valves while the pump rests.
         """
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
@@ -209,7 +213,8 @@ class VolumeBalance:
         The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
         (`learn`). Without a leak it scatters about 0, by differences between days and errors of the estimates; a leak
         must exceed this scatter. The later recording is taken to have the Gram matrices of the first healthy one, and
-        the median flow and pressure. `n_repeats`: number of times that each healthy recording counts.
+        the median flow and pressure. `channels`: channels of the recordings; `n_repeats`: number of times that each
+        healthy recording counts, as if it were repeated on later days.
         """
         shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -240,7 +245,10 @@ class VolumeBalance:
         return odds + (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the column roles of each volume balance of the recorded channels, for open or `shut` valves."""
+        """Return the column roles of each volume balance of the recorded channels, for open or `shut` valves.
+
+        If the channels allow no other balance, it is that of a load held by valves (`locked`).
+        """
         balances = equations(self.rig, channels)
         if not balances and (hold_balance := locked(self.rig, channels)) is not None:
             balances = (hold_balance,)
@@ -305,8 +313,8 @@ class VolumeBalance:
         if leak.step is None and leak.rise is None:
             lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
             return Observed(self.name, lack=lack)
-        # a block with missing samples has fewer rows (equations); without a position the number also depends on the
-        # motion, and the whole recording counts as judged
+        # a block with missing samples has fewer rows; without a position the number of rows also depends on the motion,
+        # and the whole recording counts as judged
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks
@@ -327,16 +335,17 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Test whether the piston's motion takes more or less flow for the same speed than in healthy recordings.
+    """Test the ratio of the pump's flow to the piston's speed for a change from the healthy recordings.
 
-    Yields the result of the test, or nothing if there are too few healthy recordings. A change means that the recording
-    is from another machine, or that the scale of a sensor has changed. A load or speed outside of the range of the
-    healthy recordings makes the comparison less certain. `roles`: roles of the columns of the volume balance.
+    Leakage is not part of this flow. Yields the result of the test, or nothing if there are too few healthy recordings.
+    A change means that the recording is from another machine, or that the scale of a sensor has changed. A load or
+    speed outside of the range of the healthy recordings makes the comparison less certain. `roles`: roles of the
+    columns of the volume balance.
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
 
     def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate log(flow per speed of the piston in the recording `sums` / in the healthy ones), with its error."""
+        """Estimate log(ratio of flow to speed in the recording `sums` / ratio in the healthy ones), with its error."""
         return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
 
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
@@ -387,15 +396,16 @@ def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Return the start of a recording [s since 1970], postponed by `n_ages` times the longest life of a machine.
+    """Return the start of a recording [s since 1970], postponed by `n_ages` times a long time (`_MAX_AGE_S`).
 
-    Copies with different `n_ages` count as recordings of different days. Return None for an undated recording.
+    This time is longer than the life of any machine, so that copies with different `n_ages` count as recordings of
+    different days. Return None for an undated recording.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the Gram matrices, flow, pressure and date of a healthy recording from its summary (`learn`).
+    """Restore the sums of a healthy recording, such as Gram matrices and mean flow, from its summary (`learn`).
 
     `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest. These have additional
     columns for the pump's leakage, which are added here if the recording has no rests. `locked`: true to include the

@@ -39,7 +39,8 @@ def estimate_pump_leakage(
 
     `pumped` (n - 1,): volume that the pump delivers between the samples of the recording [m^3]; `holds`: holds of the
     recording, in which shut valves hold the load; `leaks`: leaks measured in the holds. The leak past the piston and
-    the external leak of the loaded side are subtracted. Return None for fewer than two holds or too few samples.
+    the external leak of the loaded side are subtracted. Return None for fewer than two holds or `MIN_SAMPLES` samples,
+    without any flow or pressure, or if the result is not finite.
     """
     rate, t = recording.rate, 0.5 * (recording.t[1:] + recording.t[:-1])
     difference = recording["p_A"] - recording["p_B"]

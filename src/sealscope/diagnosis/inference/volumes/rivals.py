@@ -48,9 +48,9 @@ def rival_rises(
     each rival that can be compared. If external leaks can be measured while shut valves hold the load (`held_rivals`),
     they are compared only there.
 
-    `volume_ratio`: ratio of the piston's area to the pump's displacement as measured, over that assumed; prior volumes
-    of air are multiplied by it. `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by
-    the name of its term. A leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged
+    `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which prior volumes
+    of air are multiplied. `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the
+    name of its term. A leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged
     recording.
     """
     names = columns[0].names
@@ -77,7 +77,7 @@ def rival_rises(
             )
             continue
         change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
-        # change of each healthy recording relative to the other healthy ones
+        # change of each healthy recording from the other healthy ones
         changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
         is_known = [np.isfinite(healthy_error) for _, healthy_error in changes]
         changes = list(compress(changes, is_known))  # in the others no pressure drives the flow of this term
@@ -134,10 +134,10 @@ def _without_oil(coefficients: Array, thinning: Array) -> Array:
 def held_rivals(
     judged: RecordingSums, healthy: Sequence[RecordingSums], unit_flows: Mapping[str, float] | None = None
 ) -> tuple[Observable, ...] | None:
-    """Test whether chamber A or B leaks to the outside more than in healthy recordings, while valves hold the load.
+    """Test chambers A and B for larger external leaks than in healthy recordings, while shut valves hold the load.
 
-    Return one test for each chamber that can be compared, or None if no load is held in the judged recording or in
-    fewer than `MIN_WITH_HOLDS` healthy recordings. `unit_flows`: as in `rival_rises`.
+    Return one test for each chamber that can be compared. Return None if the judged recording has no such holds, or if
+    fewer than `MIN_WITH_HOLDS` healthy recordings have them. `unit_flows`: as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
@@ -167,12 +167,12 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 
 
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
-    """Estimate by how much a coefficient of a recording differs from healthy recordings, with the standard error.
+    """Estimate the change of a coefficient of a recording from healthy recordings, with its standard error.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
-    equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The differences of the
-    other coefficients have normal priors and are eliminated. Except for the leak, columns without a finite prior
-    deviation are left out. Without information the change is 0 and the error infinite.
+    equations; `columns`: roles of their columns; `tested`: column of the coefficient, which counts as 0 in the healthy
+    recordings. The differences of the other coefficients have normal priors and are eliminated. Except for the leak,
+    columns without a finite prior deviation are left out. Without information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):

@@ -25,7 +25,10 @@ K = TypeVar("K")
 
 @dataclass(frozen=True)
 class Formula(Generic[K]):
-    """A linear formula: `constant` plus the sum of columns, by name or number, times `factors`, in `unit` if known."""
+    """A linear formula: `constant` plus the sum of columns times their `factors`.
+
+    A column is called by its name or number. `unit`: unit of the result, None if unknown.
+    """
 
     factors: Mapping[K, float]
     constant: float = 0.0
@@ -33,7 +36,7 @@ class Formula(Generic[K]):
 
     @property
     def column(self) -> K | None:
-        """The only column, if the formula has no factor other than 1 and no constant; None for other formulas."""
+        """The only column of a formula that has the factor 1 and no constant; None for other formulas."""
         return next(iter(self.factors)) if self.constant == 0.0 and [*self.factors.values()] == [1.0] else None
 
     def plus(self, other: Formula[K], times: float = 1.0) -> Formula[K]:
@@ -58,7 +61,7 @@ def parse_formula(text: str) -> Formula[str]:
     The formula is the longest possible beginning of the text. Raises InputError if there is none that is linear.
     """
     if len(text) > _MAX_LENGTH:
-        raise InputError(f"{_RULE}, got {len(text)} signs")
+        raise InputError(f"{_RULE}, got {len(text)} characters")
     for end in sorted({match.start() for match in _END.finditer(text)}, reverse=True):  # the longest formula first
         names: list[str] = []
 

@@ -26,7 +26,7 @@ class Label:
 
     @classmethod
     def parse(cls, text: str, unit: str | None = None) -> Label:
-        """Parse a heading such as `p_A [psi]`, `p_A / psi` or `p_A in psi`; a given `unit` overrides that in it."""
+        """Parse a heading such as `p_A [psi]`, `p_A / psi` or `p_A in psi`; `unit` overrides that in the heading."""
         whole = text.strip().translate(_WIDE_BRACKETS)
         name, bracket_text = split_square_brackets(whole)
         if bracket_text is not None:

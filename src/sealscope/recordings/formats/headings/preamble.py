@@ -92,7 +92,10 @@ def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
 
 
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
-    """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`."""
+    """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`.
+
+    `delimiter`: separator of the log's cells, which may also separate the name of a remark from its text.
+    """
     pairs: list[tuple[str, str]] = []
     for line in lines[: 4 * _MAX_REMARKS]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]
@@ -108,12 +111,15 @@ def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 
 
 def _clean_text(text: str, max_length: int) -> str:
-    """Make a text printable, on a single line and at most `max_length` characters long."""
+    """Make a text printable, on one line, at most `max_length` characters long and without outer quotation marks."""
     return " ".join(printable(text[: 4 * max_length], instead=" ").split()).strip("\"'")[:max_length]
 
 
 def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
-    """Find the oil temperature [deg C] in the remarks of a recording's provenance; None if it is not stated."""
+    """Find the oil temperature [deg C] in the remarks of a recording's provenance; None if it is not stated.
+
+    Values outside -60 to 200 deg C are ignored.
+    """
     for name, text in clean_remarks(provenance).items():
         if not _OIL.search(name):
             continue

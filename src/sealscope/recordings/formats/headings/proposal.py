@@ -54,8 +54,9 @@ class _Guess(NamedTuple):
 def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
 
-    Columns with a channel's name and equally likely columns are left out. A unit at the end of a name (``PA_bar``)
-    becomes the unit of the column. The map is empty if it would contain only the time.
+    Left out are columns that already have a channel's name, and channels for which several columns are equally likely.
+    A unit at the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would contain only
+    the time.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head_side = _find_head_side(labels)  # the chamber that the word "head" means in these names
@@ -137,7 +138,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
     if last_word and len(last_word[0]) > 2:
         endings.append((name[: last_word.start()], last_word[0]))
     for stem, unit in endings:
-        if not stem or not unit or unit in ("A", "B", "a", "b"):  # a chamber, no unit
+        if not stem or not unit or unit in ("A", "B", "a", "b"):  # a chamber, not a unit
             continue
         quantity = _AMBIGUOUS_UNITS.get(unit)
         if quantity is not None and not _split_words(stem) & _MEASURED[quantity]:
@@ -194,8 +195,9 @@ def _strip_accents(text: str) -> str:
 def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case, and parts of words.
 
-    Parts are both words of a German compound with a known ending, such as `kolbenseite` and `druck`, without an n or s
-    that links them; both letters of `pa` and `pb`; and known words of languages without spaces, such as Chinese.
+    Parts are both words of a German compound with a known ending, such as `kolbenseite` and `druck`, the first one also
+    without an n or s that links them; both letters of `pa` and `pb`; and known words of languages without spaces, such
+    as Chinese.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
@@ -265,9 +267,10 @@ def is_current_or_fraction(unit: str) -> bool:
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess whether a column is the pressure upstream (`kind` "before") or downstream ("behind") of a valve.
+    """Guess from the name if a column is the pressure upstream or downstream of a valve.
 
-    Return None if it is not, or if its name says that it is a set point.
+    `kind`: "before" for upstream, "behind" for downstream. Returns None if the name has no such word, the unit is not
+    one of pressure, or the name means a set point.
     """
     name, unit = _find_name_and_unit(label)
     words = _split_words(name)

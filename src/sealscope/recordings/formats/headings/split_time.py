@@ -51,8 +51,9 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
     """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
-    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only its dates are
-    used. `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the start.
+    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only the dates in `base`
+    are used. `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the
+    start.
     """
     subsecond_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = subsecond_parts[-1] if subsecond_parts else "second"

@@ -32,7 +32,7 @@ def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
 
 
 def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series of samples in a value of any type.
+    """Yield the series of samples in a value of any type; nothing for one that contains none, or is nested too deeply.
 
     `name`: name of the value; `group`: names of the structs around it, with slashes between; `clock`: times of series
     that state none, None if unknown; `depth`: number of structs around the value.
@@ -136,7 +136,7 @@ def _is_vector(value: Any) -> bool:
 
 
 def _first_text(by_name: Mapping[str, Any], names: tuple[str, ...]) -> str | None:
-    """Return the text of the first existing field of several `names`; "" if it is no text, None if no field exists."""
+    """Return the text of the first existing field of several `names`; "" if it is not a text, None if none exists."""
     return next((_single_text(by_name[name]) for name in names if name in by_name), None)
 
 
@@ -164,7 +164,11 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct with samples from its fields `time` or `timeinfo`; None if it has neither."""
+    """Read the times (n,) [s] of a struct with samples from its field `time` or `timeinfo`; None if it has neither.
+
+    `timeinfo` states start, step and number of samples. A struct has samples if it has a field `signals` or `data`; for
+    others, the result is None.
+    """
     if "signals" not in by_name and "data" not in by_name:
         return None
     time = by_name.get("time")

@@ -142,7 +142,10 @@ def make_drift_experiment(
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command by both solvers, with throttles closed by `closed_pct` [%], None for no throttles."""
+    """Simulate a command by both solvers, with throttles closed by `closed_pct` [%], None for no throttles.
+
+    `reading`: interpretation of the thesis's equations, which sets the rig's parameters.
+    """
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 

@@ -121,7 +121,10 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
     def largest_change(*, with_throttles: bool) -> str:
-        """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles."""
+        """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles.
+
+        The text is "diverged" if there is no such change.
+        """
         # `closed` is None in a case without throttles
         matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
         changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
@@ -181,7 +184,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
 
 
 def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Format how many tests passed, such as "7 of 16 tests pass".
+    """Format the number of tests that passed, such as "7 of 16 tests pass".
 
     `tests`: results by interpretation of the throttles' equations. If only some tests passed, the text also names the
     interpretations under which all of them do.
@@ -306,7 +309,10 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
         return _changes([rows[0], rows[-1]], "range")
 
     def judge_increase(number: int, runs: RowsByReading, head: str, values: Callable[[Rows], Iterable[float]]) -> Claim:
-        """Judge claim 4.`number`: the numbers [Pa] that `values` computes from the runs' summaries are visible."""
+        """Judge claim 4.`number`, that numbers [Pa] computed from runs exceed the limit of a visible change.
+
+        `values`: computes the numbers from the summaries of the runs; `head`: text before the numbers.
+        """
         return _judge_runs(
             number, runs, lambda rows: (value > min_visible for value in values(rows)), _range_text(head, values)
         )
@@ -354,11 +360,11 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         return f"{head} {', '.join(texts)}"
 
     def differs(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing whether the drift [m] differs from that without orifices by over `min_change`."""
+        """Yield for each closing True if the drift [m] differs from that without orifices by over `min_change`."""
         return (abs(with_orifices - drift_without) > min_change for with_orifices in row)
 
     def grows(row: list[float]) -> Iterator[bool]:
-        """Yield for each closing but the first whether the drift [m] is larger than before by over `min_change`."""
+        """Yield for each closing but the first True if the drift [m] is larger than before by over `min_change`."""
         return (abs(later) - abs(earlier) > min_change for earlier, later in itertools.pairwise(row))
 
     head = f"drift over 60 s without orifices {drift_without * 1e3:.3f} mm, in addition at"

@@ -232,7 +232,10 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw how the pressures depend on the line volumes V_1 = V_2, which the thesis does not give."""
+    """Draw the ranges of p_1 and p_A and the mean of p_1 - p_A over the line volumes V_1 = V_2, for both solvers.
+
+    The thesis does not give these volumes.
+    """
     command, closed = "3 sin(4t)", 25.0  # closed [%]
     volumes = _QUICK_VOLUMES if context.quick else _VOLUMES
     sweep = {volume: run_both_solvers(context, command, closed, Reading(V_line_cm3=volume)) for volume in volumes}
@@ -251,6 +254,9 @@ def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def measured_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the figures of chapter 4 that show measured curves without numbers, and the simulated figure instead."""
+    """Tabulate the figures of chapter 4 that show only measured curves, for which the thesis gives no numbers.
+
+    Each row also names the simulated figure that replaces the measured one. `context` is not used.
+    """
     rows = ((*row, "cannot be reproduced: no numbers are given") for row in load_texts("cases.toml")["measured"])
     return (item.table(rows, format_note("measured-only")),)

@@ -26,7 +26,10 @@ class LeakLaw(NamedTuple):
     onset: float = 0.0
 
     def growth_factor(self, t: Array, end: float) -> Array:
-        """Compute the coefficient at times `t` (n,) [s], up to `end`, relative to its value at the onset."""
+        """Compute the coefficient at times `t` (n,) [s] relative to its value at the onset.
+
+        `end`: end of the recording [s]. The factor is 1 before the onset and grows linearly to 1 + `growth`.
+        """
         return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
 
 
@@ -34,7 +37,7 @@ class LeakLaw(NamedTuple):
 LAMINAR = LeakLaw()
 
 
-#: Sides, A and B, whose displaced oil check valves replace.
+#: Flags of the sides A and B whose displaced oil check valves replace: none, and both.
 NEITHER, BOTH = (False, False), (True, True)
 
 

@@ -125,6 +125,7 @@ def build_regression(
     The columns are volumes [m^3] that the compression of the oil (`strained`) and of its free air (`aired`, by Boyle's
     law) takes up with the usual properties: in the stroke, in the dead volume of A, and in that of B. Pressures are
     absolute.
+
     `flags` (2, n), for each hold of n samples: true in samples in which no check valve refills A (row 0) or B (row 1),
     so that the displacement of that side counts; `n_readings`: effective number of independent readings.
     """
