@@ -72,6 +72,24 @@ def test_rows_that_a_logger_lost_come_back_at_their_times() -> None:
     assert error(recording, whole, "p_A") < 2 * NOISE
 
 
+def test_a_channel_that_begins_late_is_not_filled_before() -> None:
+    whole = machine()
+    at = np.arange(len(whole))
+    gap = (at >= 5000) & (at < 5003)
+    late = holed(holed(whole, gap), (at < 5002), "theta")
+    recording = bridge(late, NEEDED)
+    assert np.isnan(recording["theta"][:5003]).all()
+    assert np.isfinite(recording["p_A"][5000:5003]).all()
+
+
+def test_the_one_row_with_a_time_is_the_one_that_stays() -> None:
+    times = np.full(5, np.nan)
+    times[3] = 7.0
+    recording = Recording(times, {"p_A": np.arange(5.0)}, CHANNEL_UNITS, RATE)
+    evened = resample_evenly(recording)
+    assert evened.t.tolist() == [7.0] and evened["p_A"].tolist() == [3.0]
+
+
 def test_without_a_cycle_a_line_joins_both_ends() -> None:
     whole = machine()
     walk = np.cumsum(np.random.default_rng(3).standard_normal((3, len(whole))), axis=1)

@@ -201,9 +201,13 @@ class GapPriors(PriorTable):
 
     - `motion` [s]: longest gap that is interpolated by a line in positions, angles, speeds and flows.
     - `hole` [s]: length above which a filled gap has less weight in the diagnosis.
+    - `live_zero`: how far below zero a sensor of 4 to 20 mA reads without a supply, over its range.
+    - `dead`: by how much such a reading varies, over its distance from all other readings.
     """
 
     motion: float
+    live_zero: float
+    dead: float
     hole: float
 
 

@@ -9,6 +9,7 @@ from functools import cache, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
@@ -37,6 +38,7 @@ from sealscope.diagnosis.inference.terms import (
     RestLimits,
     Signals,
     equations,
+    find_rests,
     shut_at_rest,
     with_rests,
 )
@@ -123,7 +125,10 @@ class BlockStream:
         self.restart(start)
 
     def restart(self, begin: float) -> None:
-        """Restart the stream after a gap, at the time `begin` [s] of the next sample, without an incomplete block."""
+        """Restart the stream after a gap, at the time `begin` [s] of the next sample, and drop an incomplete block.
+
+        Pressure offsets, signs and weights that earlier samples determined are kept.
+        """
         self._begin = begin
         self._pieces: list[Mapping[str, Array]] = []  # joined only when they complete a block
         self._first = 0  # index of the first stored sample, counted from `begin`
@@ -133,14 +138,16 @@ class BlockStream:
     def push(self, samples: Mapping[str, Array], last: bool = False) -> Blocks | None:
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
-        `samples`: arrays by channel name, NaN where missing; `last`: true if no samples follow. Complete blocks then do
-        not wait for the samples after them, or for the first `n_first` blocks, which are returned together.
+        `samples`: arrays by channel name, NaN where missing, or empty to add none; `last`: true if no samples follow.
+        The first `n_first` blocks are returned together, once all of them are complete. A block is complete when it is
+        followed by the samples on which its rows, speeds and rests depend. With `last` true, only the rows count, and
+        fewer than `n_first` blocks suffice.
         """
         if samples:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
         length = self._strides_per_block * self._stride
-        # number of samples needed after a block: its last rows extend over them, its speeds and rests depend on them
+        # number of samples needed after a block: those of its last rows, and a margin for its speeds and rests
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
         n_complete = max(0, (self._end - tail) // length)
         is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
@@ -171,8 +178,8 @@ class BlockStream:
     def state(self) -> dict[str, Any]:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
-        It has the samples that later blocks need, the values that the first samples determined (offsets of the
-        pressures, signs of the flows), and sums over all blocks.
+        The state consists of the samples that later blocks need, the values that the first samples determined (absolute
+        minus gauge pressures, signs of the flows), and weighted sums over all blocks.
         """
         return {
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -202,14 +209,14 @@ class BlockStream:
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
 
-        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form. The log
-        odds are the sum over three symptoms of correct wiring, each with a z score (`_sign_log_odds`):
+        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form. Three
+        symptoms of correct wiring are tested, and their log odds (`_sign_log_odds`) are added:
 
         - Oil leaks from high to low pressure.
         - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy.
-          The mean, weighted by abs(flow), is subtracted, since a constant load also correlates with a motion in one
-          direction. The log odds are averaged with those of p_A - p_B, which a load disturbs less than the force, but
-          throttling on the rod side more.
+          The mean force, weighted by abs(flow), is subtracted first, since a constant load also correlates with a
+          motion in one direction. The same test is made with p_A - p_B instead of the force, and the two log odds are
+          averaged: a load disturbs p_A - p_B less than the force, throttling on the rod side disturbs it more.
         - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
         """
         odds_by_balance = []
@@ -231,9 +238,10 @@ class BlockStream:
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
-        One robust fit to all rows of these blocks determines their weights. The first call also estimates, for all
-        blocks of the stream, the signs of the left sides, absolute minus gauge pressure, and the speeds of rests.
-        `on_samples` is called with the samples of each block.
+        The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
+        weights. The first call also determines, for all blocks of the stream, the signs of the left sides, absolute
+        minus gauge pressures, and the speeds below which the machine rests. `on_samples` is called with the samples of
+        each block.
         """
         length = self._strides_per_block * self._stride  # samples in a block
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
@@ -252,7 +260,7 @@ class BlockStream:
         row_parts, *block_parts = zip(*batches, strict=True)
         weights, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         is_counted = weights > 0.0  # rows without missing samples
-        root_weights = np.sqrt(weights[is_counted])[:, None]  # a product of two entries of a row has its weight
+        root_weights = np.sqrt(weights[is_counted])[:, None]  # roots, since sums are over products of two entries
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
         if not self.left_signs:
             self.sign_log_odds = self._flow_sign_log_odds(rows)
@@ -277,9 +285,9 @@ class BlockStream:
     def _compute_rows(
         self, samples: Mapping[str, Array], first: int, end: int
     ) -> tuple[list[Array], Array, Array, Array]:
-        """Compute the rows of each volume balance in the K blocks `first` to `end` - 1 from `samples`, by channel name.
+        """Compute the rows of each volume balance in the K blocks with the indices `first` to `end` - 1.
 
-        Returns four items:
+        `samples`: arrays by channel name. Returns four items:
 
         - for each balance an array (r, m) of its terms and left side, with one row for each test function;
         - weights (r,) of the rows: 1, a fraction next to a hole (a long gap), and 0 with a missing sample;
@@ -306,7 +314,7 @@ class BlockStream:
             is_whole &= weak_rows.whole
             rows.append(weak_rows.values)
         in_blocks = slice(start - begin, start - begin + (end - first) * length)  # ends with the last block
-        # a clipped pressure is closer to the true one than the mean of the other samples is
+        # clipped pressures are used as recorded: they are closer to the true ones than the mean of the other samples
         difference = piece[CLIPPED_DIFFERENCE] if CLIPPED_DIFFERENCE in piece else piece["p_A"] - piece["p_B"]
         pressure = difference[in_blocks].reshape(-1, length)
         flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate  # volume per interval times rate [m^3/s]
@@ -322,7 +330,7 @@ class BlockStream:
 def _z_score(products: Array) -> float:
     """Compute the z score of the sum of `products` (r,): sum(products) / sqrt(OVERLAP sum(products^2)).
 
-    Each is the product of the flow and another quantity in one row of the regression, which have equal signs if the
+    A product is that of the flow and another quantity in one row of the regression. The two have equal signs if the
     sensors are wired correctly. Overlapping rows increase the variance of the sum by the factor `OVERLAP`.
     """
     standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
@@ -330,10 +338,11 @@ def _z_score(products: Array) -> float:
 
 
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
-    """Compute p_A - `area_ratio` p_B in each row (r,) of a regression, i.e. the pressures' force over the area of A.
+    """Compute p_A - `area_ratio` p_B in each row of a regression, i.e. the pressures' force over the area of A.
 
-    `area_ratio`: area of the piston on side B over that on side A. The columns of the external leaks hold p_A and -p_B.
-    A balance that lacks one of them gives its leak's column, p_A - p_B.
+    `rows` (r, m): rows of a volume balance; `columns`: roles of their columns; `area_ratio`: area of the piston on side
+    B over that on side A. p_A and -p_B are the columns of the two external leaks. If the balance lacks one of them, or
+    if `area_ratio` is 1, the result is the column of the leak, p_A - p_B. The result has the shape (r,).
     """
     names = [f"external leak {side}" for side in "AB"]
     if area_ratio == 1.0 or not set(names) <= set(columns.names):
@@ -358,7 +367,8 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares: positive for oil from high to low pressure.
 
-    It is 0 if the `n_rows` rows of the regression, with the Gram matrix `gram` (m, m), do not determine it.
+    It is the coefficient over its standard error. `gram` (m, m): Gram matrix of the `n_rows` rows of the regression;
+    `roles`: roles of its columns. The result is 0 if the rows do not determine the coefficient.
     """
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak_and_left = [roles.leak, roles.left]
@@ -377,9 +387,10 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
     """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
 
-    It is the larger of a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard deviations
-    of the noise of a speed v that is averaged over `AVERAGING_TIME`. For a pump v is its flow. `increments` (n,):
-    increments of the position [m] or of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
+    With the speed v of a piston, or the flow v of a pump, it is the larger of two values: a `fraction` of the mean
+    speed in motion, sum(v^2) / sum(abs(v)), and three standard deviations of the noise of a mean of v over
+    `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples;
+    `rate`: sampling rate [Hz].
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
@@ -389,14 +400,33 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     differences = np.abs(np.diff(velocity[::2], 6))
     # standard deviation; 1.4826: that of normal values over the median of their magnitudes
     noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
-    # 2: increments may be means of neighbouring samples, which share samples; this doubles the variance of their sum
+    # 2: neighbouring increments may be means that share a sample, which doubles the variance of their sum
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
+
+
+def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.bool_]:
+    """Flag the sampling intervals (n,) in which the piston moves for a time although the pump rests.
+
+    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside: the volume
+    that the piston displaces is none of the pump's. A load that sinks by a leak is slower; the piston must move by
+    more than the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion. `pump_volume`, `x_step` (n,):
+    increments of the pump's volume [m^3] and of the position [m], of which the former may be NaN; `rate`: sampling rate
+    [Hz].
+    """
+    rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
+    is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
+    is_lowering, margin = np.zeros(len(rests), dtype=bool), math.ceil(AVERAGING_TIME * rate)
+    for first, length in find_runs(is_moved).tolist():
+        if length >= MIN_REST * rate:
+            is_lowering[max(first - margin, 0) : first + length + margin] = True
+    return is_lowering
 
 
 def _absolute_offset(pressure: Array) -> float:
     """Compute absolute minus gauge pressure [Pa] for a sensor with the readings `pressure` (n,) [Pa].
 
-    It is the atmospheric pressure, or more if the absolute pressure would otherwise fall below `MIN_ABSOLUTE_PRESSURE`.
+    The difference is the atmospheric pressure, or more if the lowest reading would otherwise give an absolute pressure
+    below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -404,7 +434,10 @@ def _absolute_offset(pressure: Array) -> float:
 
 
 def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples (n,) of the channels `names`, NaN in long gaps (`flag_holes`) and in clipped pressures."""
+    """Return the samples (n,) of the channels `names`, NaN in long gaps (`flag_holes`) and in clipped pressures.
+
+    As in `bridged_samples`, there is an entry `CLIPPED_DIFFERENCE` if pressures are clipped.
+    """
     samples = bridged_samples(recording, names)
     is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
     return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
@@ -413,9 +446,10 @@ def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
     """Return the samples (n,) of the channels `names`, with NaN where a pressure is clipped.
 
-    Holes, i.e. long gaps of missing samples, keep the values with which the recording fills them in. If there are
-    holes, the additional entry `HOLE` is 1 there and 0 elsewhere. If pressures are clipped, the additional entry
-    `CLIPPED_DIFFERENCE` is p_A - p_B of the values as recorded.
+    Names that the recording lacks are left out. Holes, i.e. long gaps of missing samples, keep the values with which
+    the recording fills them in. If there are holes, the additional entry `HOLE` is 1 there and 0 elsewhere. If a
+    pressure is clipped, and `names` contains p_A and p_B, the additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as
+    recorded.
     """
     samples, is_clipped = {}, False
     is_hole = flag_holes(recording)
@@ -437,10 +471,11 @@ def derive_drive_signals(
 ) -> dict[str, Array]:
     """Add signals from a model of the drive to the samples of a recording, each an array (n,) by channel name.
 
-    `rate`: sampling rate [Hz]. The entry `START` is exp(-t/lag) at the time t since the first sample: the effect of the
-    drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow, its
-    speed "omega" [rad/s] is added: the drive's response to u, NaN where u is missing. If `loaded` is true, the drive
-    responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as leakage.
+    `rate`: sampling rate [Hz]. The added entry `START` is exp(-t/lag) at the time t since the first sample: the effect
+    of the drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow,
+    the speed of the pump is added as "omega" [rad/s]. It is the drive's response to u, NaN where u is missing. If
+    `loaded` is true, the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load
+    counts as leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -449,7 +484,7 @@ def derive_drive_signals(
         load = np.zeros(len(u))
         if loaded:
             dp = _hold_missing(samples["p_A"] - samples["p_B"])
-            # the order of the pump's ports is unknown: the load has the sign of p_A - p_B that correlates with u
+            # the order of the pump's ports is unknown: the load is dp or -dp, whichever correlates positively with u
             load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
         speed = drive.flow(u, load, rate) / drive.displacement
         derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
@@ -465,8 +500,8 @@ def _hold_missing(values: Array) -> Array:
 def min_samples_for_step(rate: float) -> int:
     """Compute the minimum number of samples, at a `rate` [Hz], to test for a leak that begins within a recording.
 
-    These are `MIN_BLOCKS` blocks of minimum length, and the samples by which the test functions that begin in the last
-    block reach beyond it. A test function begins at each multiple of the stride, and is `SPAN` strides long.
+    A test needs `MIN_BLOCKS` blocks of minimum length, and the samples beyond the last block over which its test
+    functions extend. A test function begins at each multiple of the stride, and is `SPAN` strides long.
     """
     stride = stride_samples(rate)
     block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
@@ -511,10 +546,10 @@ class RecordedBlocks(NamedTuple):
     sign_log_odds: tuple[float, ...]
 
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
-        """Reverse the flows whose sign this recording alone gets wrong, by the evidence of other recordings.
+        """Reverse the flows whose more probable sign changes when the evidence of other recordings is added.
 
         `log_odds` (E,): for each of the E balances, log odds from other recordings that its recorded flow has the right
-        sign. They are added to those of this recording.
+        sign. They are added to those of this recording; the field `sign_log_odds` stays unchanged.
         """
         is_right = np.array(self.sign_log_odds) >= 0.0
         is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()
@@ -524,12 +559,19 @@ class RecordedBlocks(NamedTuple):
         return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for shut valves if these are possible and their log `odds` positive, else for open ones."""
+        """Return the blocks for shut valves if there are any and `odds`, the log odds of shut valves, is positive.
+
+        Otherwise return those for open valves.
+        """
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
 def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
-    """Compute the blocks of a recording for a volume balance; None if its channels allow none, or it is too short."""
+    """Compute the blocks of a recording for the volume balances of the machine, for open and for shut valves.
+
+    Shut valves are considered only if a channel gives the pump's flow and the machine rests at times. Return None if
+    the channels of the recording allow no balance, or if the recording is too short.
+    """
     names = frozenset(name for name in recording.channels if name in READ)
     balances = equations(rig, names)
     if not balances:
@@ -542,6 +584,8 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     samples = bridged_samples(recording, channels)
     if balances[0].by_command:
         samples = derive_drive_signals(samples, rig, recording.rate)
+    if may_shut:
+        samples = _without_lowering(samples, recording.rate, balances[0])
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
 
@@ -580,6 +624,20 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
 
 
+def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equation) -> dict[str, Array]:
+    """Set the channel of the pump's flow to NaN while a valve lowers the load past the pump (`flag_lowering`).
+
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    """
+    signals = Signals(samples, rate)
+    is_lowering = flag_lowering(balance.left(signals), signals.step("x"), rate)
+    drive = flow_source(samples)
+    if drive is None or not is_lowering.any():
+        return dict(samples)
+    is_touched = np.append(is_lowering, False) | np.append(False, is_lowering)  # samples on either side of an interval
+    return {**samples, drive: np.where(is_touched, np.nan, samples[drive])}
+
+
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
     """Find the longest time [s] for which the piston rests while the pump turns to hold a load; 0 if it never does.
 
@@ -593,10 +651,10 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    If a flow meter is recorded, rest is judged by the flow alone, and the limit of the piston's speed is minus
-    infinity: if little oil enters the cylinder, the valves are closed, and a piston that moves creeps by a leak.
-    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
-    pump or of the meter.
+    If a flow meter is recorded, its flow alone decides. The limit of the piston's speed is then minus infinity, so that
+    the piston never counts as resting: while little oil enters the cylinder, the valves are closed, and a piston that
+    still moves creeps by a leak. `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose
+    left side is the flow of the pump or of the meter.
     """
     signals = Signals(samples, rate)
     if flow_source(samples) == "q_pump":
@@ -608,9 +666,10 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `compute_blocks(offset)` subtracts an offset [Pa] from p_A - p_B. The offset is estimated from the recorded blocks
-    and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations of its prior, the blocks
-    are instead computed again after subtracting it, and the remaining offset is removed.
+    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
+    estimated from the blocks as recorded and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET`
+    standard deviations of its prior, the blocks are instead computed again after subtracting it, and the remaining
+    offset is removed. Neighbouring blocks of a long recording are merged (`Blocks.merge`).
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded

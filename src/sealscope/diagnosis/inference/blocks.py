@@ -35,7 +35,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, TURNING, Equation
+from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -97,7 +97,7 @@ class Blocks:
         upper, lower = np.triu_indices(size)
         lengths = {len(getattr(self, name)) for name in self.__dataclass_fields__}
         if self.gram.shape[2:] != upper.shape or lengths != {len(self.start)}:
-            raise InputError(f"saved state's gram must have {len(upper)} sums a block, got {self.gram.shape}")
+            raise InputError(f"saved state's gram must have {len(upper)} sums in each block, got {self.gram.shape}")
         gram = np.zeros((*self.gram.shape[:2], size, size))
         gram[..., upper, lower] = gram[..., lower, upper] = self.gram
         return replace(self, gram=gram)
@@ -122,10 +122,10 @@ class Blocks:
 
     @property
     def pressure_weights(self) -> Array:
-        """Weights (K,) for averaging a function of p_A - p_B over the blocks: 1, or nearly 0 for a block without it.
+        """Weights (K,) for averaging a function of p_A - p_B over the blocks.
 
-        The numbers of rows would be wrong weights: a row with a clipped pressure is dropped, though the pressure is
-        roughly known.
+        The weight is 1, or nearly 0 for a block without samples of the pressure (`pressures` are then 0). The numbers
+        of rows would be wrong weights: a row with a clipped pressure is dropped, though the pressure is roughly known.
         """
         return np.where((self.pressures != 0.0).any(axis=1), 1.0, 1e-9)  # positive, so that a mean exists
 
@@ -162,18 +162,22 @@ class Blocks:
         return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block (K,), for the flow of an orifice."""
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,).
+
+        The flow through an orifice is proportional to it.
+        """
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square (rms) of the pressure that drives the flow of a leak or another `term` [Pa].
 
-        It is p_B, for example, for a leak out of side B. `names`: names of the columns of `gram`. The result is
+        This pressure is p_B, for example, for a leak out of side B. `term`: name of the term; `names`: names of the
+        columns of `gram`. The result is
 
             rms(p_A - p_B) s_term / s_leak,
 
-        where s_term^2 and s_leak^2 are the sums of squares of two columns, the term's and the one of p_A - p_B, over
-        the equations that contain the term.
+        where s_term^2 and s_leak^2 are sums of squares of two columns: that of the term, and that of the leak, whose
+        increments are (p_A - p_B) dt. The sums are over the equations that contain the term.
         """
         squares = np.einsum("keii->ei", self.gram)  # (E, m): sum of squares of each column in each equation
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)  # equations that contain the term
@@ -203,7 +207,7 @@ class ColumnRoles:
 
     - `drift_rate`: drift, relative to the coefficient [1/min];
     - `between_deviation`: relative difference between recordings, infinite without a prior, 0 if it repeats;
-    - `level_deviation`: constant part, in the coefficient's unit, infinite without a prior.
+    - `level_deviation`: constant part, in the coefficient's unit, infinite without a prior (`level_deviations`).
 
     `names` and `drivers` (m - 1,): names and drivers of the terms (`Term`); `healthy_conductance` [m^3/(s Pa)]:
     standard deviation of a healthy machine's leak.
@@ -241,14 +245,35 @@ class ColumnRoles:
         self.drivers = tuple(term.driver for term in equation.terms)
         self.healthy_conductance = equation.healthy
 
+    def level_deviations(self, total: Array) -> Array:
+        """Compute the prior standard deviations (m - 1,) of the constant parts of all coefficients.
+
+        Those of a pump's flow offset and of the delay of the position depend on the recording: a pump that always moves
+        the piston at one speed and pressure determines neither beside the piston's area. The offset is `level.bias`
+        (`priors.toml`) times the rms flow, and the delay is at most some `level.lag`. `total` (m, m): Gram matrix of
+        the recording.
+        """
+        deviations, energies = self.level_deviation.copy(), np.diag(total)
+        piston = [k for k in self.motion if self.names[k].startswith("motion")]
+        if not piston:
+            return deviations
+        if self.bias is not None and not np.isfinite(deviations[self.bias]) and energies[self.bias] > 0.0:
+            deviations[self.bias] = INFERENCE.level.bias * np.sqrt(energies[self.left] / energies[self.bias])
+        moved = float(energies[piston].sum())
+        if LAG in self.names and moved > 0.0:
+            deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / moved)
+        return deviations
+
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
         """Compute the prior precisions (c,) of the differences of c coefficients from those of other recordings.
 
-        `indices` (c,): their columns; `coefficients` (c,): their values in the other recordings; `leak_coefficient`:
-        the leak's value there [m^3/(s Pa)]. The prior deviations are relative to the coefficients: `between_deviation`,
-        for the leak `between.pump` of `priors.toml`. A flow offset that repeats in all recordings (deviation 0) is an
-        exception: it differs by the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor
-        offset of p_A - p_B. Precisions may be infinite.
+        `indices` (c,): columns of the coefficients; `coefficients` (c,): their values in the other recordings;
+        `leak_coefficient`: the leak's value in the other recordings [m^3/(s Pa)].
+
+        The prior deviation is the magnitude of the coefficient times `between_deviation`, or for the leak times
+        `between.pump` (`priors.toml`). A flow offset that repeats in all recordings (`between_deviation` 0) is an
+        exception. Its deviation is the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor
+        offset of p_A - p_B. The precision is infinite if the deviation is 0.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
@@ -266,7 +291,10 @@ class ColumnRoles:
         return roles
 
     def replace_leak(self, name: str) -> ColumnRoles:
-        """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term."""
+        """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term.
+
+        The prior deviation of the old leak between recordings becomes `between.pump` (`priors.toml`).
+        """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
         roles.between_deviation[self.leak] = INFERENCE.between.pump
@@ -275,8 +303,9 @@ class ColumnRoles:
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the leak coefficient of `column` in a healthy machine.
 
-        For an orifice the mean flow is that of a laminar leak past the piston alone, since the pump's leakage is
-        laminar. The result is in the coefficient's unit, and infinite if no pressure drives the flow of this column.
+        The result is in the unit of the coefficient, and infinite if no pressure drives the flow of this column. The
+        coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`. This
+        conductance is at most that of a healthy piston, since the pump's leakage is laminar.
         """
         driver = self.drivers[column] if column < self.left else ""
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -289,9 +318,9 @@ class ColumnRoles:
     def offset_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
 
-        It is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the column's term. It is
-        also 0 in an equation without flow offset, since the column of this offset is needed to remove the error
-        (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the mean of
+        The error is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the column's term.
+        It also counts as 0 in an equation without flow offset, since the column of the flow offset is needed to remove
+        the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the mean of
         abs(p_A - p_B) over `blocks`: pressures recorded in counts are much smaller numbers.
         """
         # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
@@ -305,7 +334,8 @@ class ColumnRoles:
 class Weighting:
     """Huber's weights of the rows of successive blocks, which limit the effect of outliers.
 
-    They follow from a fit that also uses weighted sums over earlier blocks, the state of the object.
+    The weights follow from a fit to the rows and to weighted sums over earlier blocks. These sums are the state of the
+    object.
     """
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
@@ -329,7 +359,7 @@ class Weighting:
         shapes = [sums.shape for sums in self._earlier_sums]
         if [sums.shape for sums in restored] != shapes:
             raise InputError(
-                f"saved state's known must be of the shapes {shapes}, got {[sums.shape for sums in restored]}"
+                f"saved state's known must have the shapes {shapes}, got {[sums.shape for sums in restored]}"
             )
         self._earlier_sums = restored
 
@@ -341,7 +371,7 @@ class Weighting:
         block, those of slow columns common to all (`ColumnRoles`). The sums over earlier blocks are updated.
         """
         self._count += len(ends)
-        update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of all blocks counts most
+        update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of many blocks has two thirds of the weight
         grams = []
         for equation_rows, columns, earlier_sums in zip(values, self._columns, self._earlier_sums, strict=True):
             fast, slow = np.array(columns.fast), np.array([*columns.slow, columns.left])
@@ -352,7 +382,8 @@ class Weighting:
 def solve(matrix: Array, right: Array) -> Array:
     """Solve matrix x = right for a positive semidefinite `matrix` (n, n) and `right` (n,) or (n, k).
 
-    The matrix is scaled to a unit diagonal with a small ridge. Components of x in its null space are about zero.
+    The matrix is scaled to a unit diagonal, to which the small number `RIDGE` is added. Components of x in the null
+    space of the matrix are about zero.
     """
     scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
     scale[~(scale > 0.0)] = 1.0  # a column of zeros stays as it is
@@ -418,11 +449,12 @@ def information(
 
 
 def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
-    """Compute for each of K blocks the error of the tested coefficient by the imperfect model of the oil's expansion.
+    """Compute the error (K,) that an imperfect model of the oil's expansion causes in the tested coefficient.
 
-    It is the fitted volume of expansion, converted to the equivalent value of this coefficient, times the relative
-    error `blocks.expansion` of `priors.toml`: the terms of the compliance hardly describe air at low pressures. The
-    error is small where pressures rise and fall again, and large where they only relax.
+    `fit`: fit of one equation to K blocks; `roles`: roles of its columns. The error in a block is the fitted volume of
+    expansion, converted to the equivalent value of the tested coefficient, times the relative error `blocks.expansion`
+    (`priors.toml`). The terms of the compliance hardly describe air at low pressures. The error is small where
+    pressures rise and fall again, and large where they only relax.
     """
     n_polynomials = fit.polynomials.shape[1]
     is_compliance = np.repeat(
@@ -431,7 +463,7 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     coupling = np.where(is_compliance, fit.normal.coupling, 0.0)
     gram, _, _ = fit.normal.eliminate_tested()
     covariances = solve(gram + np.diag(fit.prior_precision), coupling.T) * fit.variance
-    # square of the sum of products of the tested column and the volume, without the part by errors of the fit
+    # squared product of the tested column and the fitted volume, minus the part that errors of the fit cause
     squares = (coupling @ fit.coefficients) ** 2 - np.einsum("kc,ck->k", coupling, covariances)
     has_energy = fit.normal.energy > 0.0
     volumes = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
@@ -439,7 +471,10 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
-    """Compute the polynomials (K, DRIFT_DEGREE + 1) of slow drifts over K blocks, and the recording's length [min]."""
+    """Compute the polynomials (K, DRIFT_DEGREE + 1) of slow drifts over K blocks, and the recording's length [min].
+
+    A single block has only the constant polynomial.
+    """
     minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
     position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0  # -1 to 1, the polynomials' range
     return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
@@ -496,10 +531,11 @@ def _build_normal_equations(
 
 
 class _Prior(NamedTuple):
-    """Prior standard deviations (c,) of c nuisance coefficients: of the `level`, their constant part, and the `drift`.
+    """Prior standard deviations of c nuisance coefficients: of their constant parts, `level`, and of their drifts.
 
-    The last coefficient is the remaining error [Pa] of the sensor offset of p_A - p_B, with the mean -`current_offset`,
-    the part that is already subtracted. `offset` [Pa]: prior standard deviation of the whole offset.
+    The last coefficient is the error [Pa] that remains of the sensor offset of p_A - p_B. The prior standard deviation
+    of the whole offset is `offset` [Pa]. `current_offset` [Pa] is already subtracted, so that the remaining error has
+    the prior mean -`current_offset`.
     """
 
     level: Array
@@ -579,12 +615,13 @@ def _fit_equation(
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
-    magnitudes = np.minimum(np.abs(constants), roles.level_deviation[nuisance])  # at most the prior deviation
+    level = roles.level_deviations(total)[nuisance]
+    magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation
     # standard deviations of the drifts over the recording; the last is 0, since the sensor offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
     # inf for the constant part of the offset: its prior standard deviation is `offset_deviation` instead
-    prior = _Prior(np.append(roles.level_deviation[nuisance], np.inf), drift, offset_deviation)
+    prior = _Prior(np.append(level, np.inf), drift, offset_deviation)
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
     for iteration in range(_MAX_OFFSET_STEPS + 1):
@@ -606,10 +643,11 @@ def _fit_equation(
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
     """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `test`: column of a pressure times the sampling interval dt, from which
-    `offset` [Pa] dt is subtracted; `coefficients` (K,): its coefficient g in each block. The appended, last column -g
-    dt is the derivative of the volume balance with respect to the offset. In a balance without the column dt, that of a
-    flow offset, nothing is corrected, and the appended column is zero.
+    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure times the sampling
+    interval dt, from which `offset` [Pa] times dt is subtracted; `coefficients` (K,): coefficient g of this column in
+    each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the volume balance with
+    respect to the offset. In a balance without a flow offset, whose column is dt, nothing is corrected, and the last
+    column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -635,7 +673,8 @@ def offset_cost(offset: Any) -> Any:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    Only a leak that changes between blocks reveals it; otherwise the estimate stays near the offset already removed.
+    Only a leak that changes between blocks reveals the offset. Otherwise the estimate stays near `blocks.zero`, the
+    offset already removed.
     """
     offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
     return float(np.mean(blocks.zero)) + float(np.mean(offsets))
@@ -645,7 +684,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     """Compute the joint likelihood of leak and flow offset (bias, `roles.bias`) in K blocks, for the first equation.
 
     Returns precision (2 K, 2 K) and vector (2 K,) as in `onset.Information`, the K leaks first, and the mean pressure
-    difference (K,) [Pa] in each block. The flow offset is that at this pressure, uncorrelated with the leak.
+    difference (K,) [Pa] in each block. The flow offset is the flow at this mean, so that it is uncorrelated with the
+    leak of the same block.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
@@ -674,8 +714,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. The coefficients are
-    their constant parts, without the drifts.
+    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. Only the constant parts
+    of the coefficients count, without the drifts.
     """
     fit = _fit_equation(blocks, 0, roles)
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit

@@ -79,6 +79,7 @@ class ChargePriors(PriorTable):
     share: float  # smallest fraction of the samples in which a chamber fed at the charge pressure is low
     near: float  # a pressure is low if it exceeds the lowest pressure by at most this difference
     seconds: float  # [s] averaging time
+    steady: float  # largest rate of change of a low pressure that is the charge pressure
     scatter: float  # standard deviation of the drift between days
     recordings: float  # the prior on the scatter weighs as much as this number of recordings
     deflation: float  # largest factor by which the standard errors of the drifts may be too large

@@ -28,9 +28,11 @@ class DifferencePriors(DriftPriors):
 
 
 class LevelPriors(PriorTable):
-    """Standard deviations [m^3/s] of constant flows in a volume balance; the prior mean of each flow is zero."""
+    """Standard deviations of coefficients of a volume balance whose prior mean is zero; flows in m^3/s."""
 
     outside: float  # constant leakage to the outside
+    bias: float  # constant flow without a recorded pressure, over the rms flow of the pump
+    lag: float  # [s] delay of the position
     gas: float  # flow from an accumulator whose gas changes its temperature
 
 
@@ -84,7 +86,7 @@ class OilPriors(PriorTable):
     friction_session: float
     friction_changes: float
     drop_tells: float  # probability that a change of the viscous drop is due to the oil, not to load and speed
-    drop_misleads: float  # probability that something else than the oil changed the drop of the judged recording alone
+    drop_misleads: float  # probability that something other than the oil changed the drop of the judged recording alone
 
 
 class SizePriors(PriorTable):
@@ -215,6 +217,7 @@ class RestPriors(PriorTable):
     lasting: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
     holding: float  # mean flow of a pump that holds a load
     moves: float  # smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter
+    lowers: float  # smallest speed, over the mean speed, of a load that a valve lowers while the pump rests
     shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
     open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
     compliance: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation

@@ -28,14 +28,15 @@ MAX_LATE_FRACTION: float = _PRIORS.late
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    If the intervals are whole numbers of sampling steps, to within `clock.scatter` of `priors.toml`, rows of NaN are
-    inserted for lost samples; else the samples are interpolated linearly. Rows without a time, or not later than all
-    rows before, are dropped. If long breaks divide the recording, only its longest stretch is used.
+    If the intervals are whole numbers of sampling steps, to within `clock.scatter` of `priors.toml` (rms), rows of NaN
+    are inserted for lost samples; else the samples are interpolated linearly. Rows without a time, or not later than
+    all rows before, are dropped. If long breaks divide the recording, only its longest stretch is used. A recording
+    with even times is returned unchanged.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
     if rows.size < 2:
-        return recording.samples(slice(0, rows.size))
+        return recording.samples(slice(rows[0], rows[0] + 1) if rows.size else slice(0))
     t = recording.t[rows]
     steps = np.diff(t) * recording.rate
     n_steps = np.round(steps)
@@ -49,16 +50,16 @@ def resample_evenly(recording: Recording) -> Recording:
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
     """Find the indices of the rows that are later than all earlier rows of a log; `t` (n,): times [s], NaN if missing.
 
-    If more than the fraction `MAX_LATE_FRACTION` of the rows are not, the result is the longest run of rows whose times
-    do not step back, without repeated times.
+    If more than the fraction `MAX_LATE_FRACTION` of the timed rows are out of this order, the result is the longest run
+    of rows whose times do not step back, without repeated times.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
         return timed
     latest_time = np.maximum.accumulate(t[timed])
-    is_late = np.r_[False, t[timed][1:] <= latest_time[:-1]]
-    if np.mean(is_late) <= MAX_LATE_FRACTION:
-        return np.asarray(timed[~is_late])
+    is_out_of_order = np.r_[False, t[timed][1:] <= latest_time[:-1]]
+    if np.mean(is_out_of_order) <= MAX_LATE_FRACTION:
+        return np.asarray(timed[~is_out_of_order])
     runs = np.split(timed, np.flatnonzero(np.diff(t[timed]) < 0.0) + 1)
     run = max(runs, key=len)
     return np.asarray(run[np.r_[True, np.diff(t[run]) > 0.0]])
@@ -109,6 +110,7 @@ def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -
     """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,), with NaN beyond the ends.
 
     Unless the channel `is_slow`, times within intervals over `MAX_INTERVAL` times the median interval get NaN, too.
+    With fewer than two samples, all values are NaN.
     """
     if t.size < 2:
         return np.full(even_times.size, np.nan)

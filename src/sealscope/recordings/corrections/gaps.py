@@ -25,6 +25,7 @@ from sealscope.recordings.motion import find_runs
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import flag_impossible, uniform_segments
 from sealscope.recordings.recording import Recording
+from sealscope.units import P_ATM
 
 Flags = NDArray[np.bool_]
 
@@ -52,15 +53,48 @@ def set_missing(recording: Recording, flags: Mapping[str, Flags]) -> Recording:
 
 
 def remove_dropouts(recording: Recording) -> Recording:
-    """Set all channels to NaN in rows where both chamber pressures are exactly zero.
+    """Set samples to NaN that were recorded while the logger's converter or the sensors' supply was off.
 
-    A converter that is off writes zeros; two noisy transducers never read zero together.
+    - All channels, where both chamber pressures are exactly zero, as a converter that is off writes them; two noisy
+      transducers never read zero together.
+    - All channels, where both chamber pressures are below vacuum by at least the fraction `gaps.live_zero`
+      (`priors.toml`) of their maximum. Without a supply, a sensor of 4 to 20 mA reads a quarter of its range below
+      zero.
+    - The position alone, where it is constant from the first sample or up to the last one, and outside of all its
+      other values by this fraction of their range.
     """
-    chambers = chambers_of(recording)
-    if len(chambers) < 2:
-        return recording
-    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
-    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout)) if is_dropout.any() else recording
+    chambers, dropouts = chambers_of(recording), dict[str, Flags]()
+    if len(chambers) == 2:
+        is_zero = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
+        is_off = is_zero | np.logical_and(*(_is_below_live_zero(recording[name]) for name in chambers))
+        dropouts = dict.fromkeys(recording.channels, is_off) if is_off.any() else {}
+    if "x" in recording:
+        is_dead = _flag_dead_ends(recording["x"] if not dropouts else np.where(dropouts["x"], np.nan, recording["x"]))
+        if is_dead.any():
+            dropouts["x"] = is_dead | dropouts.get("x", False)
+    return set_missing(recording, dropouts)
+
+
+def _is_below_live_zero(pressure: Array) -> Flags:
+    """Flag the samples of a pressure (n,) [Pa] that are as far below vacuum as a sensor without a supply reads."""
+    highest = float(np.nanmax(pressure, initial=0.0))
+    return np.asarray(pressure < -P_ATM - _GAPS.live_zero * highest)
+
+
+def _flag_dead_ends(position: Array) -> Flags:
+    """Flag the first and the last samples of a `position` (n,) if its sensor was off there (`remove_dropouts`)."""
+    known, is_dead = np.flatnonzero(np.isfinite(position)), np.zeros(len(position), dtype=bool)
+    for rows in (known, known[::-1]):  # from the first sample on, and from the last one back
+        values = position[rows]
+        steps = np.abs(np.diff(values))
+        end = int(steps.argmax()) + 1 if steps.size else 0  # number of samples before the largest step
+        if not end or not values[end:].size:
+            continue
+        low, high = float(values[end:].min()), float(values[end:].max())
+        distance = max(low - values[:end].max(), values[:end].min() - high)
+        if distance > _GAPS.live_zero * (high - low) and np.ptp(values[:end]) < _GAPS.dead * distance:
+            is_dead[rows[:end]] = True
+    return is_dead
 
 
 def remove_impossible(recording: Recording) -> Recording:
@@ -76,8 +110,10 @@ def remove_impossible(recording: Recording) -> Recording:
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     """Fill the gaps of the `needed` channels, except at the ends, and mark them in `Recording.bridged`.
 
-    A short gap is filled by a spline, others from another cycle of the motion or by a straight line. Values that other
-    channels miss in the same rows are filled in the same way. The times must be evenly spaced.
+    A gap of up to `SPLINE` samples is filled by a spline. A longer one is filled from another cycle of the motion, or
+    by a straight line if no cycle is similar enough or the gap exceeds the fraction `MAX_CYCLE_GAP` of the recording.
+    Values that other channels miss in the same rows are filled in the same way. The times must be evenly spaced. The
+    recording is returned unchanged if there is no such gap, or no row with values in all `needed` channels.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -111,8 +147,8 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recording:
     """Interpolate short gaps linearly, except at the ends, in all channels but the `needed` ones, which `bridge` fills.
 
-    A sensor that is slower than the logger leaves such gaps. A gap is short up to `SPLINE` samples in a pressure,
-    and up to `gaps.motion` [s] of `priors.toml` in other channels, because a moving mass moves evenly over that time.
+    A sensor that is slower than the logger leaves such gaps. A gap is short up to `SPLINE` samples in a pressure, and
+    up to `gaps.motion` [s] of `priors.toml` in other channels, as moving masses hardly change their speed in that time.
     """
     max_motion_gap = _GAPS.motion * recording.rate
     channels: dict[str, Array] = {}
@@ -130,7 +166,7 @@ def interpolate_short_gaps(recording: Recording, needed: Sequence[str]) -> Recor
 
 
 def flag_bridged(recording: Recording, bounds: Array | NDArray[np.integer]) -> Flags:
-    """Flag the blocks (n,) of samples in which filled samples are more than the fraction `MAX_BRIDGED_FRACTION`.
+    """Flag the blocks (n,) of samples in which more than the fraction `MAX_BRIDGED_FRACTION` of the samples are filled.
 
     `bounds` (n + 1,): index of the first sample of each block, and the end of the last block.
     """
@@ -161,8 +197,9 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    The two nearest cycles on either side are tried. `channels`: name -> values (n,); the gap has the samples `first` to
-    `stop` - 1; `needed`: channels that must be complete in the copied cycle; `period`: length of a cycle [samples].
+    The two nearest cycles on either side are tried, the nearer ones first. `channels`: name -> values (n,); the gap has
+    the samples `first` to `stop` - 1; `needed`: channels that must be complete in the copied cycle; `period`: length of
+    a cycle [samples].
     """
     half_cycle = round(0.5 * period)
     # the copied samples must not overlap the gap, nor the half cycle next to it
@@ -183,11 +220,12 @@ def _cycle_mismatch(
 ) -> float:
     """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
-    The motion is seen in the command, else in p_A - p_B or the only chamber pressure (`duty_signal`). The gap, i.e. the
-    samples `first` to `stop` - 1, and up to `half_cycle` samples on either side are compared with the stretch `shift`
-    samples later. The result is the rms difference of both, after their means are subtracted, over the standard
-    deviation of the latter. It is infinite if too few samples are known, or if one of the `needed` channels lacks
-    samples to copy into the gap. `channels`: name -> values (n,).
+    The motion is seen in the command u if this is `needed`, else in p_A - p_B or the only chamber pressure
+    (`duty_signal`). The gap, i.e. the samples `first` to `stop` - 1, and up to `half_cycle` samples on either side are
+    compared with the stretch `shift` samples later, or earlier if `shift` is negative. The result is the rms difference
+    of the two stretches, after their means are subtracted, over the standard deviation of the shifted stretch. It is
+    infinite if too few samples are known, or if one of the `needed` channels lacks samples to copy into the gap.
+    `channels`: name -> values (n,).
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as both stretches lie within the recording
@@ -230,10 +268,15 @@ def _fill_by_line(values: Array, rows: Flags) -> None:
 
 
 def _fill_by_spline(values: Array, rows: Flags) -> None:
-    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known ones."""
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known ones.
+
+    Values before the first known one and after the last one stay missing, and all of them if at most `_N_END` values
+    are known.
+    """
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
     if missing.size and known.size > _N_END:
+        missing = missing[(missing > known[0]) & (missing < known[-1])]
         values[missing] = CubicSpline(known, values[known])(missing)

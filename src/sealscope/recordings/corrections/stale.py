@@ -35,25 +35,29 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
     """Replace samples that repeat the previous one by linear interpolation between new readings; also return findings.
 
     Either a channel holds each reading for a fixed time (`estimate_holding_period`), or the logger repeats whole rows.
+    Slow channels and the command u stay as they are.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
     channels, findings = dict(recording.channels), list[Finding]()
     repeated = _flag_repeated_rows([recording[name] for name in names])
+    # rows later than all rows before, which alone the resampling keeps
+    latest = np.fmax.accumulate(recording.t)
+    is_ordered = np.append(True, recording.t[1:] > latest[:-1]) & np.isfinite(recording.t)
     rows = np.flatnonzero(repeated)
     if rows.size:
-        text = f"{rows.size} rows repeat the one before: left out"
+        text = f"{rows.size} rows repeat the row before: interpolated"
         findings.append(Finding("repeated_rows", "note", None, rows.size, float(recording.t[rows[0]]), text))
     for name in names:
         values = recording[name]
         stale = repeated & np.isfinite(values)
         if (period := estimate_holding_period(recording.t, values)) is not None:
             stale = stale | _flag_held(recording.t, values, period)
-            text = f"{name}: repeats each sample for {period:.2g} s: lines between the fresh ones"
+            text = f"{name}: repeats each sample for {period:.2g} s: interpolated between new ones"
             findings.append(
                 Finding("held_samples", "note", name, int(np.count_nonzero(stale)), float(recording.t[0]), text)
             )
-        if stale.any():
-            fresh = np.isfinite(values) & ~stale
+        fresh = np.isfinite(values) & ~stale & is_ordered
+        if stale.any() and fresh.any():
             channels[name] = np.where(stale, np.interp(recording.t, recording.t[fresh], values[fresh]), values)
     return (replace(recording, channels=channels) if findings else recording), findings
 
@@ -81,10 +85,11 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 
     All channels are constant or missing there, and both chamber pressures for longer than their noise allows
     (`find_holds`). No channel jumps at the first of these rows, but one does after the last, as the machine moved on.
+    Nothing is flagged without both chamber pressures, or with fewer than `stale.runs` (`priors.toml`) rows in all.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
-    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:  # too short to tell
+    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:
         return flags
     holds_a, holds_b = (find_runs(find_holds(values, recording.rate).flags) for values in pressures)
     begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
@@ -107,20 +112,23 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 
 
 def _jumps_at(values: Array, row: int) -> bool:
-    """Test whether a channel (n,) changes around `row` by more than the quantile `stale.leap` of its usual changes."""
+    """Test whether a channel (n,) changes around `row` by more than the quantile `stale.leap` of its usual changes.
+
+    Changes are those over 7 sampling steps, here from 4 rows before `row` to 3 rows after it.
+    """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
     return bool(change > usual_change)
 
 
 def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
-    """Test whether a channel changes in `rows` (k,) by more than `stale.moves` (`priors.toml`) of its range."""
+    """Test whether a channel (n,) changes by more than the fraction `stale.moves` of its range within `rows` (k,)."""
     all_values, values_in_rows = values[np.isfinite(values)], values[rows][np.isfinite(values[rows])]
     return bool(values_in_rows.size and np.ptp(values_in_rows) > _PRIORS.moves * np.ptp(all_values))
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Divide a channel (n,) into its k runs of equal values; return their first indices (k,) and flags (k,).
+    """Divide a channel (n,) into its k runs of equal values; return the first index (k,) and a flag (k,) of each.
 
     A run is flagged if it both begins and ends with a jump by more than `_MIN_JUMP` times the channel's resolution.
     """
@@ -133,10 +141,11 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 def estimate_holding_period(t: Array, values: Array) -> float | None:
     """Estimate the time [s] for which a channel (n,) that is slower than its logger repeats each reading.
 
-    It is the mean duration of the regular runs of equal values that begin and end with a jump (`_find_equal_runs`).
-    There must be `stale.runs` runs (`priors.toml`), and the fraction `stale.share` must be regular, i.e. differ from
-    the median by at most the fraction `stale.spread`. Returns None with fewer runs, for a median below two samples and
-    for a mean below `stale.shortest`. `t` (n,): times [s].
+    It is the mean duration of the regular runs of equal values that begin and end with a jump (`_find_equal_runs`). A
+    run is regular if its duration differs from the median by at most the fraction `stale.spread` (`priors.toml`) of
+    this. Returns None if there are fewer than `stale.runs` runs, if less than the fraction `stale.share` of them is
+    regular, if the median run has fewer than two samples, or if the mean is below `stale.shortest` [s]. `t` (n,): times
+    [s].
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -160,7 +169,8 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
 def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
     """Flag the samples (n,) that repeat the previous one, in a channel with a new reading every `period` [s].
 
-    In a run of equal values, a sample is flagged unless it is the first of a period. `t` (n,): times [s].
+    Each run of equal values is divided into periods from its first sample on. All samples but the first of each period
+    are flagged. `t` (n,): times [s].
     """
     known = np.flatnonzero(np.isfinite(values))
     starts, _ = _find_equal_runs(values[known])
@@ -176,10 +186,10 @@ def _flag_held(t: Array, values: Array, period: float) -> NDArray[np.bool_]:
 def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     """Flag the rows (n,) in which a logger got no new readings and repeated the previous row.
 
-    In such a row, or two, all of `channels` (n,) that vary repeat their samples, and one channel jumps before and after
-    it by more than `_MIN_JUMP` quantisation steps. Nothing is flagged unless there are `stale.repeats` (`priors.toml`)
-    times as many such places as expected by chance. The expected fraction of rows is that for channels that repeat
-    independently of each other, but at least `stale.fewest`.
+    At such a place, one or two rows repeat the samples of all `channels`, each (n,), that vary, and one channel jumps
+    by more than `_MIN_JUMP` quantisation steps both before and after these rows. Nothing is flagged unless there are at
+    least `stale.repeats` (`priors.toml`) times as many places as rows that are expected to repeat by chance. The
+    expected fraction of rows is that for channels that repeat independently of each other, but at least `stale.fewest`.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

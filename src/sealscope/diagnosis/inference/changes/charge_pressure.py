@@ -2,8 +2,8 @@
 
 In a closed circuit an accumulator keeps the chamber that carries no load at the charge pressure. A leak past the piston
 returns its oil to the circuit; an external leak empties the accumulator, so that its pressure falls through the whole
-recording. A sensor whose offset drifts moves the low values of its own chamber alone. Of each pressure, the samples
-near its lowest values, the "low pressure" of the chamber, are fitted by
+recording. A sensor whose offset drifts moves the low values of its own chamber alone. Of each pressure, the steady
+samples near its lowest values, the "low pressure" of the chamber, are fitted by
 
     p = level + k x + r_+ max(q, 0) + r_- min(q, 0) + drift t,
 
@@ -89,11 +89,14 @@ class LowDrifts(NamedTuple):
 def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
-    In a closed circuit a chamber that carries no load is at the charge pressure. Samples before the pump first turns do
-    not count, as shut valves may enclose any pressure until then. The drift of a chamber is unknown if its lowest
-    pressure exceeds that of the other chamber by `charge.near` (`priors.toml`) or more, or if at most the fraction
-    `charge.share` of its samples lies within `charge.near` of the lowest pressure. Return None if neither drift is
-    known, or if a pressure, or both angle and speed of the pump, are not recorded.
+    In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
+    `charge.near` (`priors.toml`) of the chamber's lowest pressure and change by less than `charge.steady`, since a load
+    that swings through zero lowers the pressure for a moment only. Samples before the pump first turns do not count, as
+    shut valves may enclose any pressure until then. The drift of a chamber is unknown if its lowest pressure exceeds
+    that of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of its samples counts.
+    Return None if neither drift is
+    known, if the recording is shorter than `MIN_SAMPLES`, or if a pressure, or both angle and speed of the pump, are
+    not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -108,10 +111,23 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
-        is_low = is_known & np.isfinite(p) & (p < low + prior.near)
+        is_steady = np.abs(_rate_of_change(p, rate)) < prior.steady
+        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & is_steady
         is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit nothing: drift NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
+
+
+def _rate_of_change(pressure: Array, rate: float) -> Array:
+    """Compute the rate of change [Pa/s] of a pressure (n,) that is averaged over `charge.seconds`; NaN near its ends.
+
+    At each sample it is the difference of the values `charge.seconds` later and earlier, over the time between them.
+    """
+    window = max(1, round(CHANGES.charge.seconds * rate))
+    slope = np.full(len(pressure), np.nan)
+    if len(pressure) > 2 * window:
+        slope[window:-window] = (pressure[2 * window :] - pressure[: -2 * window]) * rate / (2 * window)
+    return slope
 
 
 class ChargeTrend(NamedTuple):
@@ -135,9 +151,9 @@ class ChargeTrend(NamedTuple):
 
             fall = (p q / V) (1 - f)^2 (1 + 2 f),
 
-        where f is the fraction of the recording before the onset, and V is divided by the exponent of the gas. The
-        likelihood is averaged over a log-normal prior on V. A measured fall may also have another cause, with a small
-        probability.
+        where f is the fraction of the recording before the onset. Here V is the gas volume over the polytropic exponent
+        of the gas. The likelihood is averaged over a log-normal prior on this V. With a small probability, a measured
+        fall has another cause.
         """
         prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # log V in standard deviations
         weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()
@@ -146,8 +162,8 @@ class ChargeTrend(NamedTuple):
         expected = self.pressure * abs(flow) / volumes * (1.0 - f) ** 2 * (1.0 + 2.0 * f)
         deviation = float(np.hypot(self.error, CHANGES.charge.scatter))
         # a fall by another cause has the probability `unlike` and the uniform density 1 / `zero_drift.size`; it is
-        # multiplied by the deviation, by which the normal densities below are not divided
-        other_cause = CHANGES.charge.unlike * deviation / CHANGES.zero_drift.size
+        # multiplied by sqrt(2 pi) times the deviation, by which the normal densities below are not divided
+        other_cause = CHANGES.charge.unlike * np.sqrt(2.0 * np.pi) * deviation / CHANGES.zero_drift.size
         with_loss = float(weights @ np.exp(-0.5 * ((self.fall - expected) / deviation) ** 2)) + other_cause
         without_loss = float(np.exp(-0.5 * (self.fall / deviation) ** 2)) + other_cause
         return 2.0 * float(np.log(with_loss / without_loss))
@@ -156,8 +172,9 @@ class ChargeTrend(NamedTuple):
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     """Estimate how fast the charge pressure of a closed circuit falls, from the lowest pressures of both chambers.
 
-    The rate is the weighted mean of their drifts (`estimate_low_drifts`). Return None if neither chamber is at times
-    near the charge pressure, or if neither angle nor speed of the pump is recorded.
+    The rate is minus the mean of the drifts of both pressures (`estimate_low_drifts`), weighted by their precisions.
+    Return None if neither chamber is at times near the charge pressure, or if neither angle nor speed of the pump is
+    recorded.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
@@ -237,8 +254,9 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     """Compare the drifts of the lowest readings of p_A and p_B with those of healthy recordings.
 
     Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
-    the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. A fall does not explain a
-    difference between the two drifts; if both are known, its p-value is
+    the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. The `advantage` of each
+    comes from a prior on its size. A fall does not explain a difference between the two drifts; if both are known, its
+    p-value is
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
     """
@@ -276,6 +294,7 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
     """Compute the rate at which the charge pressure falls [Pa/s], as a mean of both chambers, with its standard error.
 
     The rate is -sum(drift / variance) / sum(1 / variance) over chambers with a known drift and variance [Pa^2/s^2].
+    Return None if there is no such chamber.
     """
     known = [(drift, 1.0 / variances[side]) for side, drift in drifts.known_drifts.items() if side in variances]
     if not known:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import max_rest_rate
+from sealscope.diagnosis.inference.balance import flag_lowering, max_rest_rate
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -183,16 +183,17 @@ class RecordedBalance:
 
     @property
     def volume_ratio(self) -> float:
-        """Factor by which the measured ratio of area to displacement exceeds the assumed one; 1 if not measured."""
-        ratio = self.size.ratio  # its inverse
+        """Measured over assumed ratio of the piston's area to the pump's displacement; 1 if not measured."""
+        ratio = self.size.ratio  # of displacement to area
         return 1.0 if ratio is None else 1.0 / max(ratio.value, np.finfo(float).tiny)
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
         """Summary of the recording for comparison with others.
 
-        It has sums of its Gram matrices, oil temperature and start time. Where they are known, it also has the leaks
-        seen in holds, the pump's leakage in holds, and the friction and line drop of the motion (`fit_difference`).
+        It contains the sums of the Gram matrices, the start time and the oil temperature. Where they are known, it also
+        contains the leaks measured in holds, the pump's leakage just before the holds, and the pressure difference that
+        resists the motion (`fit_difference`).
         """
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
@@ -242,8 +243,13 @@ class RecordedBalance:
 
     @cached_property
     def _pumped(self) -> Array:
-        """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,)."""
-        return self.equations[0].left(Signals(dict(self.recording.channels), self.recording.rate, {}))
+        """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,).
+
+        It is NaN while a valve lowers the load past the pump (`flag_lowering`).
+        """
+        signals = Signals(dict(self.recording.channels), self.recording.rate, {})
+        pumped = self.equations[0].left(signals)
+        return np.where(flag_lowering(pumped, signals.step("x"), self.recording.rate), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the averaged magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
@@ -264,6 +270,7 @@ class RecordedBalance:
         """Return True if the pump probably rests in a hold, since its mean flow is too small to hold the load.
 
         To hold a load, a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
+        The result is False if no flow is recorded in the hold.
         """
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
@@ -282,8 +289,8 @@ class RecordedBalance:
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        At equal pressures a leak has no flow, so that the hold would not show the leak. The largest p_A - p_B in the
-        hold or just before it counts, since a large leak equalises the pressures while the valves are still shutting.
+        At equal pressures a leak has no flow, so that the hold would not show the leak. The largest abs(p_A - p_B) in
+        the hold or just before it counts, since a large leak equalises the pressures while the valves are shutting.
         """
         oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -325,9 +332,9 @@ class RecordedBalance:
         return rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate piston areas and ends of the stroke; None without motion, or if the areas' ratio is implausible.
+        """Estimate piston areas and ends of the stroke; None without motion, or for an implausible ratio of the areas.
 
-        The stroke is that of all known recordings (`known_stroke`).
+        The stroke covers the motion of this recording and of the others that are known (`known_stroke`).
         """
         area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         if (stroke := self.recorded_stroke) is None:
@@ -356,9 +363,9 @@ class RecordedBalance:
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
         the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are stated,
         scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of the motion under its
-        load in the volume balance, weighted by the sums of squares of the columns. The main side has more motion in
-        which it surely carries the load. The area of the other side is corrected for motion that may belong to the main
-        side (`log_area_ratio`).
+        load in the volume balance, weighted by the sums of squares of the columns. The main side is the one with more
+        motion in which it surely carries the load. The area of the other side is corrected for motion that may belong
+        to the main side (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -449,7 +456,10 @@ class RecordedBalance:
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
 
     def mean_of_blocks(self, values: Array, weights: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) with positive `weights` (K,) over the blocks after `since` [s], at least the last."""
+        """Average `values` (K,) over the blocks from `since` [s] on, or over the last block if there are none.
+
+        `weights` (K,): positive weights of the blocks.
+        """
         is_after = self.blocks.time >= since
         if not is_after.any():
             is_after[-1] = True
@@ -523,7 +533,8 @@ class RecordedBalance:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
         A control loop replaces the oil that leaks, so that the piston hardly moves. A displaced flow near zero thus
-        indicates a control loop, and a flow near the leakage of a typical machine indicates creep.
+        indicates a control loop, and a flow near the leakage of a typical machine indicates creep. The result is 0 if
+        the recording does not determine the flow.
         """
         holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]  # [m^3/s] of typical leakage
         # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
@@ -549,15 +560,16 @@ class RecordedBalance:
 
 
 def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
-    """Estimate the logarithm r of the piston area of one side over that of the other, with its standard deviation.
+    """Estimate the logarithm r of the ratio of two piston areas, first side over second, with its standard deviation.
 
-    `measured`: fitted ratio of the areas, without information if it is not positive. Only a fraction w of the motion
-    that was attributed to the first side belongs to it, and the rest to the other side, whose area is well known; thus
-    log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the probability
-    `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the fraction of
-    that motion in which the first side surely carries the load. r has a normal prior with the mean `held_oil.sides`,
-    negative unless the first side is probably the larger one (`is_larger`), and the standard deviation
-    `held_oil.sides_deviation`.
+    `measured`: fitted ratio of the areas, without information if it is not positive; the area of the second side is
+    well known. Only a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the
+    second side. Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with
+    the probability `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the
+    fraction of that motion in which the first side surely carries the load.
+
+    r has a normal prior with the standard deviation `held_oil.sides_deviation`. The prior mean is `held_oil.sides` if
+    the first side is probably the larger one (`is_larger`), else minus this value.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation

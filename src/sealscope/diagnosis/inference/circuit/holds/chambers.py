@@ -467,24 +467,26 @@ class HeldChambers:
                 fits.append(LawFit(law, law_conditions, fit, log_weight))
         return fits
 
-    def _fit_growing_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
-        """Fit a leak that may grow from its `onset` [s] on; its coefficient is the mean from the onset to the end.
+    def _fit_growing_leak(self, leak: UnitLeak) -> tuple[LeakFit, int]:
+        """Fit a leak that may grow from its onset on; its coefficient is the mean from the onset to the end.
 
-        Returns the fit with the most probable growth of `growth_priors`. Its likelihood is replaced by the mean over
-        all growths, weighted by their prior probabilities.
+        Each growth of `growth_priors` has its own most probable onset. Returns the fit with the most probable growth,
+        and the index of its onset in `onsets`. The likelihood of the fit is replaced by the mean over all growths,
+        weighted by their prior probabilities.
         """
-        fits, log_weights = list[LeakFit](), list[float]()
+        fits, log_weights = list[tuple[LeakFit, int]](), list[float]()
         for growth, probability in growth_priors():
-            law = LeakLaw(exponent=1.0, growth=growth, onset=onset)
+            index = int(self._onset_posteriors(leak, growth).argmax())
+            law = LeakLaw(exponent=1.0, growth=growth, onset=float(self.onsets[index]))
             flows = [
                 flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
             ]
-            fit = self._fit_leak(leak._replace(flows=flows), onset)
+            fit = self._fit_leak(leak._replace(flows=flows), law.onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
-            fits.append(fit.scale(mean_ratio, fit.log_likelihood))  # the scaling does not change the likelihood
+            fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
             log_weights.append(fit.log_likelihood + float(np.log(probability)))
-        most_probable = fits[int(np.argmax(log_weights))]
-        return most_probable._replace(log_likelihood=float(np.logaddexp.reduce(log_weights)))
+        fit, index = fits[int(np.argmax(log_weights))]
+        return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
 
     def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
         """Compute the mean magnitude of the flow past the piston in holds after the onset, for a coefficient of 1."""
@@ -526,9 +528,7 @@ class HeldChambers:
         # each fit with the index of its onset in `onsets`
         index = int(np.abs(self.onsets - best.conditions.onset).argmin())
         fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
-        for leak in leaks:
-            index = int(self._onset_posteriors(leak).argmax())
-            fits.append((self._fit_growing_leak(leak, float(self.onsets[index])), index))
+        fits += [self._fit_growing_leak(leak) for leak in leaks]
         log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
