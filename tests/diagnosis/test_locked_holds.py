@@ -345,7 +345,8 @@ def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(
     for onset in range(n_onsets):
         rows = np.column_stack([np.vstack([oil, np.diag((0.5 * 4.0) ** 0.5 / deviations)]), np.zeros(n_rows + 4)])
         rows[:n_rows, -1] = columns[:, onset]
-        lowest = np.array([-1.0, least_dead, least_dead, -1.0, 0.0])
+        least = np.expm1(-2.0 * deviations)  # of compressibility and air, whose changes are logarithms
+        lowest = np.array([least[0], max(least_dead, least[1]), max(least_dead, least[2]), least[3], 0.0])
         oracle = lsq_linear(rows, np.append(left, np.zeros(4)), bounds=(lowest, np.inf), tol=1e-12)
         assert squares[onset] == pytest.approx(2.0 * oracle.cost, rel=1e-6)
 

@@ -159,7 +159,8 @@ def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
     min_factor, max_factor = leak.flow_factors
     low, high = min_factor * max(flow.value - half_width, 0.0), max_factor * (flow.value + half_width)
     interval = low * leak.lpm_per_flow, high * leak.lpm_per_flow
-    return {**fields, "leak_lpm": flow.value * leak.lpm_per_flow, "leak_interval_lpm": interval}
+    # a leak is no negative flow, of which noise may make an estimate
+    return {**fields, "leak_lpm": max(flow.value, 0.0) * leak.lpm_per_flow, "leak_interval_lpm": interval}
 
 
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:

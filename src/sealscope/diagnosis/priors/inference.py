@@ -153,6 +153,7 @@ class HeldOilPriors(PriorTable):
     sides_told: float  # probability that the pressures tell which side carries, whatever the offsets of the sensors
     unlike: float  # largest plausible ratio of the two piston areas
     right: float  # probability that the holds are right about a leak's flow if they disagree with the whole recording
+    scatter: float  # relative standard deviation of a leak's flow in holds, beyond the errors of its fit
     agrees: float  # standard deviation of the logarithm of the ratio of the conductances from holds and whole recording
     rare: float  # p-value of a rise of the leakage in the holds, below which they give the flow of the leak
     settles: float  # [s] time in which valves shut

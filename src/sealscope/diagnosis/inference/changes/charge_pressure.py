@@ -91,12 +91,11 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
     `charge.near` (`priors.toml`) of the chamber's lowest pressure and change by less than `charge.steady`, since a load
-    that swings through zero lowers the pressure for a moment only. Samples before the pump first turns do not count, as
-    shut valves may enclose any pressure until then. The drift of a chamber is unknown if its lowest pressure exceeds
-    that of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of its samples counts.
-    Return None if neither drift is
-    known, if the recording is shorter than `MIN_SAMPLES`, or if a pressure, or both angle and speed of the pump, are
-    not recorded.
+    that swings through zero lowers the pressure for a moment only. While the pump rests no sample counts, as shut
+    valves may enclose any pressure. The drift of a chamber is unknown if its lowest pressure exceeds that of the other
+    chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples of a turning pump counts.
+    Return None if neither drift is known, if the recording is shorter than `MIN_SAMPLES`, or if a pressure, or both
+    angle and speed of the pump, are not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -104,16 +103,15 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
     drive, rate = recording[flow_channel], recording.rate
     turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate  # [rad] in each interval
-    first_turn = int(np.argmax(~find_rests(turned, rate, max_rest_rate(turned, rate))))  # 0 if the pump always rests
-    has_turned = np.arange(len(recording)) >= first_turn
-    is_known = np.isfinite(regressors).all(axis=1) & has_turned
+    is_turning = np.append(~find_rests(turned, rate, max_rest_rate(turned, rate)), False)
+    is_known = np.isfinite(regressors).all(axis=1) & is_turning
     pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
     drifts = list[float]()
     for p, low in zip(pressures, lowest, strict=True):
         is_steady = np.abs(_rate_of_change(p, rate)) < prior.steady
         is_low = is_known & np.isfinite(p) & (p < low + prior.near) & is_steady
-        is_at_charge = low < min(lowest) + prior.near and is_low.mean() > prior.share  # else fit nothing: drift NaN
+        is_at_charge = low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum()  # else drift NaN
         drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
     return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
 
@@ -209,7 +207,8 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 
     The envelope is a robust fit in which samples above it count less than those below. `regressors` (n, k): pump flow
     and position, which are fitted together with the drift; `rows`: indices of the samples to fit, which are thinned out
-    if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples.
+    if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples, and for a drift larger than samples can
+    have that lie within `charge.near` of their lowest pressure: few visits to the charge pressure do not determine it.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
@@ -232,7 +231,10 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     parts = equal_parts(len(rows))
     (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
     error = np.hypot(jackknife_error, _envelope_error(time, residual))
-    return float(coefficients[slope]), float(error)
+    drift = float(coefficients[slope])
+    # samples within `charge.near` of the lowest drift by less than that; position and flow may add as much again
+    is_determined = abs(drift) * np.ptp(time) < 2.0 * CHANGES.charge.near
+    return (drift, float(error)) if is_determined else (np.nan, np.nan)
 
 
 def _envelope_error(time: Array, residual: Array) -> float:

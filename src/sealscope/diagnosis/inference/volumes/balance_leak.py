@@ -75,7 +75,8 @@ class BalanceLeak:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
         - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
-          too.
+          too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
+          `held_oil.rare` (`priors.toml`), as it does beside a chamber that is open to the tank.
         - "piston leak" if a servo valve drives the cylinder, or if holds measure the leakage, i.e. times in which shut
           valves separate the pump from the loaded cylinder. Then `rise` must be the rise in holds. In addition, the
           balance must already assume shut valves at every rest, or the rise must be too high for a healthy machine.
@@ -87,6 +88,10 @@ class BalanceLeak:
         is_unusual = hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare  # for a healthy machine
         is_measured_in_holds = hold_rise is not None and self.rise is hold_rise and (self.balance.shut or is_unusual)
         has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
+        chambers = self.balance.chambers
+        if is_measured_in_holds and chambers is not None:
+            is_external = chambers.piston_leak.probability < 1.0 - INFERENCE.held_oil.rare
+            return "internal or external leak" if is_external else "piston leak"
         return "piston leak" if has_servo_valve or is_measured_in_holds else "piston or pump leak"
 
     @property
@@ -213,13 +218,16 @@ class BalanceLeak:
     def _hold_flow(self, hold_rise: Rise) -> Flow:
         """Estimate the mean flow of a leak from the times in which shut valves hold the load, averaged over its laws.
 
-        The variance of `hold_rise`, the rise over healthy recordings in these times, is added to that of the fits.
+        The variance of `hold_rise`, the rise over healthy recordings in these times, and the relative scatter
+        `held_oil.scatter` (`priors.toml`) are added to the variances of the fits.
         """
         laws = self._hold_laws
         low, high = hold_rise.interval()
         laminar_unit_flow = laws.unit_flows[0]  # the rise is that of a laminar leak
         rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit_flow
-        return mixture_flow(laws.weights, laws.flows, np.hypot(rise_flow_deviation, laws.deviations))
+        scatter = INFERENCE.held_oil.scatter * laws.flows
+        deviations = np.sqrt(rise_flow_deviation**2 + laws.deviations**2 + scatter**2)
+        return mixture_flow(laws.weights, laws.flows, deviations)
 
     @cached_property
     def _hold_laws(self) -> _HoldLaws:
