@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording
 from sealscope.recordings.corrections.clock import resample_evenly
-from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes
+from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes, remove_dropouts
 
 RATE, NOISE = 500.0, 1e3
 NEEDED = ("u", "p_A", "p_B")
@@ -184,3 +184,43 @@ def test_a_block_is_touched_by_more_than_a_hundredth() -> None:
     assert np.flatnonzero(flag_bridged(recording, np.arange(0, 30_001, 1000))).tolist() == [2]
     assert recording.samples(slice(2000, 3000)).bridged is not None
     assert recording.samples(slice(3000, 4000)).bridged is None
+
+
+def switched_on_late(recording: Recording, seconds: float, **readings: float) -> Recording:
+    """Replace the first samples of some channels by what a sensor without a supply reads."""
+    is_off = recording.t < seconds
+    dead = {name: np.where(is_off, value, recording[name]) for name, value in readings.items()}
+    return replace(recording, channels={**recording.channels, **dead})
+
+
+def with_position(recording: Recording) -> Recording:
+    x = 0.1 * np.sin(2 * np.pi * recording.t / 1.6)
+    return replace(recording, channels={**recording.channels, "x": x}, units={**recording.units, "x": "m"})
+
+
+def test_sensors_without_a_supply_read_a_quarter_of_their_range_below_zero() -> None:
+    recording = with_position(machine())
+    dead = switched_on_late(recording, 5.0, p_A=-25e5, p_B=-25e5, x=-0.2)
+    cleaned = remove_dropouts(dead)
+    is_off = recording.t < 5.0
+    for name in recording.channels:
+        assert np.isnan(cleaned[name][is_off]).all()
+        assert np.array_equal(cleaned[name][~is_off], recording[name][~is_off])
+
+
+def test_a_zero_that_is_some_bar_too_low_is_no_missing_supply() -> None:
+    recording = machine()
+    low = replace(recording, channels={**recording.channels, "p_B": recording["p_B"] - 7e5})
+    assert remove_dropouts(low) is low
+
+
+@pytest.mark.parametrize(("value", "is_dead"), [(-0.2, True), (0.25, True), (-0.12, False), (0.0, False)])
+@pytest.mark.parametrize("at_end", [False, True])
+def test_a_position_that_jumps_out_of_its_range_is_dead_before(value: float, is_dead: bool, at_end: bool) -> None:
+    recording = with_position(machine())
+    is_off = recording.t > 55.0 if at_end else recording.t < 5.0
+    held = replace(recording, channels={**recording.channels, "x": np.where(is_off, value, recording["x"])})
+    cleaned = remove_dropouts(held)
+    assert np.isnan(cleaned["x"][is_off]).all() == is_dead
+    assert np.isfinite(cleaned["x"][~is_off]).all()
+    assert np.isfinite(cleaned["p_A"]).all()

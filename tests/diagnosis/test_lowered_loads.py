@@ -1,0 +1,80 @@
+"""A lift that its pump raises and gravity lowers: past the pump, which then stands still."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.inference.balance import flag_lowering
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.parameters import load_rig
+from sealscope.recordings import Recording
+from sealscope.recordings.channels import CHANNEL_UNITS
+
+RATE, CYCLE, SPEED = 100.0, 40.0, 0.04
+AREA_A, AREA_B, DISPLACEMENT = 5.03e-3, 3.77e-3, 1e-5 / (2.0 * np.pi)
+RIG = load_rig("single-rod-eha").with_overrides(
+    {"cylinder.A_A": AREA_A, "cylinder.A_B": AREA_B, "cylinder.V": 1.5e-3, "pump.q_b": DISPLACEMENT * 2.0 * np.pi}
+)
+
+
+@cache
+def lift(seed: int, leak: float = 0.0, load: float = 50e5) -> Recording:
+    """Record three cycles of a lift: up within 6 s, held for 18 s, lowered within 6 s, at rest for 10 s.
+
+    Check valves hold the load, which a leak of side A [m^3/(s Pa)] to the rod side, open to the tank, lets sink.
+    """
+    random = np.random.default_rng(seed)
+    t = np.arange(round(3.0 * CYCLE * RATE)) / RATE
+    phase = t % CYCLE
+    rising, lowered = phase < 6.0, (phase >= 24.0) & (phase < 30.0)
+    speed = np.where(rising, SPEED, np.where(lowered, -SPEED, 0.0))
+    p_A = load * (1.0 + 0.1 * random.uniform(-1.0, 1.0, 3))[(t / CYCLE).astype(int)]
+    p_A = p_A + np.where(rising, 8e5, np.where(lowered, -3e5, 0.0))
+    sinks = np.where(rising | lowered, 0.0, leak * p_A / AREA_A)
+    x = 0.05 + np.cumsum(speed - sinks) / RATE
+    omega = np.where(rising, (AREA_A * SPEED + (leak + 2e-13) * p_A) / DISPLACEMENT, 0.0)
+    noise = random.standard_normal((4, t.size))
+    channels = {
+        "p_A": p_A + 1e4 * noise[0],
+        "p_B": np.where(rising, 4e5, 0.0) + 1e4 * noise[1],
+        "x": x + 1e-5 * noise[2],
+        "omega": omega + 0.05 * noise[3],
+    }
+    return Recording(t, channels, CHANNEL_UNITS, RATE)
+
+
+def test_only_the_piston_that_moves_while_the_pump_rests_is_lowered() -> None:
+    recording = lift(0, leak=2e-12)
+    pumped = DISPLACEMENT * recording["omega"][1:] / RATE
+    is_lowering = flag_lowering(pumped, np.diff(recording["x"]), RATE)
+    phase = (recording.t % CYCLE)[1:]
+    assert is_lowering[(phase > 24.5) & (phase < 29.5)].all()
+    assert not is_lowering[phase < 23.5].any()  # neither the stroke up nor the sinking of the load in a hold
+    assert not is_lowering[phase > 30.5].any()
+
+
+def test_lowering_changes_nothing_that_the_pump_shows() -> None:
+    """The balance of a lift is that of its strokes up: as fast or slow as the load may come down."""
+    recording = lift(1)
+    phase = recording.t % CYCLE
+    lowered = (phase >= 24.0) & (phase < 30.0)
+    # another way down, to the same end
+    weights = np.where(lowered, np.sin(np.pi * (phase - 24.0) / 6.0) ** 2, 0.0)
+    way = recording["x"].copy()
+    for first in range(3):
+        rows = np.flatnonzero(lowered & (recording.t // CYCLE == first))
+        share = np.cumsum(weights[rows]) / weights[rows].sum()
+        way[rows] = way[rows[0]] + share * (way[rows[-1]] - way[rows[0]])
+    other = replace(recording, channels={**recording.channels, "x": way})
+    conductances = []
+    for record in (recording, other):
+        leak = VolumeBalance(rig=RIG).observe(record).leak
+        assert leak is not None
+        conductances.append(leak.balance.conductance)  # type: ignore[attr-defined]
+    widths = [conductance.high - conductance.low for conductance in conductances]
+    assert abs(conductances[1].value - conductances[0].value) < 0.5 * max(widths)
+    assert widths[1] == pytest.approx(widths[0], rel=0.5)
