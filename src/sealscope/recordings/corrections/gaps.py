@@ -76,7 +76,7 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def _is_below_live_zero(pressure: Array) -> Flags:
-    """Flag the samples of a pressure (n,) [Pa] that are as far below vacuum as a sensor without a supply reads."""
+    """Flag the samples of a pressure (n,) [Pa] at the reading of a sensor without a supply, below vacuum."""
     highest = float(np.nanmax(pressure, initial=0.0))
     return np.asarray(pressure < -P_ATM - _GAPS.live_zero * highest)
 
