@@ -102,7 +102,7 @@ class RecordingPlan(NamedTuple):
 
     @property
     def finds(self) -> bool:
-        """True if the planned recording detects the leak that was asked for (`target`)."""
+        """True if the planned recording detects the leak that was asked for (`target`), or if none was asked for."""
         return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:

@@ -224,11 +224,12 @@ class AlarmJudge:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
         A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
-        none) was `leak`, too, or if the verdict is rare enough by itself (`RecordingVerdict.is_rare`). For a recording
-        of a stream (`is_stream`), the `evidence` must instead reach 1/alpha, with alpha the probability of a false
-        alarm that the stream's recordings are allowed. The verdict `no leak`, or a leak below the warning threshold,
-        ends the alarm. `baseline`: version of the healthy baseline; `settings`: thresholds and the allowed rate of
-        false alarms.
+        none) was `leak`, too, or if the verdict is rare enough by itself (`RecordingVerdict.is_rare`). A leak of
+        unknown size counts as above the threshold. A recording of a stream (`is_stream`) raises an alarm only if the
+        attribute `evidence`, collected from the stream's recordings, reaches 1/alpha, where alpha is the probability of
+        a false alarm that these recordings are allowed. The verdict `no leak`, or a leak below the warning threshold,
+        ends the alarm and resets `evidence`. `baseline`: version of the healthy baseline; `settings`: thresholds and
+        the allowed rate of false alarms.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for
         none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.

@@ -14,10 +14,10 @@ from sealscope.physics.lanes import exponential, select
 
 @contracted
 def coulomb_friction(p_A: float, p_B: float, F_pr: float, F_cfr: float, use_difference: bool) -> float:
-    """Compute the Coulomb force F_C = F_pr + F_cfr (p_A + p_B) [N], eq. (4.20) of the thesis.
+    """Compute the Coulomb friction force F_C = F_pr + F_cfr (p_A + p_B) [N].
 
     `p_A`, `p_B` [Pa]: chamber pressures; `F_pr` [N]: preload force of the seals; `F_cfr` [N/Pa]: Coulomb friction per
-    pressure. `use_difference`: take p_A - p_B instead of the sum, as the equation is printed in the thesis.
+    pressure. `use_difference`: take p_A - p_B instead of the sum, as eq. (4.20) of the thesis is printed.
     """
     return F_pr + F_cfr * ((p_A - p_B) if use_difference else (p_A + p_B))
 

@@ -333,7 +333,8 @@ class Experiment:
         inputs = [identity_values(self.command), *(identity_values(leak) for leak in self.leaks)]
         inputs += [identity_values(change) for change in (*self.faults, *self.drifts)]
         solver = [self.method, self.step, self.allow_unresolved]
-        solver += [] if self.error is None else [self.error]  # without an error, keys must stay those of older versions
+        # without a tolerance `error`, keys must stay those of older versions
+        solver += [] if self.error is None else [self.error]
         inputs += [identity_values(added) for added in (self.load, self.active_controller) if added is not None]
         text = json.dumps([self.describe(), values, inputs, solver], sort_keys=True, default=str)
         return hashlib.sha256(text.encode()).hexdigest()[:16]

@@ -124,7 +124,8 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Divide log Bayes factors by 1 + 2 m B, since a model describes its data only approximately.
 
-    B is the largest log factor of the same kind of data, and m the misfit (`explanation.misfit` in `priors.toml`).
+    B is the largest log factor, at least 0, of observables with the same `data`, and m is the misfit
+    (`explanation.misfit` in `priors.toml`).
     """
     max_factor: dict[str, float] = {}
     for observable, factor in log_factors:

@@ -684,8 +684,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     """Compute the joint likelihood of leak and flow offset (bias, `roles.bias`) in K blocks, for the first equation.
 
     Returns precision (2 K, 2 K) and vector (2 K,) as in `onset.Information`, the K leaks first, and the mean pressure
-    difference (K,) [Pa] in each block. The flow offset is the flow at this mean, so that it is uncorrelated with the
-    leak of the same block.
+    difference (K,) [Pa] in each block, 0 in blocks without a flow offset. The offset is stated as the flow at this mean
+    pressure difference, not at p_A = p_B, so that it is uncorrelated with the leak of the same block.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None

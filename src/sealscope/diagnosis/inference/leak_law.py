@@ -105,9 +105,10 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
     A step is tested for each exponent of `EXPONENTS`. The p-value (`chance`) of each test is divided by the prior
-    probability of the exponent, and the test with the smallest quotient is returned. The size of the step is the change
-    of the conductance, averaged over the blocks with their information as weights. `leak`: likelihood of the leak's
-    coefficient in the blocks. Return None if too few blocks determine this coefficient.
+    probability of the exponent, and the test with the smallest quotient is returned. With an exponent other than 1 the
+    apparent conductance varies with the pressure; its mean over the blocks, weighted by their information, changes by
+    the size of the step. `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of
+    the leak's coefficient in the blocks. Return None if too few blocks determine this coefficient.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -267,8 +268,9 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     Returns the log weight of each onset, and the fraction of the recording's information after the onset, (o,) each.
     The first onset is the recording's start, with log weight 0 and fraction 1. The others are the n onsets of `test`,
     without those whose fraction is below `MIN_FRACTION`. A leak from such an onset on is a step by `value` / fraction.
-    Its weight is the likelihood ratio of this step to no step, divided by n. Without a `test`, or if `value` is not
-    positive, only the first onset remains.
+    The weight of the onset is the likelihood ratio of this step to no step, divided by n: together these onsets are as
+    probable beforehand as the start. `leak`: likelihood of the leak's coefficient in the blocks; `test`: test of this
+    coefficient for a step. Without a `test`, or if `value` is not positive, only the first onset remains.
     """
     if test is None or not value > 0.0:
         return np.zeros(1), np.ones(1)

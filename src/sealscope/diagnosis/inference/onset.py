@@ -473,10 +473,14 @@ class _Whitening(NamedTuple):
     walk_log_priors: Array
 
     def whiten(self, vector: Array) -> Array:
-        """Transform the `vector` (K,) of `Information`, precision times estimates, to n independent values z."""
-        z = (self.vectors.T @ vector) / self.root
-        z = np.append(z, np.zeros(self.complement.shape[1] - len(z)))  # a prior is one more estimate, 0
-        return np.asarray(self.basis.T @ (self.complement @ z))
+        """Transform the `vector` (K,) of `Information`, precision times estimates, to n independent values z.
+
+        The estimates become independent, each prior of a slow change is appended as one more estimate of 0, and the
+        slow changes are projected out.
+        """
+        independent = (self.vectors.T @ vector) / self.root
+        extended = np.append(independent, np.zeros(self.complement.shape[1] - len(independent)))
+        return np.asarray(self.basis.T @ (self.complement @ extended))
 
     def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
         """Compute the change of the n whitened values by a unit step at each of o onsets, shape (n, o).

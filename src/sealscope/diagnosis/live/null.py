@@ -51,10 +51,11 @@ class StepNull:
         self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
 
     def log_threshold(self, probability: float) -> float:
-        """Compute the threshold of the evidence log M of a step for a false-alarm `probability` per block.
+        """Compute the threshold of log M, the log e-value of a step, for a false-alarm `probability` per block.
 
-        A window has `WINDOW` times this probability. The threshold is -log(probability) for fewer than `_MIN_WINDOWS`
-        windows, and at least that for more.
+        With at least `_MIN_WINDOWS` windows of healthy blocks, it is fitted to the log e-values that these show, as a
+        window of `WINDOW` blocks has `WINDOW` times this probability. It is at least -log(probability), its value for
+        fewer windows.
         """
         return _find_threshold(self._count, self._surprisal, probability)
 

@@ -293,7 +293,7 @@ class StepDetector:
         return save_attributes(self, _SAVED)
 
     def load_state(self, state: Any) -> None:
-        """Restore the evidence that `state` returned; raise InputError if its parts do not fit together."""
+        """Restore the evidence from a result of the method `state`; raise InputError if it does not fit the onsets."""
         restore_attributes(self, _SAVED, state)
         if self._sums.shape[2] != len(self._onsets):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")

@@ -193,7 +193,8 @@ class Watch:
         """Convert the detected `leak` to a LiveLeak, from which `decide_on_stream` decides the verdict.
 
         If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
-        the 95 % upper bound of an undetected leak. `estimator` states the uncertainty of flows.
+        the 95 % upper bound of an undetected leak. The flow per conductance is the mean pressure of a laminar leak; the
+        flow factors are the least and the largest flow over that. `estimator` states the uncertainty of flows.
         """
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0

@@ -54,9 +54,10 @@ def limit_answers(engine: Engine) -> None:
             return super().wait(self._with_time_limit(gen), *arguments, **options)
 
         def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen`; close the connection by an OperationalError if an answer takes too long.
+            """Run psycopg's generator `gen` and return its result.
 
-            Psycopg resumes this generator several times a second; `ready` is false while there is no answer.
+            Close the connection and raise OperationalError if PostgreSQL does not answer for `ANSWER_S`. Psycopg
+            resumes this generator several times a second; `ready` is false while there is no answer.
             """
             last_answer = time.monotonic()
             ready: Any = None

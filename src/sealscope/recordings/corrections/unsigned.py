@@ -32,7 +32,8 @@ _NAMES = {"omega": "speed", "q_pump": "flow"}
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
-    The result is positive for flow into chamber A. Also returns a finding for each channel that was changed.
+    The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
+    cannot be found stays as it is. Also returns a finding for each channel that was changed.
     """
     channels, findings = dict(recording.channels), list[Finding]()
     for name, quantity in _NAMES.items():

@@ -60,7 +60,7 @@ class Batch:
     def rms_of(self, channel: str, detail: str) -> Array:
         """Return the RMS (runs, segments) of a wavelet detail of a chamber pressure.
 
-        `channel`: p_A or p_B; `detail`: d1, d2, d3 or d4 [Pa], or d3d4 [Pa^2].
+        `channel`: p_A or p_B; `detail`: d1, d2, d3 or d4 [Pa], or the product d3d4 of two [Pa^2].
         """
         channel_index = _index_of(channel, CHAMBERS, "channel")
         detail_index = _index_of(detail, QUANTITIES, "detail")
@@ -86,8 +86,9 @@ class Batch:
     def to_pandas(self) -> pd.DataFrame:
         """Convert the batch to a pandas table with one row for each run and segment.
 
-        Its columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each channel (such as `d3
-        of p_A [Pa]`), mean_leak [L/min], coefficient and step [s]. Raises MissingExtra if pandas is not installed.
+        Its columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each chamber pressure (such
+        as `d3 of p_A [Pa]`; `d3d4` of the product of two), mean_leak [L/min], the leak's coefficient, and the solver's
+        step [s]. Raises MissingExtra if pandas is not installed.
         """
         try:
             import pandas as pd

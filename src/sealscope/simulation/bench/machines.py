@@ -50,10 +50,12 @@ class BenchMachine:
     controller: str = "pi"
 
     def experiment(self, **arguments: Any) -> Experiment:
-        """Make an experiment with this machine, whose piston starts where its travel is centred (`centred_start`).
+        """Make an experiment with this machine.
 
-        `arguments`: those of `Experiment.of`, such as leak and fault; seed, duration, command, load and drifts are the
-        machine's unless stated. Raises InputError as `Experiment.of` does, also if a drawn parameter is out of range.
+        `arguments`: those of `Experiment.of`, such as leak and fault. Unless they are stated, seed, duration, command,
+        load, drifts and, for a position target, the controller are the machine's, and the piston starts where its
+        travel is centred (`centred_start`). Raises InputError as `Experiment.of` does, also if a drawn parameter is out
+        of range.
         """
         machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         names = ("load", "seed", "duration", "command", "drifts")

@@ -141,7 +141,10 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse a profile's entry as a difference between machines; an InputError begins with the entry's name."""
+    """Parse an entry of a profile as a nuisance, a property that differs between machines, in SI units.
+
+    The message of an InputError begins with the entry's name.
+    """
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)

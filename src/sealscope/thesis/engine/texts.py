@@ -34,9 +34,9 @@ def format_range(values: Iterable[float], unit: str, factor: float = 1.0) -> str
 def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    The texts are in `claims.toml` under `id`, or under `kind` for claims that share texts. The values `sheet` (what the
-    thesis's data show), `simulation` (what a simulation shows) and `why` (reason for the verdict) replace a whole text;
-    the others fill the placeholders of the same names.
+    A test is True, False, or None if the data cannot decide. The texts are in `claims.toml` under `id`, or under `kind`
+    for claims that share texts. The values `sheet` (what the thesis's data show), `simulation` (what a simulation
+    shows) and `why` (reason for the verdict) replace a whole text; the others fill the placeholders of the same names.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

@@ -168,7 +168,7 @@ class ChargeTrend(NamedTuple):
 
 
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
-    """Estimate how fast the charge pressure of a closed circuit falls, from the lowest pressures of both chambers.
+    """Estimate the rate [Pa/s] at which the charge pressure of a closed circuit falls, from both low pressures.
 
     The rate is minus the mean of the drifts of both pressures (`estimate_low_drifts`), weighted by their precisions.
     Return None if neither chamber is at times near the charge pressure, or if neither angle nor speed of the pump is

@@ -37,9 +37,9 @@ _NEIGHBOURS = _PRIORS.neighbours
 def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
-    Returns a test for each amplitude, or an empty list. A change of what the machine is commanded to do (its duty)
-    changes both amplitudes alike; a leak changes only one. The recording is divided into `BLOCKS` blocks of equal
-    length, or with a position and a periodic motion into blocks of whole cycles.
+    Returns a test for each amplitude; an empty list with too few blocks in motion. A change of what the machine is
+    commanded to do (its duty) changes both amplitudes alike; a leak changes only one. The recording is divided into
+    `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:

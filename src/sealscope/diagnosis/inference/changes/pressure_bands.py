@@ -77,11 +77,12 @@ class Octaves(NamedTuple):
 
 
 def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
-    """Compute the amplitude of both channels of a `pair` in octaves of frequency, and the phase between the channels.
+    """Compute the log amplitudes of both channels of a `pair` in octaves of frequency, and the phase between them.
 
     The power in an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows of time, since a machine
-    may often rest. Return None if a channel is not recorded, if the recording is too short or its sampling rate too low
-    for `MIN_OCTAVES` octaves, or if all windows have missing samples.
+    may often rest; the phase [rad], with its variance, is that of the sum over all windows. Return None if a channel is
+    not recorded, if the recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all
+    windows have missing samples.
     """
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):

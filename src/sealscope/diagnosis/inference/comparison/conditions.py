@@ -29,8 +29,9 @@ class UnusualCondition(NamedTuple):
 def find_unusual_conditions(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> list[UnusualCondition]:
     """List the conditions (load, speed, oil temperature) of a recording outside of the range of healthy recordings.
 
-    A tolerance (`conditions` in `priors.toml`) is added to the range. Unknown temperatures are not compared, and loads
-    (or speeds) are not compared if any of them is 0.
+    The load is the mean pressure difference, the speed the mean flow. They may exceed the range by the factor
+    exp(`ratio`), and the temperature by `oil` [K] (`conditions` in `priors.toml`). Unknown temperatures are not
+    compared, and loads (or speeds) are not compared if any of them is 0.
     """
     allowed = INFERENCE.conditions
     unusual: list[UnusualCondition] = []

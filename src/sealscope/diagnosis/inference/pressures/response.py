@@ -445,10 +445,11 @@ class Follower:
 
 
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
-    """Fit the pressure response of a recording; None if no parameters describe it.
+    """Fit the response of p_A and p_B to the command in a recording; None if no parameters describe it.
 
-    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and
-    priors. The result is computed only once for a recording.
+    The parameters are those of the machine, the leakage among them. `recording` must meet the requirements
+    (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and priors. The result is computed only once
+    for a recording.
     """
 
     def compute_fit(recording: Recording) -> Joint | None:
