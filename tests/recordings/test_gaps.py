@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.recordings import CHANNEL_UNITS, Recording
 from sealscope.recordings.corrections.clock import resample_evenly
-from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes, remove_dropouts
+from sealscope.recordings.corrections.gaps import bridge, flag_bridged, flag_holes, remove_unsupplied
 
 RATE, NOISE = 500.0, 1e3
 NEEDED = ("u", "p_A", "p_B")
@@ -201,7 +201,7 @@ def with_position(recording: Recording) -> Recording:
 def test_sensors_without_a_supply_read_a_quarter_of_their_range_below_zero() -> None:
     recording = with_position(machine())
     dead = switched_on_late(recording, 5.0, p_A=-25e5, p_B=-25e5, x=-0.2)
-    cleaned = remove_dropouts(dead)
+    cleaned = remove_unsupplied(dead)
     is_off = recording.t < 5.0
     for name in recording.channels:
         assert np.isnan(cleaned[name][is_off]).all()
@@ -211,7 +211,7 @@ def test_sensors_without_a_supply_read_a_quarter_of_their_range_below_zero() -> 
 def test_a_zero_that_is_some_bar_too_low_is_no_missing_supply() -> None:
     recording = machine()
     low = replace(recording, channels={**recording.channels, "p_B": recording["p_B"] - 7e5})
-    assert remove_dropouts(low) is low
+    assert remove_unsupplied(low) is low
 
 
 @pytest.mark.parametrize(("value", "is_dead"), [(-0.2, True), (0.25, True), (-0.12, False), (0.0, False)])
@@ -220,7 +220,14 @@ def test_a_position_that_jumps_out_of_its_range_is_dead_before(value: float, is_
     recording = with_position(machine())
     is_off = recording.t > 55.0 if at_end else recording.t < 5.0
     held = replace(recording, channels={**recording.channels, "x": np.where(is_off, value, recording["x"])})
-    cleaned = remove_dropouts(held)
+    cleaned = remove_unsupplied(held)
     assert np.isnan(cleaned["x"][is_off]).all() == is_dead
     assert np.isfinite(cleaned["x"][~is_off]).all()
     assert np.isfinite(cleaned["p_A"]).all()
+
+
+def test_an_encoder_that_moves_by_one_count_is_not_dead_before() -> None:
+    recording = machine()
+    counts = np.where(recording.t < 5.0, 0.0, 1e-3)
+    still = replace(recording, channels={**recording.channels, "x": counts}, units={**recording.units, "x": "m"})
+    assert remove_unsupplied(still) is still

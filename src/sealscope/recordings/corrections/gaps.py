@@ -35,6 +35,8 @@ SPLINE = 3
 MAX_CYCLE_GAP = 0.1
 #: Largest fraction of impossible samples in a channel with the right unit.
 _MAX_IMPOSSIBLE_FRACTION = 0.1
+#: Number of different positions of a sensor that works; an encoder at rest shows one or two.
+_MIN_POSITIONS = 10
 _GAPS = RECORDINGS.gaps
 #: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
@@ -53,26 +55,37 @@ def set_missing(recording: Recording, flags: Mapping[str, Flags]) -> Recording:
 
 
 def remove_dropouts(recording: Recording) -> Recording:
-    """Set samples to NaN that were recorded while the logger's converter or the sensors' supply was off.
+    """Set all channels to NaN in rows where both chamber pressures are exactly zero.
 
-    - All channels, where both chamber pressures are exactly zero, as a converter that is off writes them; two noisy
-      transducers never read zero together.
-    - All channels, where both chamber pressures are below vacuum by at least the fraction `gaps.live_zero`
-      (`priors.toml`) of their maximum. Without a supply, a sensor of 4 to 20 mA reads a quarter of its range below
-      zero.
-    - The position alone, where it is constant from the first sample or up to the last one, and outside of all its
-      other values by this fraction of their range.
+    A converter that is off writes zeros; two noisy transducers never read zero together.
     """
-    chambers, dropouts = chambers_of(recording), dict[str, Flags]()
+    chambers = chambers_of(recording)
+    if len(chambers) < 2:
+        return recording
+    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
+    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout)) if is_dropout.any() else recording
+
+
+def remove_unsupplied(recording: Recording) -> Recording:
+    """Set samples of a whole recording to NaN during which the sensors had no supply.
+
+    A sensor of 4 to 20 mA then reads a quarter of its range below zero. With the fraction `gaps.live_zero`
+    (`priors.toml`), these samples are
+
+    - all channels, where both chamber pressures are below vacuum by at least this fraction of their maximum;
+    - the position alone, where it is constant from the first sample or up to the last one, and outside of all its other
+      values by this fraction of their range, if these are at least `_MIN_POSITIONS` different ones.
+    """
+    chambers, unsupplied = chambers_of(recording), dict[str, Flags]()
     if len(chambers) == 2:
-        is_zero = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
-        is_off = is_zero | np.logical_and(*(_is_below_live_zero(recording[name]) for name in chambers))
-        dropouts = dict.fromkeys(recording.channels, is_off) if is_off.any() else {}
+        is_off = np.logical_and(*(_is_below_live_zero(recording[name]) for name in chambers))
+        unsupplied = dict.fromkeys(recording.channels, is_off) if is_off.any() else {}
     if "x" in recording:
-        is_dead = _flag_dead_ends(recording["x"] if not dropouts else np.where(dropouts["x"], np.nan, recording["x"]))
+        is_off = unsupplied.get("x", np.zeros(len(recording), dtype=bool))
+        is_dead = _flag_dead_ends(np.where(is_off, np.nan, recording["x"]))
         if is_dead.any():
-            dropouts["x"] = is_dead | dropouts.get("x", False)
-    return set_missing(recording, dropouts)
+            unsupplied["x"] = is_dead | is_off
+    return set_missing(recording, unsupplied)
 
 
 def _is_below_live_zero(pressure: Array) -> Flags:
@@ -82,13 +95,13 @@ def _is_below_live_zero(pressure: Array) -> Flags:
 
 
 def _flag_dead_ends(position: Array) -> Flags:
-    """Flag the first and the last samples of a `position` (n,) if its sensor was off there (`remove_dropouts`)."""
+    """Flag the first and the last samples of a `position` (n,) if its sensor was off there (`remove_unsupplied`)."""
     known, is_dead = np.flatnonzero(np.isfinite(position)), np.zeros(len(position), dtype=bool)
     for rows in (known, known[::-1]):  # from the first sample on, and from the last one back
         values = position[rows]
         steps = np.abs(np.diff(values))
         end = int(steps.argmax()) + 1 if steps.size else 0  # number of samples before the largest step
-        if not end or not values[end:].size:
+        if not end or np.unique(values[end:]).size < _MIN_POSITIONS:
             continue
         low, high = float(values[end:].min()), float(values[end:].max())
         distance = max(low - values[:end].max(), values[:end].min() - high)

@@ -17,6 +17,7 @@ from sealscope.recordings.corrections.gaps import (
     interpolate_short_gaps,
     remove_dropouts,
     remove_impossible,
+    remove_unsupplied,
     set_missing,
 )
 from sealscope.recordings.corrections.spikes import remove_spikes
@@ -50,7 +51,7 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, in this order.
 
-    1. impossible values, and dropouts, i.e. rows with zeros in both chamber pressures;
+    1. impossible values, dropouts, i.e. rows with zeros in both chamber pressures, and sensors without a supply;
     2. rows, and then single pressures, that repeat one value for a long time;
     3. spikes, and samples that repeat the previous one;
     4. uneven sampling times;
@@ -61,7 +62,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     are left out, except chamber pressures. A chamber pressure that is stuck in more than `MAX_STUCK_FRACTION` of the
     rows stays as it is, and is named as unusable.
     """
-    part, findings = remove_dropouts(remove_impossible(recording)), list[Finding]()
+    part, findings = remove_unsupplied(remove_dropouts(remove_impossible(recording))), list[Finding]()
     is_frozen = flag_frozen_rows(part)
     part = set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
     chambers = chambers_of(part)
