@@ -78,6 +78,7 @@ class ChargePriors(PriorTable):
 
     share: float  # smallest fraction of the samples in which a chamber fed at the charge pressure is low
     near: float  # a pressure is low if it exceeds the lowest pressure by at most this difference
+    range: float  # largest change by a drift over the recording, over `near`
     seconds: float  # [s] averaging time
     steady: float  # largest rate of change of a low pressure that is the charge pressure
     scatter: float  # standard deviation of the drift between days

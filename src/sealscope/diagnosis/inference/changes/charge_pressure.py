@@ -232,8 +232,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
     error = np.hypot(jackknife_error, _envelope_error(time, residual))
     drift = float(coefficients[slope])
-    # samples within `charge.near` of the lowest drift by less than that; position and flow may add as much again
-    is_determined = abs(drift) * np.ptp(time) < 2.0 * CHANGES.charge.near
+    is_determined = abs(drift) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.near
     return (drift, float(error)) if is_determined else (np.nan, np.nan)
 
 

@@ -19,8 +19,8 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
 
-#: Largest decrease of compressibility and free air, in standard deviations of their logarithms, in a linearised fit.
-MAX_LOG = 2.0
+#: Largest decrease of a property of the oil in a linearised fit, in prior standard deviations of its logarithm.
+MAX_DECREASE = 2.0
 #: Maximum number of iterations of a fit; largest relative change of variance and properties in the last iteration.
 MAX_ITERATIONS, TOLERANCE = 20, 1e-3
 #: Ridge that is added to the unit diagonal of a scaled matrix.
@@ -217,7 +217,7 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     The `regression` is linearised at the usual properties of the oil. `columns` (r, o): volume lost up to each reading
     through a leak with a coefficient of 1 since each onset; `variance`: variance of a reading, which weights the priors
     on the properties against the readings. The properties are changes relative to their usual values, each with a lower
-    limit. Compressibility and free air may fall by `MAX_LOG` standard deviations of their logarithms.
+    limit: each may fall by `MAX_DECREASE` standard deviations of its logarithm, and a dead volume not below its least.
     """
     usual = np.zeros(4)
     leaked, oil = regression.leaked(usual), regression.slopes(usual)
@@ -226,8 +226,8 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     products /= np.outer(scale, scale)
     oil = oil / scale
     with_leaked, with_columns = oil.T @ leaked, oil.T @ columns  # (4,), (4, o)
-    # a linear decrease to nothing would be as probable as a small one: logarithms are followed to `MAX_LOG` deviations
-    lowest = scale * np.maximum(_lowest_changes(), np.expm1(-MAX_LOG * _oil_deviations()))
+    # without a limit, a linear decrease to nothing would be hardly less probable than a small one
+    lowest = scale * np.maximum(_lowest_changes(), np.expm1(-MAX_DECREASE * _oil_deviations()))
     # The least squares within the limits are the smallest of c = 16 cases: some properties are at their limits, and the
     # others are free and within them.
     is_free = np.array(list(itertools.product((True, False), repeat=4)))  # (c, 4)
