@@ -80,29 +80,31 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     return field(default=default, metadata={"kind": kind, "text": full_text, "unit": unit})
 
 
-def take_fields_of(declared: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
-    """Build a decorator that lets callers of a function pass the fields of a dataclass as its arguments.
+def take_fields_of(arguments_class: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
+    """Build a decorator that makes the fields of a dataclass the parameters of a function.
 
-    `declared`: the dataclass, with fields declared by `argument`. The function itself takes an instance of `declared`
-    as its only argument. The decorator puts the fields into the function's signature. It also inserts a section
-    "Parameters" on the fields into the docstring, before the section "Returns". Wrong arguments raise InputError.
+    `arguments_class`: the dataclass, whose fields are declared by `argument`. It is typed as its constructor, so that
+    type checkers know the parameters. The function is written with one parameter, an instance of this dataclass; its
+    callers pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the
+    section "Returns". Wrong arguments raise InputError.
     """
     lines: list[str] = []
-    for declared_field in fields(declared):  # type: ignore[arg-type]
+    for declared_field in fields(arguments_class):  # type: ignore[arg-type]
         wrapped = fill(declared_field.metadata["text"], width=110, break_long_words=False, break_on_hyphens=False)
         lines += [f"{declared_field.name} : {declared_field.metadata['kind']}, optional", indent(wrapped, "    ")]
     section = "\n".join(["Parameters", "----------", *lines, "", ""])
 
     def decorate(function: Callable[[V], R]) -> Callable[P, R]:
-        """Replace the only parameter of `function`, a dataclass, by one parameter for each of its fields."""
+        """Wrap `function` in a function that takes the fields and passes it an instance of the dataclass."""
 
         @functools.wraps(function)
         def call(*args: P.args, **kwargs: P.kwargs) -> R:
-            """Build the dataclass from the arguments, and call `function` with it."""
-            return function(declared(*args, **kwargs))
+            """Call `function` with an instance of the dataclass made from the arguments."""
+            return function(arguments_class(*args, **kwargs))
 
         returns = inspect.signature(function).return_annotation
-        call.__signature__ = inspect.signature(declared).replace(return_annotation=returns)  # type: ignore[attr-defined]
+        signature = inspect.signature(arguments_class).replace(return_annotation=returns)
+        call.__signature__ = signature  # type: ignore[attr-defined]
         call.__doc__ = (inspect.getdoc(function) or "").replace("Returns\n---", f"{section}Returns\n---", 1)
         return checked_call(call)
 

@@ -96,7 +96,7 @@ def status(plan: PlanArgument, folder: FolderOption = None) -> None:
     if isinstance(loaded_plan, SimulatedPlan):
         echo(_format_progress(read_progress(loaded_plan, _campaign_folder(loaded_plan, folder))))
     else:
-        echo("a campaign over recordings has no progress: its records are judged by `campaign report`")
+        echo("a campaign over recordings simulates nothing: `campaign report` judges its records")
 
 
 @campaign.command()

@@ -394,7 +394,10 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print `head` and a paragraph on standard output, wrapped at 80 columns and indented by the width of `head`."""
+    """Print `head` and a paragraph on standard output, wrapped at 80 columns.
+
+    Lines after the first are indented by the length of `head`, or by 2 if it is empty.
+    """
     say(paragraph(text, head, indent=len(head) or 2))
 
 

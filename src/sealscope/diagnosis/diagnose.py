@@ -186,7 +186,7 @@ def diagnose(
         thesis is used. It counts as stated for a recording that was simulated with the same sizes. For any other
         recording it is a mere assumption, and L/min are stated only if a flow meter was recorded.
     limit : str, optional
-        Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
+        Smallest leak that calls for a repair: a flow (``"5 mL/min"``) or a creep speed of the piston
         (``"8 mm/min"``, the default).
     file : str or path-like, optional
         Name of the recording in the diagnosis; by default the name of the file it was read from.

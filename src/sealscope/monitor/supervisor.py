@@ -46,10 +46,14 @@ class SupervisedPart:
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
-        """Begin without an outage or a pause; `name`: name of the part in the log, on the page and in metrics."""
+        """Set up a part that has had no outage; the class describes its attributes.
+
+        `name`: name of the part in the log, on the page and in metrics.
+        """
         self.name, self._supervisor = name, supervisor
         self.since: float | None = None
-        self.reason, self.count, self.seconds, self._began = "", 0, 0.0, 0.0
+        self.reason, self.count, self.seconds = "", 0, 0.0
+        self._began = 0.0  # monotonic time at which the present outage began [s]
         self._pause = self._due = 0.0  # length of the last pause [s], and the monotonic time at which it ends
         self._lock = threading.Lock()
 

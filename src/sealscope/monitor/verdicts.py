@@ -126,10 +126,11 @@ class RecordingVerdict:
         return false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
-        """Return True if leak-free recordings get such a verdict so rarely that it may raise an alarm by itself.
+        """Return True if so few leak-free recordings get such a verdict that it may raise an alarm by itself.
 
-        It is rare if `chance` is at most `allowed_chance`, or at most `rarest` of `priors.toml`, the smallest
-        probability that can be known. A verdict with unknown `chance` (None) also counts as rare.
+        `chance` must be at most `allowed_chance`. The smallest `chance` that a diagnosis states, `rarest` of
+        `priors.toml`, is always rare enough: otherwise a short recording could never do so. An unknown
+        `chance` (None) counts as rare, so that no leak is missed for lack of it.
         """
         allowed_chance = self.allowed_chance(false_alarms_per_1000_h)
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)

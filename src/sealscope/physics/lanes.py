@@ -212,9 +212,10 @@ def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
 
 
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` if the condition is true, else `no`, in each lane of a vector or for one number.
+    """Choose `yes` where the condition is true, else `no`, for one number or in each lane of a vector.
 
-    Unlike with `if`, both values have been computed before.
+    Both values are computed before the call, unlike with `if`. Compiled code runs the instructions of `_lower_select`,
+    for numbers and vectors. Python runs the body below, for numbers only.
     """
     return yes if condition else no
 
@@ -317,10 +318,11 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def load(array: Any, row: int) -> Any:
-    """Load one row of a C-ordered array as lanes, a vector of numbers, in compiled code that `_lower_load` builds.
+    """Load one row of a C-ordered array as lanes (a vector of numbers).
 
-    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over
-    all axes but the last.
+    Only compiled code may call it: `_lower_load` builds its instructions, and the Python function is empty. `array`:
+    (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over all axes
+    but the last.
     """
 
 

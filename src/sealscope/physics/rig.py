@@ -429,8 +429,11 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def makeup_pressure(y: State, p: RigNumbers) -> float:
-    """Compute the pressure [Pa gauge] of the make-up's accumulator after delivering the oil V_up in the state `y`."""
-    if len(p.polytropic) > 0:  # an empty tuple if the gas is isothermal
+    """Compute the pressure [Pa gauge] of the make-up's accumulator in the state `y`.
+
+    The state contains the oil volume V_up (`MADE_UP`) [m^3] that the accumulator has delivered.
+    """
+    if len(p.polytropic) > 0:  # this law is an empty tuple in a rig whose gas is isothermal
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 

@@ -37,11 +37,13 @@ def standstill_force(x: float, p: RigNumbers) -> float:
 def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
-    `force` [N]: load against +x. With a make-up the lower pressure is the charge pressure. Without one the circuit
-    contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted by the oil volumes
-    of the two sides, is therefore the charge pressure.
+    `force` [N]: load against +x. If the rig has a make-up (`made_up`), the lower pressure is the charge pressure. If
+    not, the circuit contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted
+    by the oil volumes of the two sides, is therefore the charge pressure.
     """
-    if p.made_up:  # each line: this pressure if the other one is the charge pressure, at least the charge pressure
+    if p.made_up:
+        # each pressure balances the force with the charge pressure on the other side, or is the charge pressure if that
+        # is higher
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B

@@ -19,18 +19,18 @@ _MAX_OUTPUTS_PER_SAMPLE = 64
 
 
 def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) -> int:
-    """Find the fewest solver outputs per recorded sample such that each controller sample falls on an output.
+    """Find the fewest solver outputs per recorded sample for which every sample of the controller is at an output.
 
-    `rate`, `controller_rate` [Hz]: samples of the recording and of the controller; `min_outputs`: lower limit of the
-    result. Raises InputError if no number up to 64 suits both rates.
+    `rate`, `controller_rate` [Hz]: sampling rates of the recording and of the controller; `min_outputs`: lower limit of
+    the result. Raises InputError if no number up to `_MAX_OUTPUTS_PER_SAMPLE` fits.
     """
     for outputs in range(min_outputs, _MAX_OUTPUTS_PER_SAMPLE + 1):
         spacing = rate * outputs / controller_rate  # outputs per controller sample: must be a whole number >= 1
         if spacing >= 1.0 - 1e-9 and abs(spacing - round(spacing)) < 1e-9 * spacing:
             return outputs
     raise InputError(
-        f"rate of the controller must be a whole multiple or a whole fraction of the sampling rate, {rate:g} Hz, got "
-        f"{controller_rate:g} Hz"
+        f"rate of the controller must be the sampling rate, {rate:g} Hz, times n/m with whole numbers m and n <= "
+        f"{_MAX_OUTPUTS_PER_SAMPLE}, got {controller_rate:g} Hz"
     )
 
 

@@ -183,10 +183,13 @@ class Polyline:
 _MAX_BREAKPOINTS = 1000
 
 
-def polyline(points: Sequence[tuple[float, float]], words: str) -> Polyline:
-    """Make the signal that is linear between the points (t [s], y); `words`: text of the signal ("step 5 at 1 s")."""
+def polyline(points: Sequence[tuple[float, float]], text: str) -> Polyline:
+    """Make the signal that is linear between the points (t [s], y), with its description `text`.
+
+    Example: [(1.0, 0.0), (3.0, 5.0)] with the text "ramp 5 from 1 s to 3 s".
+    """
     t, y = np.array(points, dtype=np.float64).T
-    return Polyline(t, y, words)
+    return Polyline(t, y, text)
 
 
 def polyline_from_table(t: Array, y: Array, what: str = "a table") -> Polyline:

@@ -59,13 +59,14 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
         text = data.decode("utf-8-sig")
         if any(key[0].count(".") > _MAX_DOTS for key in _KEY.finditer(text)):
             raise ValueError(f"a dotted key must have at most {_MAX_DOTS} dots")
-        if (memory := _estimate_memory(text)) > max(_MAX_MEMORY, _MEMORY_RATIO * len(data)):
-            raise ValueError(f"{len(data)} bytes of text must take less memory when parsed, got some {memory} bytes")
+        max_memory = max(_MAX_MEMORY, _MEMORY_RATIO * len(data))
+        if (memory := _estimate_memory(text)) > max_memory:
+            raise ValueError(f"its tables must take at most {max_memory} bytes of memory, got about {memory} bytes")
         tree = tomllib.loads(text)
         _check_whole_numbers(tree)
     except UnicodeDecodeError as error:
         raise InputError(f"{what} must be UTF-8 text, got byte {data[error.start]:#04x} ({place})") from None
-    except (ValueError, RecursionError) as error:  # tomllib passes errors of dates and of very long numbers on
+    except (ValueError, RecursionError) as error:  # tomllib: ValueError also for wrong dates and very long numbers
         raise InputError(f"{what} must be TOML: {str(error).splitlines()[0]} ({place})") from None
     return tree
 

@@ -113,7 +113,7 @@ class CommissionedMachine:
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which the machine must be repaired, such as "5 mL/min".
+        Smallest leak that calls for a repair, such as "5 mL/min".
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
@@ -348,16 +348,17 @@ def commission(
         Stated parameters of the machine: a Rig, the name of a packaged rig or the path of a TOML file; by default
         nothing is stated.
     map : mapping of str to str, or "auto", optional
-        Column of the logs for each channel, as for `sealscope.read`; by default the map in the rig's file.
+        Name of the column in the logs by channel, such as ``{"p_A": "PG_1"}``, as for `sealscope.read`; by default the
+        map in the rig's file.
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Leak from which the machine must be repaired: a flow (``"5 mL/min"``) or a creep speed of the piston
-        (``"8 mm/min"``, the default).
+        Smallest leak that calls for a repair: a flow (``"5 mL/min"``) or a creep speed of the piston (``"8 mm/min"``,
+        the default).
     name : str, optional
         Name of the machine.
     keep : bool, optional
-        Whether to keep a recording that is judged leaking in comparison with the others; by default it is left out.
+        True to keep recordings in which a comparison with the others finds a leak; by default they are left out.
 
     Returns
     -------

@@ -75,19 +75,18 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, for a recording on which no detector decides.
 
-    `ranked` are the decisions of all detectors by rank, and `usable` those of detectors that could use the recording.
-    The reason is that of the first usable detector. If this detector is the change of RMS, the reason why the volume
-    balance cannot be used is put before it. If no detector is usable, the reason is that of the last built-in detector
-    by rank, which needs the fewest channels.
+    `ranked`: decisions of all detectors, by rank; `usable`: those of detectors that could use the recording. The first
+    usable detector gives the reason. If that is `RMS_CHANGE`, the last by rank, no other detector could use the
+    recording; the reason of the volume balance is then put first. If no detector is usable, the last built-in one by
+    rank gives the reason, because it needs the fewest channels.
     """
     if usable:
         undecided = usable[0]
         balance_reason = next((decision.reason for decision in ranked if decision.detector == VOLUME_BALANCE), "")
         if undecided.detector == RMS_CHANGE and balance_reason:
-            # a missing channel would help more than a higher sampling rate
+            # the balance may name a missing channel, RMS_CHANGE a higher sampling rate: the channel would help more
             undecided = replace(undecided, reason=f"the {VOLUME_BALANCE} {balance_reason}; {undecided.reason}")
     else:
         built_in = [decision for decision in ranked if decision.detector in (*ORDER, RMS_CHANGE)] or list(ranked)
         undecided = Evidence(CANNOT_TELL, built_in[-1].reason if built_in else "there is no detector")
-    # the combined evidence belongs to no single detector
-    return replace(undecided, detector="", parts=tuple(ranked), usable=True)
+    return replace(undecided, detector="", parts=tuple(ranked))  # "": no single detector has decided

@@ -651,13 +651,13 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    If a flow meter is recorded, its flow alone decides. The limit of the piston's speed is then minus infinity, so that
-    the piston never counts as resting: while little oil enters the cylinder, the valves are closed, and a piston that
-    still moves creeps by a leak. `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose
-    left side is the flow of the pump or of the meter.
+    If the flow is that of a meter (`q_pump`), it alone decides. Below the fraction `rest.moves` (`priors.toml`) of its
+    mean in motion, the valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is
+    then minus infinity: the piston never counts as resting. `samples`: arrays by channel name at the `rate` [Hz];
+    `balance`: volume balance, whose left side is the flow of the pump or of the meter.
     """
     signals = Signals(samples, rate)
-    if flow_source(samples) == "q_pump":
+    if flow_source(samples) == "q_pump":  # no angle or speed of the pump is recorded
         max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
         return RestLimits(pump=max_flow, piston=-math.inf)
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))

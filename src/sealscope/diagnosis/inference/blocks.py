@@ -681,11 +681,15 @@ def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
 
 
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Array]:
-    """Compute the joint likelihood of leak and flow offset (bias, `roles.bias`) in K blocks, for the first equation.
+    """Compute the joint likelihood of the leak and the flow offset in K blocks, from their first volume balance.
 
-    Returns precision (2 K, 2 K) and vector (2 K,) as in `onset.Information`, the K leaks first, and the mean pressure
-    difference (K,) [Pa] in each block, 0 in blocks without a flow offset. The offset is stated as the flow at this mean
-    pressure difference, not at p_A = p_B, so that it is uncorrelated with the leak of the same block.
+    The flow offset is the constant flow in the balance, in the column `roles.bias`. Returns
+
+    - `precision` (2 K, 2 K) and `vector` (2 K,) as in `onset.Information`, for the K leaks and then the K flow offsets;
+    - the mean of p_A - p_B (K,) [Pa] in each block, 0 in blocks without a flow offset.
+
+    The flow offset of a block is its constant flow at this mean of p_A - p_B, not at p_A = p_B. The columns of leak and
+    offset are then orthogonal in each block.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
@@ -696,7 +700,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     # mean of p_A - p_B in each block: the leak's column is (p_A - p_B) dt, that of the flow offset is dt
     mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(blocks, 0, roles)
-    # subtract this mean from the leak's column, so that leak and flow offset are uncorrelated in the block
+    # subtract this mean from p_A - p_B in the leak's column, which makes it orthogonal to that of the flow offset
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]

@@ -144,27 +144,32 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Arr
 
 
 def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
-    """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the random walk.
+    """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the leak's random walk.
 
-    For each q the best step up and the variance kappa of the noise are fitted. `steps` (n, K): matrix S, whose column k
-    is the change of the residuals by a unit step of the leak's coefficient from block k on. A walk consists of steps of
-    independent sizes in all blocks. Thus cov residuals = kappa (I + q S S'), which is diagonal along S times the
-    eigenvectors of S' S. `walks` (w,): values of q, in units in which q = 1 changes the residuals on average as much as
-    the noise does.
+    The model of the residuals is that of `_find_relative_offset`:
+
+        residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S').
+
+    For each q the likelihood is maximised over the block k in which the leak begins, its size and the variance kappa.
+    Only sizes > 0 count, as a leak does not heal. `steps` (n, K): matrix S, whose column k is the change of the
+    residuals if the leak's coefficient rises by 1 from block k on. `walks` (w,): variances q relative to the one for
+    which walk and noise have the same mean variance over the residuals.
     """
+    # I + q S S' is diagonal in the basis of S times the eigenvectors of S' S
     eigen, basis = np.linalg.eigh(steps.T @ steps)
     is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)
     eigen, basis = eigen[is_informative], basis[:, is_informative]
     n = len(residuals)
+    # now factors of S S', whose mean diagonal element is the sum of its eigenvalues over n
     walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
     variances = 1.0 + walks[:, None] * eigen  # variance of the residuals along each eigenvector, over kappa
     directions = steps @ (basis / np.sqrt(eigen))  # orthonormal
     in_span = directions.T @ residuals
     off_span = residuals - directions @ in_span
     total = float(off_span @ off_span) + (in_span**2 / variances).sum(axis=1)
-    # products of a step from each block on, (w, K), with the residuals and with itself
+    # products (w, K) of each column of S with the residuals and with itself, weighted by the inverse covariance
     moments = (np.sqrt(eigen) * in_span / variances) @ basis.T
     energies = np.maximum((eigen / variances) @ (basis**2).T, np.finfo(float).tiny)
-    # 1e-9: lower limit against rounding errors
+    # maximum(moments, 0): steps up only; 1e-9: the difference may be 0 by rounding errors
     residual_squares = np.maximum(total - (np.maximum(moments, 0.0) ** 2 / energies).max(axis=1), 1e-9 * total)
     return np.asarray(-0.5 * np.log(variances).sum(axis=1) - 0.5 * n * np.log(residual_squares))

@@ -242,13 +242,15 @@ class LiveBalance:
         return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the balances to the first blocks, and set the usual precision; return the leakage conductances.
+        """Fit the balances to the first blocks together, then estimate the leakage conductance in each block.
 
-        Blocks at standstill are left out, so that the list may be empty.
+        The median of the blocks' precisions is stored as that of a usual block: `_estimate_block` compares the
+        precision at standstill with it. Blocks that are too uncertain are left out, so that the list may be empty.
         """
-        for number, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
-            grams = np.ascontiguousarray(blocks.gram[:, number])  # products of one balance in each block
+        for index, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
+            grams = np.ascontiguousarray(blocks.gram[:, index])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
+        # updates_model=False: the fit already contains these blocks
         solutions = [self._solve_block(block, updates_model=False) for block in _split(blocks)]
         self._precision = float(np.median([precision for precision, *_ in solutions]))
         estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))

@@ -88,21 +88,21 @@ class SignalWindow:
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test each feature for a step in the blocks that begin at `since` [s] or later.
+        """Test the features for steps in the blocks that begin at `since` [s] or later.
 
-        The result is empty for fewer than `MIN_BLOCKS` blocks.
+        Duty (command and motion) and sensors (noise, hum, sense of p_A - p_B) are tested in the blocks in motion only,
+        the mean pressures in all blocks. The result is empty for fewer than `MIN_BLOCKS` blocks.
         """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
             return ()
         time = rows[:, [_BEGIN, _END]].mean(axis=1)
-        # duty and sensors are tested in the blocks in motion only
         is_moving = is_in_motion(rows[:, _MOVING])
         moving_time, columns = time[is_moving], zip(FEATURES, rows[is_moving, _FEATURES].T, strict=True)
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
         sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
-        return run_tests(  # a test whose numbers overflow ends early
+        return run_tests(  # if numbers overflow in one test, the other tests still run
             lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
             lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
             lambda: level_observables(self._test_levels(rows, time)),

@@ -59,7 +59,7 @@ class Diagnosis(Evidence):
     machine : AssumedMachine, optional
         Assumed sizes of the machine, and whether they were stated.
     limit : RepairLimit
-        Leak from which the machine must be repaired.
+        Smallest leak that calls for a repair.
     about : mapping of str to str
         Statements in the recording's file, such as operator, machine and oil temperature.
     start : str, optional

@@ -67,9 +67,10 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    If `states.toml` lists the `cause` of the change, the action is that for the cause. So is the state, unless the
-    condition is a leak past piston or pump (`LEAKING`). `since_s` is the time at which the state began [s]. A given
-    `action` replaces that of `states.toml`.
+    The condition gives the name of the state and the action. If `states.toml` lists the `cause` of the change, the
+    action of the cause is used instead, and its state if it has one. With a leak past piston or pump (`LEAKING`) only
+    the condition gives the state. `since_s`: time at which the state began [s]; `action`: replaces that of
+    `states.toml`.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]

@@ -18,11 +18,12 @@ IMPLICIT: Implicit = (True,)
 
 
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
-    """Compute the times (nodes,) within a step of h [s] at which a method, `IMPLICIT` or `EXPLICIT`, needs its inputs.
+    """Compute the times within a step of `h` [s] at which the integration method needs its inputs, shape (nodes,).
 
-    The first and last lie just inside the step, where an input that jumps between two steps has the value of this step.
+    `implicit`: the method, `IMPLICIT` or `EXPLICIT` (an empty tuple). The first and the last time lie just inside the
+    step: if an input jumps between two steps, its values there are those of this step.
     """
-    nodes = np.array(IMEX_NODES if implicit else RK4_NODES)
+    nodes = np.array(IMEX_NODES if len(implicit) > 0 else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
     return nodes * h
 

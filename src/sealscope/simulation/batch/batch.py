@@ -256,21 +256,23 @@ def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> 
 
 
 def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array, threads: int) -> Array:
-    """Find the leakage coefficients (runs,) that give the stated mean flows of a set's leaks, by `size_leaks`.
+    """Find the leakage coefficients (runs,) for which the leaks of a set have their stated mean flows.
 
-    `coefficients`: start values; `step` [s]: longest step of the solver if the set does not state one.
+    `coefficients`: start values of the search (`size_leaks`); `step` [s]: longest step of the solver if the set does
+    not state one.
     """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
-    def measure_unit_flows(coefficients: Array) -> tuple[Array, None]:
-        """Simulate the set; return each leak's mean flow [m^3/s] per unit of coefficient (runs,), and None for the run.
+    def measure_unit_flows(trial_coefficients: Array) -> tuple[Array, None]:
+        """Simulate the set; return each leak's mean flow [m^3/s] per unit of its coefficient (runs,), and None.
 
         For a coefficient of 0, it is the flow that a leak of coefficient 1 would have under the pressures of the run.
+        `size_leaks` also expects a run, which is not needed here: None.
         """
-        flow_coefficients = np.where(coefficients > 0, coefficients, 1.0)
-        run_step = stated_step or min(step, longest_allowed_step(experiment_set, coefficients))
-        run = SetRun(experiment_set, run_step, coefficients, flow_coefficients=flow_coefficients, bounds=None)
+        flow_coefficients = np.where(trial_coefficients > 0, trial_coefficients, 1.0)
+        run_step = stated_step or min(step, longest_allowed_step(experiment_set, trial_coefficients))
+        run = SetRun(experiment_set, run_step, trial_coefficients, flow_coefficients=flow_coefficients, bounds=None)
         run.run_all(threads, None)
         unit_flows = run.mean_flow() / flow_coefficients
         never_open = np.flatnonzero((mean_flows > 0) & (unit_flows <= 0))

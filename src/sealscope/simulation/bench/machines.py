@@ -167,22 +167,23 @@ def draw(
 ) -> BenchMachine:
     """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
 
-    Uncertain parameters and their drifts are drawn, and so is the duty: command and its amplitude, throttles, load and
-    controller. `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the
-    parameters drift; `family`: one of the profile's families of machines, "" for none. Raises InputError for a seed
-    below 0, a duration that is not positive and finite, or an unknown rig, profile or family.
+    Uncertain parameters and their drifts are drawn. The duty is drawn, too: the command and its amplitude, the closed
+    fraction of the throttles, the load and the controller. `profile`: a profile, its name or its file; `duration` [s]:
+    length of the recording, over which the parameters drift; `family`: one of the profile's families of machines, ""
+    for none. Raises InputError for a seed below 0, a duration that is not positive and finite, or an unknown rig,
+    profile or family.
     """
     from sealscope.parameters import load_rig
 
     distribution = load_profile(profile) if isinstance(profile, str) else profile
-    warms = bool(family) and distribution.family(family).warms
+    oil_warms = bool(family) and distribution.family(family).warms  # True: the oil never wanders, but warms linearly
     distribution = distribution.of_family(family) if family else distribution
     designed_rig = load_rig(rig)
     if seed < 0:
         raise InputError(f"seed must be >= 0, got {seed}")
     if not (math.isfinite(duration) and duration > 0):
         raise InputError(f"duration must be > 0 s and finite, got {duration}")
-    oil_shapes = ("linear",) if warms else ("linear", "wander")
+    oil_shapes = ("linear",) if oil_warms else ("linear", "wander")
     oil = _draw_path(_random_stream(seed, "temperature of the oil"), oil_shapes, duration, warms=True)
     overrides: dict[str, float | str] = {}
     drifts: list[ParameterDrift] = []
@@ -202,9 +203,9 @@ def draw(
         """Draw one of the options, each with the same probability."""
         return options[int(random.integers(len(options)))]
 
-    command, closed = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
-    overrides |= {"line.closed_A": closed, "line.closed_B": closed}
-    if closed > 0:
+    command, closed_fraction = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
+    overrides |= {"line.closed_A": closed_fraction, "line.closed_B": closed_fraction}
+    if closed_fraction > 0:
         overrides["line.orifices"] = "present"
     amplitude = float(random.uniform(*duty.amplitude))
     if amplitude != 1.0:
@@ -212,5 +213,14 @@ def draw(
     load = parse_force(draw_one(duty.loads)) if duty.loads else None
     controller = draw_one(duty.controllers) if duty.controllers else "pi"
     return BenchMachine(
-        distribution.name, seed, designed_rig, duration, overrides, tuple(drifts), command, closed, load, controller
+        profile=distribution.name,
+        seed=seed,
+        rig=designed_rig,
+        duration=duration,
+        overrides=overrides,
+        drifts=tuple(drifts),
+        command=command,
+        closed=closed_fraction,
+        load=load,
+        controller=controller,
     )

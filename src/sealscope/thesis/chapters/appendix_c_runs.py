@@ -156,7 +156,7 @@ def column(table: ThesisTable, head: str) -> Array:
 
 def parse_sheet(table: ThesisTable) -> DataSheet:
     """Build the data sheet from a table of simulated tests, with one test per row and the columns `COLUMNS`."""
-    # shape: (chambers, details, halves of the test, tests)
+    # shape: (chambers, `QUANTITIES`, 2, tests), where 2 stands for the halves of a test: a leak opens at half time
     values = np.array([column(table, head) for *_, head in _RMS_COLUMNS]).reshape(len(CHAMBERS), len(QUANTITIES), 2, -1)
     return DataSheet({c: {q: values[k, j].T for j, q in enumerate(QUANTITIES)} for k, c in enumerate(CHAMBERS)})
 

@@ -91,12 +91,14 @@ THRESHOLDS = (
 
 
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the tests in which each rule of Table 5.1 fires (indicates a leak), as rows with the columns `RATES`.
+    """Count for each rule of Table 5.1 the tests in which it fires (indicates a leak); return rows of a table.
 
-    `measured`: measured sheet, None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without leak,
-    and without leak but with drifting parameters. Two more rows are for rules that always and that never fire. The last
-    cell of a row is the rate with leak minus the rate with drift [percentage points].
+    The table has the columns `RATES` and a row for each rule. For comparison it has two more rows, for a rule that
+    fires in all tests and one that fires in none. `measured`: measured sheet, None if not given; `leak`, `no_leak`,
+    `drift`: sheets simulated with leak, without leak, and without leak but with drifting parameters. The last cell of a
+    row is the rate with leak minus the rate with drift [percentage points].
     """
+    # by name: the success rates that the thesis prints ("" for none), and the function that finds the firings
     rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
         **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
         "always fires": ("", lambda sheet: np.full(sheet.tests, True)),

@@ -92,13 +92,15 @@ def reproduce(
 
     `patterns`: selection (`items.select_items`); `quick`: True to simulate less; `jobs`: number of processes, by
     default one per core, 1 for this process only; `sheet`: folder of the measured data sheet; `items`: the list to
-    select from, by default that of `items.toml`; `publish`: writes the products as files, None to write none;
-    `progress`: called with the numbers of finished and of all items to make, and the ids of those in work.
+    select from, by default that of `items.toml`; `publish`: function that writes the products as files, None for no
+    files; `progress`: called with the number of finished items, the number of all items that this call makes, and the
+    ids of the items that are being made.
 
     Results that an earlier call stored in `folder` from the same inputs are reused. A failed item does not stop the
     others, and KeyboardInterrupt leaves all finished items stored.
 
-    Raises InputError for an unknown item, a bad sheet, or a folder that is damaged, in use or cannot be written.
+    Raises InputError for `jobs` below 1, an unknown item, an invalid data sheet, or a folder that is damaged, in use or
+    cannot be written.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"jobs must be >= 1, got {jobs}")
@@ -208,18 +210,18 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make one item (a figure, table or claims) and write its files; return the result, or the error, to be stored.
+    """Make one item (a figure, table or claims) and write its files; return the row to store, with result or error.
 
-    `quick`: True to simulate less; `sheet`: measured data sheet, None if not given; `publish`: writes the files, None
-    to write none; `folder`: folder of the results; `runs`: folder of simulated runs; `job`: the item, its key, and the
-    products of the items it needs.
+    `quick`: True to simulate less; `sheet`: data sheet with the measured tests, None if not given; `publish`: function
+    that writes the files, None for no files; `folder`: folder of the results; `runs`: folder of the simulated runs that
+    all items share; `job`: the item, its key, and the products of the items it needs.
     """
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)
     try:
-        products = tuple(map(_thin_product, item.make(context, item)))
+        products = tuple(map(_thin_product, item.make(context, item)))  # figures with fewer points
         files = () if publish is None else publish(item, products, folder)
-        row = ItemRow(item.id, key, tuple(map(drop_curves, products)), files)
+        row = ItemRow(item.id, key, tuple(map(drop_curves, products)), files)  # figures are stored without curves
         dumps(row.as_dict())  # if a row cannot be stored, only its own item fails
     except Exception as error:
         return ItemRow(item.id, key, error=error_text(error) or type(error).__name__, trace=traceback.format_exc())

@@ -44,8 +44,8 @@ if TYPE_CHECKING:
 #: Reason for having no balance; the key is True if the position is recorded.
 _NO_BALANCE = {
     True: "finds no time in which the piston is held under a constant command u, for long enough, in {:.3g} s",
-    False: "no loop brings the piston back or holds it under a pressure difference, for long enough in {:.3g} s, so "
-    "that what leaks moves it: record its position x",
+    False: "needs the position x: for too little of the {:.3g} s does a loop bring the piston back or hold it under "
+    "a pressure difference, so that a leak moves it",
 }
 #: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
@@ -303,18 +303,19 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Make the report of a volume balance: tests, leakage, and how much of the recording is judged.
+        """Make the report of a volume balance: test results, leakage, and the judged part of the recording.
 
         `Observed.share` is the fraction of the samples that were used, `Observed.judged_until` the end of the last
-        block with used samples, as a fraction of the recording. If the leakage can be tested neither for a step nor
-        against the `healthy` recordings (none if empty), the report states only the reason.
+        block with used samples, as a fraction of the recording. The leakage is tested for a step within the recording
+        and compared with that of the `healthy` recordings, if there are any. If neither is possible, the report states
+        only the reason.
         """
         leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
-            lack = "p_A and p_B hardly differ, or too few samples are whole: no leak would show"
-            return Observed(self.name, lack=lack)
-        # a block with missing samples has fewer rows; without a position the number of rows also depends on the motion,
-        # and the whole recording counts as judged
+            reason = "finds p_A and p_B too similar, or too few samples without gaps, to show a leak"
+            return Observed(self.name, lack=reason)
+        # a block with missing samples has fewer rows; but if the position is not recorded, the number of rows also
+        # depends on the motion, and the whole recording counts as judged
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks

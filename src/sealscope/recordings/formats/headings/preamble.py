@@ -94,12 +94,14 @@ def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
     """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`.
 
-    `delimiter`: separator of the log's cells, which may also separate the name of a remark from its text.
+    Returns name -> text for up to `_MAX_REMARKS` remarks (`collect_remarks`). Only the first 4 * `_MAX_REMARKS` of the
+    `lines`, and 500 characters of each, are read. `delimiter`: separator of the log's cells, which may also separate
+    the name of a remark from its text.
     """
     pairs: list[tuple[str, str]] = []
     for line in lines[: 4 * _MAX_REMARKS]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]
-        if delimiter.strip() or delimiter == "\t":  # a blank also separates words
+        if delimiter.strip() or delimiter == "\t":  # not a blank, which a name of two words contains, too
             name, separator, value = text.partition(delimiter)
             if separator and name.strip() and value.strip(f" {delimiter}") and ":" not in name:
                 pairs.append((name, value.strip(f" {delimiter}")))

@@ -132,12 +132,12 @@ def _iter_packets(lines: Iterator[tuple[int, str]], delimiter: str, decimal: str
 def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     """Join the samples of each channel from all packets that have the same columns as the first one.
 
-    `x_columns`: "one" if all channels share a column of times, "multi" if a column of times stands before each channel,
-    or "no" if the headers of the packets state start and step instead.
+    `x_columns`: "one" if all channels share a column of times, "multi" if each channel follows its own column of times,
+    or "no" if the headers of the packets state start and step of the times; the column of times is then blank.
     """
     first, names = packets[0], packets[0].names
-    times = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
-    if not times:
+    time_columns = [column for column, name in enumerate(names) if name.casefold().startswith("x_value")]
+    if not time_columns:
         raise InputError(f"a LabVIEW measurement file must have a column X_Value, got {', '.join(names)}")
     matching = [packet for packet in packets if packet.names == names]
     check_size(sum(len(packet.rows) for packet in matching), len(names))
@@ -145,9 +145,9 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
     offsets = _packet_offsets(matching, day_first)
     is_multi = x_columns == "multi"
     series = []
-    for index, column in enumerate(column for column in range(len(names)) if column not in times):
-        times_before = [time for time in times if time < column]
-        time_column = times_before[-1] if is_multi and times_before else times[0]
+    for index, column in enumerate(column for column in range(len(names)) if column not in time_columns):
+        preceding = [time_column for time_column in time_columns if time_column < column]
+        time_column = preceding[-1] if is_multi and preceding else time_columns[0]
         values, times_of_packets = [], []
         for packet, offset in zip(matching, offsets, strict=True):
             samples = packet.column(column)

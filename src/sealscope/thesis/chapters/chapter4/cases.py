@@ -180,21 +180,28 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Summarise the pressures and flows from pi to 2 pi seconds of a run (`STEADY`) by a few numbers, by name.
+    """Compute the numbers by which runs are compared from the pressures and flows in the steady part of a run.
 
-    In Pa: "range of p_A" (maximum minus minimum) and "peak of p_A" (maximum) of each pressure; "least pressure", the
-    lowest of all; "mean of p_1 - p_A" and "mean of p_2 - p_B", the mean drops at the orifices; "largest drop", the
-    largest magnitude of either drop. "flows differ" is rms(Q_A - Q_B) / rms(Q_A). All are nan if the run diverged.
+    The steady part (`STEADY`) is the time from pi to 2 pi s. All numbers are nan if the run diverged. Pressures in Pa:
+
+    - "range of p_A", "peak of p_A": maximum minus minimum, and maximum, of each pressure;
+    - "lowest pressure": minimum of all pressures;
+    - "mean of p_1 - p_A", "mean of p_2 - p_B": mean drops at the orifices;
+    - "largest drop": largest magnitude of these drops.
+
+    "flow difference" is rms(Q_A - Q_B) / rms(Q_A).
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
     return {
         **{f"range of {name}": float(np.ptp(outputs[name])) for name in PRESSURES},
         **{f"peak of {name}": float(outputs[name].max()) for name in PRESSURES},
-        "least pressure": min(float(outputs[name].min()) for name in PRESSURES),
+        "lowest pressure": min(float(outputs[name].min()) for name in PRESSURES),
         **{f"mean of {name}": float(np.mean(drop)) for name, drop in drops.items()},
         "largest drop": max(float(np.abs(drop).max()) for drop in drops.values()),
-        "flows differ": float(np.sqrt(np.mean((outputs["Q_A"] - outputs["Q_B"]) ** 2) / np.mean(outputs["Q_A"] ** 2))),
+        "flow difference": float(
+            np.sqrt(np.mean((outputs["Q_A"] - outputs["Q_B"]) ** 2) / np.mean(outputs["Q_A"] ** 2))
+        ),
     }
 
 

@@ -270,7 +270,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
     min_visible = cases.visible_pressure()
     # by interpretation: rows[0] is the run with open orifices, rows[1] that with orifices that are 25 % closed
     opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
-    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flows differ"  # keys of a run's summary
+    p_1, p_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flow difference"  # keys of a run's summary
 
     def peak_and_range_changes(rows: Rows) -> list[float]:
         """Compute the changes of all pressures' peaks and ranges [Pa] from open orifices to 25 % closed."""
@@ -376,9 +376,9 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
 #: Keys of a run's summary that the table of runs shows, and the factor from SI units to the table's units.
 _TABLE_FACTORS: dict[str, float] = {
     **{f"range of {name}": 1e-6 for name in PRESSURES},
-    "least pressure": 1e-6,
+    "lowest pressure": 1e-6,
     **dict.fromkeys(("mean of p_1 - p_A", "mean of p_2 - p_B", "largest drop"), 1e-3),
-    "flows differ": 100.0,
+    "flow difference": 100.0,
 }
 _HALVING_TEST = {True: "passed", False: "not passed", None: "not made"}
 
