@@ -128,9 +128,10 @@ class Controller(Protocol):
     """A sampled controller of the piston's position: the interface that a controller of your own must have.
 
     `rate` [Hz]: sampling rate, the rig's times n/m with whole numbers n and m up to 64; `delay`: number of whole
-    samples from a measurement to the voltage computed from it. A run calls `start` once, and then calls the returned function
-    once a sample. All state must be in this function: then a run can be repeated. The voltage is constant between
-    samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify the run.
+    samples from a measurement to the voltage computed from it. A run calls `start` once, and then calls the returned
+    function once a sample. All state must be in this function: then a run can be repeated. The voltage is constant
+    between samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify
+    the run.
 
     The function may have an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample.
     The recording then has it as channel `q_comp`; without it, control would hide the wear.
