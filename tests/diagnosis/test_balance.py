@@ -170,6 +170,27 @@ def test_a_press_whose_pump_moves_more_oil_outward_than_back_is_wired_as_it_is()
     assert balance.conductance.value / seal == pytest.approx(1.0, rel=0.05)
 
 
+def test_a_machine_that_brakes_what_others_drive_is_wired_as_it_is() -> None:
+    """A die cushion: the load drives the piston both ways, so that the pressures work against the motion."""
+    cushion = machine(1, speed=irregular(3), load=lambda t: -2e6 * np.sign(irregular(3)(t)), G_pump=5e-13)
+    balance = VolumeBalance(RIG).balance(cushion)
+    assert balance is not None
+    assert balance.conductance.value == pytest.approx(5e-13, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [2.0, 10.0])
+def test_a_slow_logger_of_a_slow_machine_tells_a_leak(rate: float) -> None:
+    """As a plant's historian records a gate or a turbine's valve."""
+    slow = machine(
+        2, G=step(0.0, LEAK, 1200.0), speed=lambda t: 12.0 * np.sin(0.1 * t), duration=2400.0, rate=rate, x_step=0.0
+    )
+    assert VolumeBalance(RIG).usable(slow) is None
+    test, _ = judged(slow)
+    assert test.score > 30.0
+    assert test.fitted[0] == pytest.approx(LEAK, abs=4.0 * test.fitted[1])
+    assert test.onset().low < 1200.0 < test.onset().high
+
+
 def test_units_of_a_file_change_nothing(tmp_path: Path) -> None:
     recording = leaking(duration=30.0)
     tables = {

@@ -87,7 +87,7 @@ def test_samples_that_are_missing_cost_the_rows_that_touch_them() -> None:
 def test_a_pressure_difference_that_zeros_of_sensors_make_tells_nothing() -> None:
     evidence = examined(balanced(2.0, 2e4, 1e-12, rise=3e-12))
     assert (evidence.verdict, evidence.score) == ("cannot tell", None)
-    assert "record its position x" in evidence.reason
+    assert "needs the position x" in evidence.reason
 
 
 def test_the_accumulator_tells_oil_that_leaves_from_oil_that_passes() -> None:

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.rows.weak_form import STRIDE
-from sealscope.diagnosis.inference.volumes.detector import MIN_STRIDE
+from sealscope.diagnosis.inference.rows.weak_form import MIN_STRIDE, STRIDE
 from sealscope.errors import InputError
 from sealscope.fmu.description import format_description, templates
 from sealscope.fmu.machine import FAILURES, RigChoice, object_code, rig_code

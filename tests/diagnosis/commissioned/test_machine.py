@@ -205,6 +205,14 @@ def test_a_temperature_that_is_not_read_is_named_when_a_machine_is_commissioned(
 
 
 @pytest.mark.slow
+def test_a_map_that_no_recording_fits_is_refused(healthy, tmp_path):
+    """Its pressures would be read without it, and whatever else it names would be lost."""
+    ss.write(healthy[0], tmp_path / "day.csv")
+    for wrong in ("omega*x m", "Weg"):
+        with refusal(wrong):
+            ss.commission(tmp_path, map={"p_A": "p_A", "p_B": "p_B", "x": wrong})
+
+
 def test_files_of_one_name_in_several_folders_are_told_apart(healthy, tmp_path):
     for day, recording in enumerate((*healthy, ss.simulate(command="3 sin(4t)", duration="20 s", seed=4)), start=1):
         place = tmp_path / f"day{day}"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -31,7 +31,7 @@ from sealscope.errors import InputError, SealscopeError, UnreadableFile
 from sealscope.paragraphs import format_count
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
-from sealscope.recordings.formats.columns import ChannelMap
+from sealscope.recordings.formats.columns import REST, ChannelMap
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files
@@ -384,7 +384,7 @@ def commission(
     'leak'
     """
     RepairLimit.parse(limit)
-    stated_rig = None if rig is None else load_rig(rig)
+    stated_rig, stated_map = None if rig is None else load_rig(rig), map
     if map is None:
         map = {} if stated_rig is None else stated_rig.channel_map
     machine = CommissionedMachine(name, (), stated_rig, map, rate, limit)
@@ -406,6 +406,8 @@ def commission(
             recording_of[label] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
+    if stated_map is not None and stated_map != "auto":
+        _check_map(stated_map, machine.healthy, lambda: read(files[0], map=stated_map, rate=rate))
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
@@ -413,6 +415,18 @@ def commission(
 
     healthy, leaking = cross_check(machine.healthy, judge, keep)
     return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
+
+
+def _check_map(
+    channel_map: Mapping[str, str], healthy: Sequence[SummarisedRecording], read_first: Callable[[], Recording]
+) -> None:
+    """Raise the error of `read_first`, which reads a log with the map, if no `healthy` recording fits a stated map.
+
+    A recording fits if it has all channels that the map names. Those that do not fit were read without the map.
+    """
+    named = channel_map.keys() - {REST, "t"}
+    if not any(named <= recording.units.keys() for recording in healthy):
+        read_first()
 
 
 def _distinct_names(paths: Sequence[Path]) -> list[str]:

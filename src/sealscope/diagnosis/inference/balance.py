@@ -21,8 +21,8 @@ from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     OVERLAP,
     SPAN,
-    STRIDE,
     stride_samples,
+    strides_in,
     weak_form_rows,
     weights_near_holes,
 )
@@ -111,7 +111,7 @@ class BlockStream:
         self.columns = tuple(ColumnRoles(balance) for balance in balances)
         self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
-        self._strides_per_block = max(SPAN, round(block_s / STRIDE))
+        self._strides_per_block = strides_in(block_s, rate)
         # samples on either side of a block that its speeds and rests depend on; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)  # a term that is 0 at rest
@@ -504,7 +504,7 @@ def min_samples_for_step(rate: float) -> int:
     functions extend. A test function begins at each multiple of the stride, and is `SPAN` strides long.
     """
     stride = stride_samples(rate)
-    block = max(SPAN, round(MIN_BLOCK_TIME / STRIDE)) * stride  # [samples]
+    block = strides_in(MIN_BLOCK_TIME, rate) * stride  # [samples]
     return MIN_BLOCKS * block + (SPAN - 1) * stride + 1
 
 

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.recording import Array
 
-#: Distance of neighbouring test functions [s], and how many of these distances a test function spans.
-STRIDE = 0.125
+#: Distance of neighbouring test functions [s] and its minimum [samples]; how many distances a test function spans.
+STRIDE, MIN_STRIDE = 0.125, 2
 SPAN = 4
 #: Weight below which a row next to holes is omitted.
 MIN_WEIGHT = 0.1
@@ -50,8 +50,18 @@ class Rows(NamedTuple):
 
 
 def stride_samples(rate: float) -> int:
-    """Compute the distance of neighbouring test functions of the weak form [samples], at least 1, at a `rate` [Hz]."""
-    return max(1, round(STRIDE * rate))
+    """Compute the distance of neighbouring test functions [samples], at least `MIN_STRIDE`, at a `rate` [Hz]."""
+    return max(MIN_STRIDE, round(STRIDE * rate))
+
+
+def half_width(rate: float) -> float:
+    """Compute half the length of a test function [s] at a sampling `rate` [Hz]."""
+    return 0.5 * SPAN * stride_samples(rate) / rate
+
+
+def strides_in(seconds: float, rate: float) -> int:
+    """Compute the number of distances of neighbouring test functions in a time [s], at least `SPAN`."""
+    return max(SPAN, round(seconds / max(STRIDE, stride_samples(rate) / rate)))
 
 
 @lru_cache(maxsize=8)

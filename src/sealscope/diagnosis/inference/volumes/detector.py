@@ -27,7 +27,6 @@ from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.regimes import add_pump_columns
-from sealscope.diagnosis.inference.rows.weak_form import STRIDE, stride_samples
 from sealscope.diagnosis.inference.terms import CYLINDER, HOLDING, TURNING, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
@@ -52,8 +51,8 @@ _NO_CREEP = "needs {}; without them it judges a held load that creeps in the hea
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
-#: Minimum number of samples between neighbouring test functions.
-MIN_STRIDE = 2
+#: Minimum sampling rate [Hz]; at lower rates the samples hardly follow a stroke.
+MIN_RATE = 1.0
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
@@ -89,10 +88,8 @@ class VolumeBalance:
         channels = frozenset(recording.channels)
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             return f"needs {self.rig.circuit.needed_channels}"
-        if stride_samples(recording.rate) < MIN_STRIDE:
-            return (
-                f"needs {MIN_STRIDE / STRIDE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
-            )
+        if recording.rate < MIN_RATE:
+            return f"needs {MIN_RATE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
         min_samples = min_samples_for_step(recording.rate)
         if len(recording) < min_samples:
             return f"needs {min_samples} samples or more at {recording.rate:g} Hz, got {len(recording)}"

@@ -45,6 +45,7 @@ from sealscope.diagnosis.inference.onset import (
     step_test,
 )
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
+from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.inference.terms import LAG, LOCKED, MIN_ABSOLUTE_PRESSURE, PUMP, Equation, Signals, find_rests
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -126,8 +127,11 @@ class RecordedBalance:
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first block in which the machine moves; 0 if too few blocks remain for a step test."""
-        first = int(np.argmax(self.blocks.is_moving))
+        """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test."""
+        rests = find_rests(self._pumped, self.recording.rate, max_rest_rate(self._pumped, self.recording.rate))
+        begin = float(self.recording.t[0]) + int(np.argmin(rests)) / self.recording.rate
+        starts = self.blocks.start - half_width(self.recording.rate)  # of the first test functions
+        first = max(int(np.argmax(self.blocks.is_moving)), int(np.searchsorted(starts, begin)))
         return first if len(self.blocks) - first >= MIN_BLOCKS else 0
 
     @property
@@ -245,10 +249,12 @@ class RecordedBalance:
     def _pumped(self) -> Array:
         """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,).
 
-        It is NaN while a valve lowers the load past the pump (`flag_lowering`).
+        With a position it is NaN while a valve lowers the load past the pump (`flag_lowering`).
         """
         signals = Signals(dict(self.recording.channels), self.recording.rate, {})
         pumped = self.equations[0].left(signals)
+        if "x" not in self.recording:
+            return pumped
         return np.where(flag_lowering(pumped, signals.step("x"), self.recording.rate), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:

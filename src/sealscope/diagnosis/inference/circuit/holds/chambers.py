@@ -14,20 +14,22 @@ with
 - p_0: atmospheric pressure.
 
 A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way. A check valve may
-fill a side that is at the charge pressure; no balance holds for that side then. A reading is the mean of neighbouring
-samples of a hold (`LockedHold.edges`). The first is of the time in which the valves may still shut; it counts only on
-the side of the lower pressure, whose oil comes through a leak alone: a large leak equalises the pressures within that
-time. The readings of all holds form one regression, each side of a hold about its mean. The dead volumes and the
-logarithms of K and alpha have normal priors (`held_oil` in `priors.toml`); the regression is linearised about the
-estimate, iteratively. Uncertain areas are varied (`HeldChambers.area_variants`). The onset of the leak and the offset z
-are those with the highest posterior; a leak that has equalised the pressures determines z. The three leaks are
-hypotheses, each with its probability. A leak past the piston may grow from its onset on.
+fill a side that is at the charge pressure, or the side without the load may be open to the charge line; no balance
+holds for that side then. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The first is of
+the time in which the valves may still shut; it counts only on the side of the lower pressure, whose oil comes through a
+leak alone: a large leak equalises the pressures within that time. The readings of all holds form one regression, each
+side of a hold about its mean. The dead volumes and the logarithms of K and alpha have normal priors (`held_oil` in
+`priors.toml`); the regression is linearised about the estimate, iteratively. Uncertain areas are varied
+(`HeldChambers.area_variants`). The onset of the leak and the offset z are those with the highest posterior; a leak that
+has equalised the pressures determines z. The three leaks are hypotheses, each with its probability. A leak past the
+piston may grow from its onset on.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -48,6 +50,8 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import (
     LeakHypothesis,
     LeakLaw,
     PistonFit,
+    Supplies,
+    Supply,
     UnitLeak,
     average_fits,
     flow_of_side,
@@ -72,6 +76,8 @@ from sealscope.units import P_ATM
 OFFSET_GRID, N_REFINED = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0]), 17
 #: Values of a normal variable of mean 0 and variance 1, and their weights, of Gauss-Hermite quadrature.
 AREA_NODES, AREA_WEIGHTS = (0.0, 3.0**0.5, -(3.0**0.5)), (2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0)
+#: Supplies of the sides with a smaller log prior are not tried.
+MIN_LOG_PRIOR = -30.0
 #: Number of evenly spaced onsets within a hold.
 N_ONSETS = 4
 #: Probability outside of the interval of an onset.
@@ -118,33 +124,49 @@ class HeldChambers:
         return independent * 2.0 * len(self.holds)
 
     @cached_property
-    def _regressions(self) -> dict[tuple[bool, bool], OilRegression]:
-        """Regressions that estimate the oil's properties, one for each choice of the sides that check valves refill."""
+    def _regressions(self) -> dict[Supplies, OilRegression]:
+        """Regressions that estimate the oil's properties, one for each possible choice of the sides' supplies."""
         return {
-            refilled: build_regression(self.holds, self._closed_flags(refilled), self.sides, self.n_readings)
-            for refilled in (NEITHER, self._refillable_sides, BOTH)
+            supplies: build_regression(self.holds, self._closed_flags(supplies), self.sides, self.n_readings)
+            for supplies in (NEITHER, self._refillable_sides, BOTH, self._unloaded_open)
         }
 
     @property
-    def _refillable_sides(self) -> tuple[bool, bool]:
-        """Flags of A and B: true for the side that a check valve may refill while the piston leaks.
+    def _refillable_sides(self) -> Supplies:
+        """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
-        It is the side of the larger area, neither if the areas are equal. The leak moves equal volumes from one side to
-        the other, and the piston follows the side that loses oil. If the side that gains oil has the larger area, its
-        volume grows by more than the leak supplies.
+        Neither is refilled if the areas are equal. The leak moves equal volumes from one side to the other, and the
+        piston follows the side that loses oil. If the side that gains oil has the larger area, its volume grows by more
+        than the leak supplies.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
-        return area_A > area_B, area_B > area_A
+        if area_A == area_B:
+            return NEITHER
+        return (Supply.CHECK, Supply.SHUT) if area_A > area_B else (Supply.SHUT, Supply.CHECK)
 
-    def _refill_log_prior(self, refilled: tuple[bool, bool]) -> float:
-        """Compute the log prior of the sides whose pressure check valves keep, relative to that of no such side.
+    @cached_property
+    def _unloaded_open(self) -> Supplies:
+        """Supplies of A and B if the side with the lower mean pressure is open, as if only the other had a valve."""
+        means = [np.mean(np.concatenate([getattr(hold, side) for hold in self.holds])) for side in ("p_A", "p_B")]
+        return (Supply.CHECK, Supply.OPEN) if means[0] > means[1] else (Supply.OPEN, Supply.CHECK)
 
-        If both sides keep their pressure, the one that gains oil must drain to the tank. The charge pressure is then
-        that of a tank line, whose gauge pressure has a normal prior with the mean 0 and the standard deviation
-        `held_oil.tank` (`priors.toml`).
+    def _supply_log_prior(self, supplies: Supplies, *, drains: bool) -> float:
+        """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
+
+        An open side has the probability `held_oil.open` (`priors.toml`), and is above the charge pressure in a few
+        readings only, each with the probability `held_oil.above`. If check valves keep both sides at their pressure, a
+        side that gains oil must drain to the tank. The charge pressure is then that of a tank line, whose gauge
+        pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
         """
-        back_pressure: float = INFERENCE.held_oil.tank
-        return -0.5 * ((self.charge - P_ATM) / back_pressure) ** 2 if refilled == BOTH else 0.0
+        prior = INFERENCE.held_oil
+        if Supply.OPEN in supplies:
+            row = supplies.index(Supply.OPEN)
+            n_above = 0.5 * self.n_readings * float(np.concatenate([flags[row] for flags in self._above_charge]).mean())
+            return math.log(prior.open) + n_above * math.log(prior.above)
+        log_prior = math.log1p(-prior.open)
+        if drains and supplies == BOTH:
+            log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank) ** 2
+        return log_prior
 
     def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
@@ -161,40 +183,51 @@ class HeldChambers:
         """Flags (2, n) for each hold of n samples, true where A (row 0) or B (row 1) is above the charge pressure."""
         return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
-    def _closed_flags(self, refilled: tuple[bool, bool]) -> list[NDArray[np.bool_]]:
-        """Flag the samples in which no check valve refills A (row 0) or B (row 1), (2, n) for each hold of n samples.
+    @cached_property
+    def _possible_supplies(self) -> list[Supplies]:
+        """Supplies of A and B that a leak past the piston may have: those with which some reading differs from none.
 
-        `refilled`: for A and for B, true if a check valve refills that side whenever its pressure is not above the
-        charge pressure. A side that is never refilled has only true flags.
+        Without a side that is open longer than a few readings allow, which is as good as impossible.
         """
-        return [flags | ~np.array(refilled)[:, None] for flags in self._above_charge]
+        possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
+        if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
+            possible.append(self._unloaded_open)
+        return [NEITHER, *possible]
 
-    def _closed_share(self, refilled: tuple[bool, bool]) -> float:
-        """Compute the fraction of samples, over both sides and all holds, in which no check valve refills the chamber.
+    def _closed_flags(self, supplies: Supplies) -> list[NDArray[np.bool_]]:
+        """Flag the samples in which A (row 0) or B (row 1) is closed, (2, n) for each hold of n samples.
 
-        `refilled`: as in `_closed_flags`. While a chamber is refilled, its readings (sample means) fit any leak, so
-        that the variance of all readings is too small by this factor.
+        A side is always closed without a supply, never if it is open, and above the charge pressure if a check valve
+        refills it. `supplies`: those of A and B.
         """
-        share = float(np.concatenate(self._closed_flags(refilled), axis=1).mean())
+        is_shut = np.array([supply is Supply.SHUT for supply in supplies])[:, None]
+        has_check = np.array([supply is Supply.CHECK for supply in supplies])[:, None]
+        return [is_shut | (has_check & flags) for flags in self._above_charge]
+
+    def _closed_share(self, supplies: Supplies) -> float:
+        """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
+
+        `supplies`: as in `_closed_flags`. While a side is not closed, its readings (sample means) fit any leak, so that
+        the variance of all readings is too small by this factor.
+        """
+        share = float(np.concatenate(self._closed_flags(supplies), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
-    def _unit_piston_leak(
-        self, offset: float, refilled: tuple[bool, bool] = NEITHER, law: LeakLaw = LAMINAR
-    ) -> UnitLeak:
+    def _unit_piston_leak(self, offset: float, supplies: Supplies = NEITHER, law: LeakLaw = LAMINAR) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
         With the exponent e of the `law` and dp = p_A - p_B - z, the flow out of A is sign(dp) |dp|^e times the law's
         growth factor, which is 1 until the law's onset (`LeakLaw.growth_factor`). The flow out of B is its negative.
         The sensor offset z in a hold may differ from the recording's `offset` [Pa] (`LockedHold.driving_pressure`). The
-        flow of a side counts as 0 while a check valve refills it (`refilled`).
+        flow of a side counts as 0 while the side is not closed (`_closed_flags`).
         """
         flows = []
         for hold in self.holds:
             difference = hold.driving_pressure(offset)
             flow = np.sign(difference) * np.abs(difference) ** law.exponent * law.growth_factor(hold.t, self.end)
             flows.append(np.array([flow, -flow]))
-        is_closed = self._closed_flags(refilled)
-        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], refilled)
+        is_closed = self._closed_flags(supplies)
+        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
 
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
@@ -210,14 +243,15 @@ class HeldChambers:
             offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
         return np.asarray(difference - offsets)
 
-    def _unit_outside_leak(self, is_A: bool) -> UnitLeak:
+    def _unit_outside_leak(self, is_A: bool, supplies: Supplies = BOTH) -> UnitLeak:
         """Compute the flow [Pa] of a laminar leak with a conductance of 1 from A (or B, if not `is_A`) to the outside.
 
-        It is the chamber's gauge pressure, or 0 while a check valve refills the chamber.
+        It is the chamber's gauge pressure, or 0 while the chamber is not closed (`_closed_flags`).
         """
-        pressures = [(hold, hold.p_A if is_A else hold.p_B) for hold in self.holds]
-        flows = [np.maximum(p - P_ATM, 0.0) * self._is_closed(hold, p) for hold, p in pressures]
-        return UnitLeak([flow_of_side(flow, is_A) for flow in flows], refilled=BOTH)
+        pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
+        flows = [flow_of_side(np.maximum(p - P_ATM, 0.0), is_A) for p in pressures]
+        is_closed = self._closed_flags(supplies)
+        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow [Pa] from A (or B, if not `is_A`) through open valves and the pump, for a conductance of 1.
@@ -233,23 +267,24 @@ class HeldChambers:
         return UnitLeak(flows)
 
     @cached_property
-    def _fits_without_leak(self) -> dict[tuple[bool, bool], LeakRegression]:
-        """Fits of the oil's properties without any leak; the keys are the sides that check valves refill."""
+    def _fits_without_leak(self) -> dict[Supplies, LeakRegression]:
+        """Fits of the oil's properties without any leak, by the supplies of A and B."""
         n_rows = len(self._regressions[NEITHER].displaced)  # the same in all regressions
         no_columns = np.empty((n_rows, 0))
         return {
-            refilled: fit_leaks(regression, no_columns, self.n_readings)
-            for refilled, regression in self._regressions.items()
+            supplies: fit_leaks(regression, no_columns, self.n_readings)
+            for supplies, regression in self._regressions.items()
         }
 
     def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
-        """Fit the coefficient of a leak past the piston, given onset, sensor offset and refilled sides (`conditions`).
+        """Fit the coefficient of a leak past the piston, given onset, sensor offset and supplies (`conditions`).
 
-        The likelihood includes the priors on the sensor offset and on the refilled sides.
+        The likelihood includes the priors on the sensor offset and on the supplies.
         """
-        unit_leak = self._unit_piston_leak(conditions.offset, conditions.refilled, law)
+        unit_leak = self._unit_piston_leak(conditions.offset, conditions.supplies, law)
         fit = self._fit_leak(unit_leak, conditions.onset)
-        log_prior = self._refill_log_prior(conditions.refilled) - 0.5 * self._offset_cost(conditions.offset)
+        log_prior = self._supply_log_prior(conditions.supplies, drains=True)
+        log_prior -= 0.5 * self._offset_cost(conditions.offset)
         return fit._replace(log_likelihood=fit.log_likelihood + log_prior)
 
     def start_error(self, conditions: PistonFit, law: LeakLaw) -> float:
@@ -305,15 +340,17 @@ class HeldChambers:
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit the coefficient (>= 0) of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if it has no flow."""
         column = self._leak_columns(leak, np.array([onset]))
-        fit_without_leak = self._fits_without_leak[leak.refilled]
+        fit_without_leak = self._fits_without_leak[leak.supplies]
         value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
         if column.any():
-            fit = fit_leaks(self._regressions[leak.refilled], column, self.n_readings)
+            fit = fit_leaks(self._regressions[leak.supplies], column, self.n_readings)
             # the leak is the only coefficient
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # no leak flows from the lower to the higher pressure
                 value, variance = float(fit.coefficients[0]), fit.variance
-        return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * float(np.log(variance)))
+        # readings of a side that is not closed have no residual, so that their variance is too small
+        closed_variance = variance / self._closed_share(leak.supplies)
+        return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * math.log(closed_variance))
 
     @cached_property
     def onsets(self) -> Array:
@@ -376,8 +413,8 @@ class HeldChambers:
         the properties: at first the variance without a leak, then the variance with the most probable onset. `growth`:
         as in `LeakLaw`.
         """
-        regression = self._regressions[leak.refilled]
-        variance, n_rows = self._fits_without_leak[leak.refilled].variance, len(regression.displaced)
+        regression = self._regressions[leak.supplies]
+        variance, n_rows = self._fits_without_leak[leak.supplies].variance, len(regression.displaced)
         columns = self._growing_leak_columns(leak, growth)
         for _ in range(2):
             squares = residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
@@ -421,30 +458,28 @@ class HeldChambers:
         return self.piston_fits[1.0]
 
     def _find_piston_fit(self, exponent: float) -> PistonFit:
-        """Find the most probable onset, sensor offset and refilled sides for a leak past the piston.
+        """Find the most probable onset, sensor offset and supplies of the sides for a leak past the piston.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, with and without check valves that refill a side (`_refill_log_prior`). `exponent`: as in `LeakLaw`.
+        once, for each possible choice of the supplies (`_supply_log_prior`). `exponent`: as in `LeakLaw`.
         """
         grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
-        # only sides that a check valve would feed during some of the readings
-        ever_refilled = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
-        for refilled in (NEITHER, *ever_refilled):
-            posteriors = [self._find_onset(float(offset), refilled, exponent)[0] for offset in grid]
+        for supplies in self._possible_supplies:
+            posteriors = [self._find_onset(float(offset), supplies, exponent)[0] for offset in grid]
             best = int(np.argmax(posteriors))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
-            fits += [self._find_onset(float(offset), refilled, exponent) for offset in (*refined, grid[best])]
+            fits += [self._find_onset(float(offset), supplies, exponent) for offset in (*refined, grid[best])]
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
     @cached_property
     def _law_onsets(self) -> dict[tuple[float, float], Array]:
         """Log posteriors (o,) of all `onsets` by the law of a leak past the piston: its exponent and its growth.
 
-        Each includes the priors of law and growth. Sensor offset and refilled sides are those of `piston_fits`.
+        Each includes the priors of law and growth. Sensor offset and supplies are those of `piston_fits`.
         """
         posteriors = dict[tuple[float, float], Array]()
         for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
-            leak = self._unit_piston_leak(conditions.offset, conditions.refilled, LeakLaw(exponent))
+            leak = self._unit_piston_leak(conditions.offset, conditions.supplies, LeakLaw(exponent))
             for growth, growth_prior in growth_priors():
                 log_prior = float(np.log(law_prior * growth_prior))
                 posteriors[exponent, growth] = log_prior + self._onset_posteriors(leak, growth)
@@ -466,6 +501,18 @@ class HeldChambers:
                 log_weight = fit.log_likelihood + float(np.log(growth_prior * law_prior))
                 fits.append(LawFit(law, law_conditions, fit, log_weight))
         return fits
+
+    def _fit_over_supplies(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
+        """Fit a leak that is not past the piston and may grow, under each possible choice of the sides' supplies.
+
+        Returns the most probable fit and the index of its onset in `onsets`. The likelihood of the fit is replaced by
+        the sum over all choices, each times its prior probability.
+        """
+        fits = [self._fit_growing_leak(leak) for leak in leaks]
+        log_priors = [self._supply_log_prior(leak.supplies, drains=False) for leak in leaks]
+        log_weights = [fit.log_likelihood + prior for (fit, _), prior in zip(fits, log_priors, strict=True)]
+        fit, index = fits[int(np.argmax(log_weights))]
+        return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
 
     def _fit_growing_leak(self, leak: UnitLeak) -> tuple[LeakFit, int]:
         """Fit a leak that may grow from its onset on; its coefficient is the mean from the onset to the end.
@@ -497,26 +544,35 @@ class HeldChambers:
         after_onset = np.concatenate(flows)
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
 
-    def _find_onset(self, offset: float, refilled: tuple[bool, bool], exponent: float) -> tuple[float, PistonFit]:
+    def _find_onset(self, offset: float, supplies: Supplies, exponent: float) -> tuple[float, PistonFit]:
         """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
 
-        `refilled`, `exponent`: as in `PistonFit` and `LeakLaw`. Return the log posterior of this onset, and the onset
-        together with `offset` and `refilled`.
+        `supplies`, `exponent`: as in `PistonFit` and `LeakLaw`. Return the log posterior of this onset, and the onset
+        together with `offset` and `supplies`.
         """
-        posteriors = self._onset_posteriors(self._unit_piston_leak(offset, refilled, LeakLaw(exponent)))
+        posteriors = self._onset_posteriors(self._unit_piston_leak(offset, supplies, LeakLaw(exponent)))
         index = int(posteriors.argmax())
-        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset) + self._refill_log_prior(refilled)
-        # readings during a refill have no residual; without this correction the smaller variance would be evidence
-        log_posterior += 0.5 * self.n_readings * float(np.log(self._closed_share(refilled)))
-        return log_posterior, PistonFit(float(self.onsets[index]), offset, refilled)
+        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset)
+        log_posterior += self._supply_log_prior(supplies, drains=True)
+        # readings of a side that is not closed have no residual; without this correction the smaller variance would be
+        # evidence
+        log_posterior += 0.5 * self.n_readings * math.log(self._closed_share(supplies))
+        return log_posterior, PistonFit(float(self.onsets[index]), offset, supplies)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
         """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order."""
-        return self._weigh_hypotheses([self._unit_outside_leak(is_A) for is_A in (True, False)])
+        possible = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies] or [
+            BOTH
+        ]
+        return self._weigh_hypotheses(
+            [[self._unit_outside_leak(is_A, supplies) for supplies in possible] for is_A in (True, False)]
+        )
 
-    def _weigh_hypotheses(self, leaks: Sequence[UnitLeak]) -> list[LeakHypothesis]:
+    def _weigh_hypotheses(self, leaks: Sequence[Sequence[UnitLeak]]) -> list[LeakHypothesis]:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
+
+        Each of `leaks` is one leak with the flows that it has under each possible choice of the sides' supplies.
 
         Each leak may grow from its onset on. The coefficient past the piston is that of the most probable law,
         converted to the conductance of a laminar leak with the same mean flow in the holds; the others are means from
@@ -528,7 +584,7 @@ class HeldChambers:
         # each fit with the index of its onset in `onsets`
         index = int(np.abs(self.onsets - best.conditions.onset).argmin())
         fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
-        fits += [self._fit_growing_leak(leak) for leak in leaks]
+        fits += [self._fit_over_supplies(leak) for leak in leaks]
         log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
@@ -547,8 +603,8 @@ class HeldChambers:
         # without a charge pressure check valves stay closed
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
         sides = (True, False)
-        leaks = [chambers._unit_outside_leak(is_A) for is_A in sides]
-        leaks += [chambers._unit_pump_leak(is_A) for is_A in sides]
+        leaks = [[chambers._unit_outside_leak(is_A)] for is_A in sides]
+        leaks += [[chambers._unit_pump_leak(is_A)] for is_A in sides]
         hypotheses = chambers._weigh_hypotheses(leaks)
         means = [hypothesis.probability * hypothesis.fraction_after * hypothesis.fit.value for hypothesis in hypotheses]
         deviations = [hypothesis.fraction_after * hypothesis.fit.deviation for hypothesis in hypotheses]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -37,20 +38,33 @@ class LeakLaw(NamedTuple):
 LAMINAR = LeakLaw()
 
 
-#: Flags of the sides A and B whose displaced oil check valves replace: none, and both.
-NEITHER, BOTH = (False, False), (True, True)
+class Supply(Enum):
+    """Connection of a side of the cylinder to the charge line while valves hold the load.
+
+    `SHUT`: none; `CHECK`: a check valve, which refills the side while it is at the charge pressure; `OPEN`: a line that
+    takes and gives oil at any time.
+    """
+
+    SHUT = "shut"
+    CHECK = "check valve"
+    OPEN = "open"
+
+
+#: Supplies of the sides A and B.
+Supplies = tuple[Supply, Supply]
+NEITHER: Supplies = (Supply.SHUT, Supply.SHUT)
+BOTH: Supplies = (Supply.CHECK, Supply.CHECK)
 
 
 class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
     `flows`: for each hold of n samples the flow out of A (first row) and out of B, (2, n), in Pa^e for the exponent e
-    of the law (laminar: 1); `refilled`: for A and for B, true if a check valve refills that side while it is at the
-    charge pressure, in which time its flow does not count.
+    of the law (laminar: 1), 0 while the side's supply replaces or takes the oil; `supplies`: those of A and B.
     """
 
     flows: Sequence[Array]
-    refilled: tuple[bool, bool] = NEITHER
+    supplies: Supplies = NEITHER
 
 
 class HeldLeaks(NamedTuple):
@@ -70,12 +84,12 @@ class HeldLeaks(NamedTuple):
 class PistonFit(NamedTuple):
     """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
 
-    `refilled`: for A and for B, true if a check valve probably refills that side while it is at the charge pressure.
+    `supplies`: most probable supplies of A and B.
     """
 
     onset: float
     offset: float
-    refilled: tuple[bool, bool]
+    supplies: Supplies
 
 
 class LeakFit(NamedTuple):
@@ -99,8 +113,8 @@ class LeakFit(NamedTuple):
 class LawFit(NamedTuple):
     """Fit of a leak past the piston under one `law`.
 
-    `conditions`: onset, sensor offset and refilled sides; `fit`: fitted coefficient; `log_weight`: log likelihood of
-    the fit plus the log prior probability of the law.
+    `conditions`: onset, sensor offset and supplies of the sides; `fit`: fitted coefficient; `log_weight`: log
+    likelihood of the fit plus the log prior probability of the law.
     """
 
     law: LeakLaw

@@ -128,8 +128,8 @@ def build_regression(
     law) takes up with the usual properties: in the stroke, in the dead volume of A, and in that of B. Pressures are
     absolute.
 
-    `flags` (2, n), for each hold of n samples: true in samples in which no check valve refills A (row 0) or B (row 1),
-    so that the displacement of that side counts; `n_readings`: effective number of independent readings.
+    `flags` (2, n), for each hold of n samples: true in samples in which A (row 0) or B (row 1) is closed, so that
+    displacement and compression of that side count; `n_readings`: effective number of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
     displaced, strained, aired = list[Array](), list[Array](), list[Array]()
@@ -140,11 +140,13 @@ def build_regression(
             volumes = np.zeros(3)  # volume in the stroke, dead volumes of A and B
             volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
             volumes[1 + index] = abs(area) * prior.dead * stroke
-            increments = -area * np.diff(hold.x, prepend=hold.x[0])  # volumes that the piston displaces
+            # changes while the side is closed, as displaced and compressed volumes count only then
+            courses = (hold.mean(_sum_changes(values, is_closed[index])) for values in (hold.x, p, 1.0 / p))
+            moved, compressed_by, expanded_by = courses
             for columns, values in (
-                (displaced, hold.mean(np.cumsum(increments * is_closed[index]))),
-                (strained, np.outer(hold.mean(p), prior.compressibility * volumes)),
-                (aired, np.outer(hold.mean(1.0 / p), -prior.air * P_ATM * volumes)),  # Boyle's law
+                (displaced, -area * moved),
+                (strained, np.outer(compressed_by, prior.compressibility * volumes)),
+                (aired, np.outer(expanded_by, -prior.air * P_ATM * volumes)),  # Boyle's law
             ):
                 columns.append(hold.centre(values, is_A=index == 0))
     strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
@@ -157,6 +159,11 @@ def build_regression(
         inflation=max(len(compressed) / n_readings, 1.0),
         misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
     )
+
+
+def _sum_changes(values: Array, is_closed: NDArray[np.bool_]) -> Array:
+    """Sum the changes of `values` (n,) from sample to sample, only those in which the side `is_closed` (n,)."""
+    return np.cumsum(np.diff(values, prepend=values[0]) * is_closed)
 
 
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
