@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import extend_rests, find_charge_pressure, find_locked_holds
-from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, NEITHER, LeakLaw, PistonFit, Supply
+from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, NEITHER, LeakLaw, PistonFit, SideSupply
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, residual_squares
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -124,7 +124,7 @@ def test_a_rod_seal_takes_from_one_side_alone(charge: float, noise_level: float)
 def test_a_side_that_is_open_to_the_charge_line_leaves_the_piston_possible() -> None:
     """Only the loaded side has a holding valve: B tells nothing, at a pressure far above that of a tank."""
     chambers = held_press(piston=SEAL, vented=True, charge=CHARGE)
-    assert Supply.OPEN in chambers.piston_fit.supplies
+    assert SideSupply.OPEN in chambers.piston_fit.supplies
     assert 0.05 < chambers.piston_leak.probability < 0.95
     assert chambers.piston_leak.fit.value == pytest.approx(SEAL, rel=0.35)
 
@@ -219,7 +219,7 @@ def test_a_check_valve_feeds_the_larger_side_that_a_leak_does_not_fill() -> None
     channels = t, p_A, CHARGE + below + P_ATM + 3e3 * noise[1], x + 2e-6 * noise[2]
     sides = CylinderSides(AREA_A, AREA_B, 0.0, STROKE)
     chambers = HeldChambers(find_locked_holds(channels, rests[1:], RATE), sides, 0.0, float(t[-1]), CHARGE + P_ATM)
-    assert chambers.piston_fit.supplies == (Supply.CHECK, Supply.SHUT)
+    assert chambers.piston_fit.supplies == (SideSupply.CHECK, SideSupply.SHUT)
     assert chambers.fit_piston_leak(chambers.piston_fit).value == pytest.approx(leak, rel=0.1)
 
 

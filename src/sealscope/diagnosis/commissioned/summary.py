@@ -90,26 +90,28 @@ class MachineSummary:
         n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
         # each of n + 1 healthy recordings is equally likely to have the highest score
         rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
+        needed = (rig or unstated_rig()).circuit.needed_channels
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in display_units.items())),
             ("machine", _describe_rig(rig)),
             ("duty", _format_duty(healthy, display_units.get("p_A", "bar"))),
             ("noise", ", ".join(noise)),
-            *self._smallest_leak_rows(len(healthy), are_dated=bool(dates)),
+            *self._smallest_leak_rows(len(healthy), are_dated=bool(dates), needed=needed),
             ("false alarms", f"{rate}; {n_alarms or 'none'} of them stand out of the others"),
             *(("check", problem) for problem in self.problems),
         ]
         return "\n".join(paragraphs(rows, columns=16))
 
-    def _smallest_leak_rows(self, n_healthy: int, are_dated: bool) -> list[tuple[str, str]]:
+    def _smallest_leak_rows(self, n_healthy: int, are_dated: bool, needed: str) -> list[tuple[str, str]]:
         """Build the rows (heading, text) on the smallest detectable leak and on the recordings needed to halve it.
 
-        `n_healthy` is the number of healthy recordings; `are_dated` is True if their dates are known.
+        `n_healthy` is the number of healthy recordings; `are_dated` is True if their dates are known; `needed` names
+        the channels of a volume balance.
         """
         if self.smallest is None:
-            needs = "speed or angle of the pump, flow or command, and two recordings"
-            return [("smallest leak", f"not known, that needs {needs}; the ringing alone judges")]
+            text = f"not known, that needs {needed}, in two recordings; the ringing alone judges"
+            return [("smallest leak", text)]
         half = "twice the pressure difference at the same flow; more recordings alone do not"
         if (factor := self.smallest.halved_by) is not None:
             half = f"{factor * n_healthy} healthy recordings instead of {n_healthy}"

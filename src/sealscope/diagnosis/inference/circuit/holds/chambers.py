@@ -50,8 +50,8 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import (
     LeakHypothesis,
     LeakLaw,
     PistonFit,
-    Supplies,
-    Supply,
+    SideSupplies,
+    SideSupply,
     UnitLeak,
     average_fits,
     flow_of_side,
@@ -124,7 +124,7 @@ class HeldChambers:
         return independent * 2.0 * len(self.holds)
 
     @cached_property
-    def _regressions(self) -> dict[Supplies, OilRegression]:
+    def _regressions(self) -> dict[SideSupplies, OilRegression]:
         """Regressions that estimate the oil's properties, one for each possible choice of the sides' supplies."""
         return {
             supplies: build_regression(self.holds, self._closed_flags(supplies), self.sides, self.n_readings)
@@ -132,7 +132,7 @@ class HeldChambers:
         }
 
     @property
-    def _refillable_sides(self) -> Supplies:
+    def _refillable_sides(self) -> SideSupplies:
         """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
         Neither is refilled if the areas are equal. The leak moves equal volumes from one side to the other, and the
@@ -142,15 +142,15 @@ class HeldChambers:
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         if area_A == area_B:
             return NEITHER
-        return (Supply.CHECK, Supply.SHUT) if area_A > area_B else (Supply.SHUT, Supply.CHECK)
+        return (SideSupply.CHECK, SideSupply.SHUT) if area_A > area_B else (SideSupply.SHUT, SideSupply.CHECK)
 
     @cached_property
-    def _unloaded_open(self) -> Supplies:
+    def _unloaded_open(self) -> SideSupplies:
         """Supplies of A and B if the side with the lower mean pressure is open, as if only the other had a valve."""
         means = [np.mean(np.concatenate([getattr(hold, side) for hold in self.holds])) for side in ("p_A", "p_B")]
-        return (Supply.CHECK, Supply.OPEN) if means[0] > means[1] else (Supply.OPEN, Supply.CHECK)
+        return (SideSupply.CHECK, SideSupply.OPEN) if means[0] > means[1] else (SideSupply.OPEN, SideSupply.CHECK)
 
-    def _supply_log_prior(self, supplies: Supplies, *, drains: bool) -> float:
+    def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
         An open side has the probability `held_oil.open` (`priors.toml`), and is above the charge pressure in a few
@@ -159,8 +159,8 @@ class HeldChambers:
         pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
-        if Supply.OPEN in supplies:
-            row = supplies.index(Supply.OPEN)
+        if SideSupply.OPEN in supplies:
+            row = supplies.index(SideSupply.OPEN)
             n_above = 0.5 * self.n_readings * float(np.concatenate([flags[row] for flags in self._above_charge]).mean())
             return math.log(prior.open) + n_above * math.log(prior.above)
         log_prior = math.log1p(-prior.open)
@@ -184,27 +184,28 @@ class HeldChambers:
         return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
     @cached_property
-    def _possible_supplies(self) -> list[Supplies]:
-        """Supplies of A and B that a leak past the piston may have: those with which some reading differs from none.
+    def _possible_supplies(self) -> list[SideSupplies]:
+        """Supplies of A and B that are tried for a leak.
 
-        Without a side that is open longer than a few readings allow, which is as good as impossible.
+        Check valves are tried if some reading does not count with them, and an open side if it is at the charge
+        pressure nearly all the time.
         """
         possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
         if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
             possible.append(self._unloaded_open)
         return [NEITHER, *possible]
 
-    def _closed_flags(self, supplies: Supplies) -> list[NDArray[np.bool_]]:
+    def _closed_flags(self, supplies: SideSupplies) -> list[NDArray[np.bool_]]:
         """Flag the samples in which A (row 0) or B (row 1) is closed, (2, n) for each hold of n samples.
 
         A side is always closed without a supply, never if it is open, and above the charge pressure if a check valve
         refills it. `supplies`: those of A and B.
         """
-        is_shut = np.array([supply is Supply.SHUT for supply in supplies])[:, None]
-        has_check = np.array([supply is Supply.CHECK for supply in supplies])[:, None]
+        is_shut = np.array([supply is SideSupply.SHUT for supply in supplies])[:, None]
+        has_check = np.array([supply is SideSupply.CHECK for supply in supplies])[:, None]
         return [is_shut | (has_check & flags) for flags in self._above_charge]
 
-    def _closed_share(self, supplies: Supplies) -> float:
+    def _closed_share(self, supplies: SideSupplies) -> float:
         """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
 
         `supplies`: as in `_closed_flags`. While a side is not closed, its readings (sample means) fit any leak, so that
@@ -213,7 +214,7 @@ class HeldChambers:
         share = float(np.concatenate(self._closed_flags(supplies), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
-    def _unit_piston_leak(self, offset: float, supplies: Supplies = NEITHER, law: LeakLaw = LAMINAR) -> UnitLeak:
+    def _unit_piston_leak(self, offset: float, supplies: SideSupplies = NEITHER, law: LeakLaw = LAMINAR) -> UnitLeak:
         """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
 
         With the exponent e of the `law` and dp = p_A - p_B - z, the flow out of A is sign(dp) |dp|^e times the law's
@@ -243,7 +244,7 @@ class HeldChambers:
             offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
         return np.asarray(difference - offsets)
 
-    def _unit_outside_leak(self, is_A: bool, supplies: Supplies = BOTH) -> UnitLeak:
+    def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
         """Compute the flow [Pa] of a laminar leak with a conductance of 1 from A (or B, if not `is_A`) to the outside.
 
         It is the chamber's gauge pressure, or 0 while the chamber is not closed (`_closed_flags`).
@@ -267,7 +268,7 @@ class HeldChambers:
         return UnitLeak(flows)
 
     @cached_property
-    def _fits_without_leak(self) -> dict[Supplies, LeakRegression]:
+    def _fits_without_leak(self) -> dict[SideSupplies, LeakRegression]:
         """Fits of the oil's properties without any leak, by the supplies of A and B."""
         n_rows = len(self._regressions[NEITHER].displaced)  # the same in all regressions
         no_columns = np.empty((n_rows, 0))
@@ -544,7 +545,7 @@ class HeldChambers:
         after_onset = np.concatenate(flows)
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
 
-    def _find_onset(self, offset: float, supplies: Supplies, exponent: float) -> tuple[float, PistonFit]:
+    def _find_onset(self, offset: float, supplies: SideSupplies, exponent: float) -> tuple[float, PistonFit]:
         """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
 
         `supplies`, `exponent`: as in `PistonFit` and `LeakLaw`. Return the log posterior of this onset, and the onset

@@ -38,7 +38,7 @@ class LeakLaw(NamedTuple):
 LAMINAR = LeakLaw()
 
 
-class Supply(Enum):
+class SideSupply(Enum):
     """Connection of a side of the cylinder to the charge line while valves hold the load.
 
     `SHUT`: none; `CHECK`: a check valve, which refills the side while it is at the charge pressure; `OPEN`: a line that
@@ -51,9 +51,9 @@ class Supply(Enum):
 
 
 #: Supplies of the sides A and B.
-Supplies = tuple[Supply, Supply]
-NEITHER: Supplies = (Supply.SHUT, Supply.SHUT)
-BOTH: Supplies = (Supply.CHECK, Supply.CHECK)
+SideSupplies = tuple[SideSupply, SideSupply]
+NEITHER: SideSupplies = (SideSupply.SHUT, SideSupply.SHUT)
+BOTH: SideSupplies = (SideSupply.CHECK, SideSupply.CHECK)
 
 
 class UnitLeak(NamedTuple):
@@ -64,7 +64,7 @@ class UnitLeak(NamedTuple):
     """
 
     flows: Sequence[Array]
-    supplies: Supplies = NEITHER
+    supplies: SideSupplies = NEITHER
 
 
 class HeldLeaks(NamedTuple):
@@ -89,7 +89,7 @@ class PistonFit(NamedTuple):
 
     onset: float
     offset: float
-    supplies: Supplies
+    supplies: SideSupplies
 
 
 class LeakFit(NamedTuple):
