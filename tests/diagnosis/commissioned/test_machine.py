@@ -204,15 +204,18 @@ def test_a_temperature_that_is_not_read_is_named_when_a_machine_is_commissioned(
     assert read.healthy[0].about["oil_degC"] == 41.5
 
 
-@pytest.mark.slow
 def test_a_map_that_no_recording_fits_is_refused(healthy, tmp_path):
     """Its pressures would be read without it, and whatever else it names would be lost."""
-    ss.write(healthy[0], tmp_path / "day.csv")
-    for wrong in ("omega*x m", "Weg"):
+    columns = [healthy[0].t, *(healthy[0][name] for name in ("p_A", "p_B", "x"))]
+    head = "t [s],p_A [Pa],p_B [Pa],Weg [m]"
+    np.savetxt(tmp_path / "day.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
+    for wrong in ("Weg*p_A m", "Lage"):
         with refusal(wrong):
             ss.commission(tmp_path, map={"p_A": "p_A", "p_B": "p_B", "x": wrong})
+    assert "x" in ss.commission(tmp_path, map={"p_A": "p_A", "p_B": "p_B", "x": "Weg"}).healthy[0].units
 
 
+@pytest.mark.slow
 def test_files_of_one_name_in_several_folders_are_told_apart(healthy, tmp_path):
     for day, recording in enumerate((*healthy, ss.simulate(command="3 sin(4t)", duration="20 s", seed=4)), start=1):
         place = tmp_path / f"day{day}"

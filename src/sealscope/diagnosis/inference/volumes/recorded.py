@@ -127,11 +127,17 @@ class RecordedBalance:
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test."""
-        rests = find_rests(self._pumped, self.recording.rate, max_rest_rate(self._pumped, self.recording.rate))
-        begin = float(self.recording.t[0]) + int(np.argmin(rests)) / self.recording.rate
-        starts = self.blocks.start - half_width(self.recording.rate)  # of the first test functions
-        first = max(int(np.argmax(self.blocks.is_moving)), int(np.searchsorted(starts, begin)))
+        """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test.
+
+        Without a position it is the first block in which the machine moves.
+        """
+        first = int(np.argmax(self.blocks.is_moving))
+        if "x" in self.recording:
+            rate = self.recording.rate
+            rests = find_rests(self._pumped, rate, max_rest_rate(self._pumped, rate))
+            begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
+            starts = self.blocks.start - half_width(rate)  # of the first test functions
+            first = max(first, int(np.searchsorted(starts, begin)))
         return first if len(self.blocks) - first >= MIN_BLOCKS else 0
 
     @property
@@ -249,12 +255,10 @@ class RecordedBalance:
     def _pumped(self) -> Array:
         """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,).
 
-        With a position it is NaN while a valve lowers the load past the pump (`flag_lowering`).
+        It is NaN while a valve lowers the load past the pump (`flag_lowering`).
         """
         signals = Signals(dict(self.recording.channels), self.recording.rate, {})
         pumped = self.equations[0].left(signals)
-        if "x" not in self.recording:
-            return pumped
         return np.where(flag_lowering(pumped, signals.step("x"), self.recording.rate), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
