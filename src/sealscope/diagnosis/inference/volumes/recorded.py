@@ -46,7 +46,16 @@ from sealscope.diagnosis.inference.onset import (
 )
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
-from sealscope.diagnosis.inference.terms import LAG, LOCKED, MIN_ABSOLUTE_PRESSURE, PUMP, Equation, Signals, find_rests
+from sealscope.diagnosis.inference.terms import (
+    CYLINDER,
+    LAG,
+    LOCKED,
+    MIN_ABSOLUTE_PRESSURE,
+    PUMP,
+    Equation,
+    Signals,
+    find_rests,
+)
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
@@ -129,10 +138,10 @@ class RecordedBalance:
     def _first_motion(self) -> int:
         """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test.
 
-        Without a position it is the first block in which the machine moves.
+        Only the balance of a cylinder has a pump's flow; otherwise it is the first block in which the machine moves.
         """
         first = int(np.argmax(self.blocks.is_moving))
-        if "x" in self.recording:
+        if self.equations[0].name == CYLINDER:
             rate = self.recording.rate
             rests = find_rests(self._pumped, rate, max_rest_rate(self._pumped, rate))
             begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
