@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cached_property
@@ -406,8 +406,8 @@ def commission(
             recording_of[label] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
-    if stated_map is not None and stated_map != "auto":
-        _check_map(stated_map, machine.healthy, lambda: read(files[0], map=stated_map, rate=rate))
+    if stated_map is not None and not any(_fits_map(recording, stated_map) for recording in machine.healthy):
+        read(files[0], map=stated_map, rate=rate)  # raises the error of the map, without which the others were read
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
@@ -417,16 +417,9 @@ def commission(
     return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
 
 
-def _check_map(
-    channel_map: Mapping[str, str], healthy: Sequence[SummarisedRecording], read_first: Callable[[], Recording]
-) -> None:
-    """Raise the error of `read_first`, which reads a log with the map, if no `healthy` recording fits a stated map.
-
-    A recording fits if it has all channels that the map names. Those that do not fit were read without the map.
-    """
-    named = channel_map.keys() - {REST, "t"}
-    if not any(named <= recording.units.keys() for recording in healthy):
-        read_first()
+def _fits_map(recording: SummarisedRecording, channel_map: ChannelMap) -> bool:
+    """Return True if a recording has all channels that a map names, so that it was read with the map."""
+    return channel_map == "auto" or channel_map.keys() - {REST, "t"} <= recording.units.keys()
 
 
 def _distinct_names(paths: Sequence[Path]) -> list[str]:

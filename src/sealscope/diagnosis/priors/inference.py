@@ -42,6 +42,7 @@ class BlockPriors(PriorTable):
     # [s] limits of a block's length
     longest: float
     shortest: float
+    slowest: float  # [Hz] lowest sampling rate
     blocks: int  # number of blocks of a recording, unless their length would be outside these limits
     coarse: int  # largest number of blocks in tests for changes other than leaks
     expansion: float  # relative error of the volume by which oil and air expand within a block

@@ -43,16 +43,14 @@ if TYPE_CHECKING:
 #: Reason for having no balance; the key is True if the position is recorded.
 _NO_BALANCE = {
     True: "finds no time in which the piston is held under a constant command u, for long enough, in {:.3g} s",
-    False: "needs the position x: for too little of the {:.3g} s does a loop bring the piston back or hold it under "
-    "a pressure difference, so that a leak moves it",
+    False: "needs the position x: no loop brings the piston back or holds it under a pressure difference, for long "
+    "enough in {:.3g} s",
 }
 #: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
 _MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
-#: Minimum sampling rate [Hz]; at lower rates the samples hardly follow a stroke.
-MIN_RATE = 1.0
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
@@ -88,8 +86,9 @@ class VolumeBalance:
         channels = frozenset(recording.channels)
         if not (equations(self.rig, channels) or circulation(self.rig, channels) or locked(self.rig, channels)):
             return f"needs {self.rig.circuit.needed_channels}"
-        if recording.rate < MIN_RATE:
-            return f"needs {MIN_RATE:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
+        min_rate: float = INFERENCE.blocks.slowest
+        if recording.rate < min_rate:
+            return f"needs {min_rate:g} Hz or more, got {recording.rate:g} Hz: is the unit of the time right?"
         min_samples = min_samples_for_step(recording.rate)
         if len(recording) < min_samples:
             return f"needs {min_samples} samples or more at {recording.rate:g} Hz, got {len(recording)}"
