@@ -37,12 +37,12 @@ class LevelPriors(PriorTable):
 
 
 class BlockPriors(PriorTable):
-    """Division of a recording into blocks."""
+    """Division of a recording into blocks, and the lowest sampling rate [Hz] at which it is divided."""
 
     # [s] limits of a block's length
     longest: float
     shortest: float
-    slowest: float  # [Hz] lowest sampling rate
+    slowest: float  # lowest sampling rate
     blocks: int  # number of blocks of a recording, unless their length would be outside these limits
     coarse: int  # largest number of blocks in tests for changes other than leaks
     expansion: float  # relative error of the volume by which oil and air expand within a block
