@@ -79,9 +79,10 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     density is proportional to S^(-(n - 1) / 2), where S is the sum of two kinds of squares: of the logarithms of the
     drops about their mean, and of the relative errors of the drops.
 
-    Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small
+    Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small prior
     probability `oil.drop_misleads`, without this sign, as if something else, such as a swollen seal, had changed the
-    judged drop.
+    judged drop. What swells or wears a seal changes its friction, too, so that in the second case the friction has the
+    density of the first hypothesis: a judged friction that is as usual makes this case less probable.
 
     A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
     error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
@@ -98,29 +99,33 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0  # friction resists the motion
     friction, drop = sign * friction, sign * drop
     usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
-    drops, log_densities = [drop], np.zeros(1)
+    drops, log_densities, log_changed = [drop], np.zeros(1), 0.0
     if min(usual_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
         drops.append(drop + (friction - usual_friction) / top_speed)
         change = float(np.log(friction[-1] / usual_friction))
         # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
+        log_changed = float(log_densities[0])
     drops_by_hypothesis = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
     healthy_logs = np.log(drops_by_hypothesis[:, healthy])
     squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
     squares += (drop_error[healthy] / drops_by_hypothesis[:, healthy]) ** 2
-    log_densities = log_densities - 0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
-    log_probabilities = np.log(prior.drop_tells) + log_densities - np.logaddexp.reduce(log_densities)
+    log_scatters = -0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
+    log_misleads = np.log(prior.drop_misleads) + log_changed + log_scatters
+    log_tells = np.log1p(-prior.drop_misleads) + log_densities + log_scatters
+    log_sum = np.logaddexp.reduce(np.concatenate([log_tells, log_misleads]))
+    log_probabilities = np.log(prior.drop_tells) + np.column_stack([log_tells, log_misleads]) - log_sum
     variance, oils = unknown_deviation**2, list[OilHypothesis]()
-    for positive_drops, mean, log_probability in zip(
+    for positive_drops, mean, (log_tells_oil, log_tells_nothing) in zip(
         drops_by_hypothesis, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
     ):
         error_variance = (prior.per_drop * drop_error / positive_drops) ** 2
         slope_deviation = prior.per_drop_deviation / prior.per_drop
         is_judged = np.arange(len(recordings)) == len(recordings) - 1
-        for is_informative, probability in (
-            (is_known, 1.0 - prior.drop_misleads),
-            (is_known & ~is_judged, prior.drop_misleads),
+        for is_informative, log_probability in (
+            (is_known, log_tells_oil),
+            (is_known & ~is_judged, log_tells_nothing),
         ):
             # variance of the true drop over that of the measured one
             reliability = np.where(is_informative, variance / (variance + error_variance), 0.0)
@@ -130,7 +135,7 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
                     * reliability
                     * np.where(is_informative, np.log(positive_drops) - mean, 0.0),
                     variances=(1.0 - reliability) * variance,
-                    log_probability=log_probability + float(np.log(probability)),
+                    log_probability=log_probability,
                     slope_deviation=slope_deviation,
                 )
             )
