@@ -62,6 +62,7 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
         name=name,
         q_b=f"{1e6 * displacement:g}",
         displacement=f"{1e6 * displacement:.6g}",
+        G_healthy=f"{base.pump.G_healthy * displacement / base.pump.q_b:.4g}",
         V_gas=f"{1e3 * GAS_OVER_ROD * abs(area_A - area_B) * stroke:.4g}",
         G_check=f"{base.makeup.G_check * _volume_ratio(base, area_A, area_B, stroke):.4g}",
     )

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.paragraphs import format_count
-from sealscope.recordings.channels import COUNTS, SLOW, Array
+from sealscope.recordings.channels import COUNTS, METERS, SLOW, Array
 from sealscope.recordings.motion import find_runs, find_stuck, is_constant, smallest_step
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
@@ -212,6 +212,8 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         add("clipped", rail.samples, int(present[rail.first]), text)
     if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
+    elif name == "omega" or name in METERS:  # a pump or a meter that stands reads 0 without noise
+        stuck = stuck[readings[stuck[:, 0]] != 0.0]
     if stuck.size and not may_rest:
         start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
