@@ -23,13 +23,16 @@ _CHANNELS = {
     "q_leak": ("m^3/s", "leakage flow"),
     "q_comp": ("m^3/s", "leakage flow that the controller makes good"),
     "q_pump": ("m^3/s", "flow to the cylinder by a meter"),
+    "q_supply": ("m^3/s", "flow to the valve by a meter in its supply line"),
     "T_oil": ("K", "oil temperature"),
 }
 CHANNEL_UNITS: Mapping[str, str] = MappingProxyType({name: unit for name, (unit, _) in _CHANNELS.items()})
 #: What each channel, and the time, measures.
 LONG_NAMES: Mapping[str, str] = MappingProxyType({"t": "time"} | {name: text for name, (_, text) in _CHANNELS.items()})
-#: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meter, command.
-FLOW_SOURCES = ("theta", "omega", "q_pump", "u")
+#: Channels of flow meters.
+METERS = ("q_pump", "q_supply")
+#: Channels from which the flow to the cylinder is computed, best first: pump angle, speed, flow meters, command.
+FLOW_SOURCES = ("theta", "omega", *METERS, "u")
 #: Channels that change slowly, over minutes, in which constant or mostly missing values are not defects.
 SLOW = frozenset({"T_oil"})
 #: Unit of a channel whose column states none: raw counts of a converter.

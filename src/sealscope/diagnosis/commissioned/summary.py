@@ -178,8 +178,9 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
         description["pressure_bar"] = _round_to_4_digits(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
         description["oil_degC"] = _round_to_4_digits(oil)
-    description["noise"] = {name: noise for name in part.channels if (noise := _estimate_noise(recording[name])) > 0.0}
-    log_units = {name: unit for name in part.channels if (unit := recording.unit_in_log(name))}
+    recorded = [name for name in part.channels if name in recording]  # not q_supply in place of a q_pump without a sign
+    description["noise"] = {name: noise for name in recorded if (noise := _estimate_noise(recording[name])) > 0.0}
+    log_units = {name: unit for name in recorded if (unit := recording.unit_in_log(name))}
     if log_units:
         description["log_units"] = log_units
     findings = inspection.findings

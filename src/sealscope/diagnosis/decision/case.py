@@ -95,6 +95,22 @@ class Case:
             return 0.0
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
+    def resembles_external(self, alarm: LeakTest) -> bool:
+        """Return True if the data cannot tell a leak that raised an `alarm` from a leak out of the circuit.
+
+        The priors, by which a large leak to the outside would have been seen, do not count here: of both descriptions
+        of the rise over healthy recordings, that of an external leak has a likelihood of at least 1 - `sure` of both
+        (`[explanation]` of `priors.toml`).
+        """
+        if not self.weigh_rivals or self._data_kind(alarm) != RISE:
+            return False
+        sure = DECISION.explanation.sure
+        return any(
+            observable.log_ratio_to_leak is not None and observable.log_ratio_to_leak > np.log(1.0 / sure - 1.0)
+            for observable in self.observables
+            if observable.name.startswith("external leak")
+        )
+
     def shows_leak(self, alarm: LeakTest) -> bool:
         """Return True if a leak probably caused an alarm, or if a leak and an external leak cannot be distinguished.
 

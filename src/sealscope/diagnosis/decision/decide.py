@@ -132,10 +132,11 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a leak that the test `alarm` detected, such as "piston or pump leak".
 
-    It is "internal or external leak" if this test does not exclude that oil leaves the circuit, else the detector's
-    cause. A "piston or pump leak" becomes a "piston leak" if a separate test makes a pump leak improbable.
+    It is "internal or external leak" if this test does not exclude that oil leaves the circuit, or if the data alone
+    cannot tell (`Case.resembles_external`), else the detector's cause. A "piston or pump leak" becomes a "piston leak"
+    if a separate test makes a pump leak improbable.
     """
-    if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure:
+    if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure or case.resembles_external(alarm):
         return "internal or external leak"
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST

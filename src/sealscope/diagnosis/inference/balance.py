@@ -39,11 +39,12 @@ from sealscope.diagnosis.inference.terms import (
     Signals,
     equations,
     find_rests,
+    is_separate_at_rest,
     shut_at_rest,
     with_rests,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.corrections.gaps import flag_holes
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
@@ -62,7 +63,7 @@ MIN_BLOCK_TIME: float = _BLOCKS.shortest
 #: since the root of p_A - p_B and the side that carries the load do not depend on the offset linearly.
 NEGLIGIBLE_OFFSET = 3.0
 #: Channels that balances read.
-READ = ("u", "theta", "omega", "q_pump", "x", "p_1", "p_2", "p_A", "p_B")
+READ = ("u", "theta", "omega", *METERS, "x", "p_1", "p_2", "p_A", "p_B")
 #: Name of a signal that is 1 in holes (long gaps of missing samples that were filled in), else 0; absent without holes.
 HOLE = "hole"
 #: Name of p_A - p_B as recorded, among the samples of a recording in which pressures are clipped.
@@ -114,9 +115,13 @@ class BlockStream:
         self._strides_per_block = strides_in(block_s, rate)
         # samples on either side of a block that its speeds and rests depend on; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
-        self._finds_rests = any(MOVING_BIAS in columns.names for columns in self.columns)  # a term that is 0 at rest
+        self._drops_rests = is_separate_at_rest(balances[0])
+        # some terms are 0 at rest
+        self._finds_rests = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
+        if self._drops_rests:
+            self._margin += SPAN * self._stride
         self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
@@ -188,6 +193,7 @@ class BlockStream:
             "done": self._n_closed,
             "zeros": self._absolute_offsets,
             "signs": list(self.left_signs),
+            "rests": None if self._rest_limits is None else list(self._rest_limits),
             "weighting": self._weighting.state(),
         }
 
@@ -204,6 +210,8 @@ class BlockStream:
             absolute_offsets = {name: float(offset) for name, offset in absolute_offsets.items()}
         self._absolute_offsets = absolute_offsets
         self.left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
+        rest_limits = require_part(state, "rests", (Sequence, type(None)))
+        self._rest_limits = None if rest_limits is None else RestLimits(*map(float, rest_limits))
         self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
@@ -250,7 +258,8 @@ class BlockStream:
                 name: _absolute_offset(samples[name][:n_first_samples]) for name in ("p_A", "p_B") if name in samples
             }
         if self._finds_rests and self._rest_limits is None:
-            self._rest_limits = _find_rest_limits(samples, self._rate, self._balances[0])
+            first_samples = {name: values[:n_first_samples] for name, values in samples.items()}
+            self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -258,8 +267,7 @@ class BlockStream:
         size = max(1, BATCH_SAMPLES // length)  # blocks in a batch, whose rows are computed together
         batches = [self._compute_rows(samples, k, min(k + size, end)) for k in range(first, end, size)]
         row_parts, *block_parts = zip(*batches, strict=True)
-        weights, flow, pressures = (np.concatenate(parts) for parts in block_parts)
-        is_counted = weights > 0.0  # rows without missing samples
+        weights, is_counted, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         root_weights = np.sqrt(weights[is_counted])[:, None]  # roots, since sums are over products of two entries
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
         if not self.left_signs:
@@ -284,13 +292,16 @@ class BlockStream:
 
     def _compute_rows(
         self, samples: Mapping[str, Array], first: int, end: int
-    ) -> tuple[list[Array], Array, Array, Array]:
+    ) -> tuple[list[Array], Array, NDArray[np.bool_], Array, Array]:
         """Compute the rows of each volume balance in the K blocks with the indices `first` to `end` - 1.
 
-        `samples`: arrays by channel name. Returns four items:
+        `samples`: arrays by channel name. Returns five items:
 
         - for each balance an array (r, m) of its terms and left side, with one row for each test function;
         - weights (r,) of the rows: 1, a fraction next to a hole (a long gap), and 0 with a missing sample;
+        - flags (r,) of the rows that count: those with a positive weight and, in a balance with terms of its own at
+          rest (`is_separate_at_rest`), within the length of a test function from motion. Rows at rest repeat better
+          than those in motion, and many of them would determine the scale of the errors;
         - mean magnitudes (K,) of the first balance's left side [m^3/s];
         - means (K, p) of p equal parts of the sorted samples of p_A - p_B [Pa].
         """
@@ -324,7 +335,21 @@ class BlockStream:
         hole_weights = (
             weights_near_holes(piece[HOLE][start - begin : stop - begin], self._rate) if HOLE in piece else 1.0
         )
-        return rows, np.where(is_whole, hole_weights, 0.0), mean_flow, pressures
+        row_weights = np.where(is_whole, hole_weights, 0.0)
+        is_counted = row_weights > 0.0
+        if self._drops_rests:
+            is_far = ~_extend_both_ways(signals.moving(self._balances[0].left) > 0.0, SPAN * self._stride)
+            time_far = np.asarray(is_far[without_margins] * signals.dt)
+            is_counted &= weak_form_rows([time_far], self._rate).values[:, 0] == 0.0
+        return rows, row_weights, is_counted, mean_flow, pressures
+
+
+def _extend_both_ways(flags: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    """Flag also the `length` samples before and after each flagged one of `flags` (n,)."""
+    counts = np.concatenate([[0], np.cumsum(flags)])
+    index = np.arange(len(flags))
+    ends = counts[np.minimum(index + length + 1, len(flags))]
+    return np.asarray(ends > counts[np.maximum(index - length, 0)])
 
 
 def _z_score(products: Array) -> float:
@@ -576,10 +601,11 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     balances = equations(rig, names)
     if not balances:
         return None
+    source = flow_source(names)
     # only a recorded flow of a pump shows whether valves cut the pump off
-    may_shut = balances[0].name == CYLINDER and not balances[0].by_command
+    may_shut = balances[0].name == CYLINDER and not balances[0].by_command and source != "q_supply"
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
-    channels = {"x", "p_A", "p_B", str(flow_source(names))}
+    channels = {"x", "p_A", "p_B", str(source)}
     channels |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = bridged_samples(recording, channels)
     if balances[0].by_command:
@@ -653,10 +679,15 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 
     If the flow is that of a meter (`q_pump`), it alone decides. Below the fraction `rest.moves` (`priors.toml`) of its
     mean in motion, the valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is
-    then minus infinity: the piston never counts as resting. `samples`: arrays by channel name at the `rate` [Hz];
-    `balance`: volume balance, whose left side is the flow of the pump or of the meter.
+    then minus infinity: the piston never counts as resting. In a balance with terms of its own at rest
+    (`is_separate_at_rest`) the piston alone decides, with the same fraction of its mean speed, and short stops count.
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
+    pump or of the meter.
     """
     signals = Signals(samples, rate)
+    if is_separate_at_rest(balance):
+        max_speed = max_rest_rate(signals.step("x"), rate, fraction=INFERENCE.rest.moves)
+        return RestLimits(pump=-math.inf, piston=max_speed, shortest=AVERAGING_TIME)
     if flow_source(samples) == "q_pump":  # no angle or speed of the pump is recorded
         max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
         return RestLimits(pump=max_flow, piston=-math.inf)

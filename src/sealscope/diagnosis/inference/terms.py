@@ -18,7 +18,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continui
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
 from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
 
@@ -43,10 +43,14 @@ AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
 
 
 class RestLimits(NamedTuple):
-    """Speeds below which a machine counts as resting: flow of the `pump` [m^3/s] and speed of the `piston` [m/s]."""
+    """Speeds below which a machine counts as resting: flow of the `pump` [m^3/s] and speed of the `piston` [m/s].
+
+    `shortest`: minimum length of a rest [s].
+    """
 
     pump: float
     piston: float
+    shortest: float = MIN_REST
 
 
 class Signals:
@@ -158,21 +162,21 @@ class Signals:
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)
         if self._states is None:
-            pump_rests = find_rests(pump_volume(self), self.rate, limits.pump)
-            piston_rests = find_rests(self.step("x"), self.rate, limits.piston)
+            pump_rests = find_rests(pump_volume(self), self.rate, limits.pump, limits.shortest)
+            piston_rests = find_rests(self.step("x"), self.rate, limits.piston, limits.shortest)
             is_moving, is_holding = ~pump_rests & ~piston_rests, ~pump_rests & piston_rests
             self._states = is_moving.astype(float), is_holding.astype(float)
         return self._states
 
 
-def find_rests(increments: Array, rate: float, limit: float) -> NDArray[np.bool_]:
-    """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `MIN_REST`.
+def find_rests(increments: Array, rate: float, limit: float, shortest: float = MIN_REST) -> NDArray[np.bool_]:
+    """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `shortest` [s].
 
     `increments` (n,): increments of the pump's volume [m^3] or of the position [m], NaN (not at rest) where missing;
     `rate`: sampling rate [Hz]; `limit` in m^3/s or m/s. The speed is averaged over `AVERAGING_TIME`. A recording
-    shorter than this time and `MIN_REST` together has no rest.
+    shorter than this time and `shortest` together has no rest.
     """
-    window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(MIN_REST * rate))  # [samples]
+    window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(shortest * rate))  # [samples]
     if len(increments) < window + min_length:
         return np.zeros(len(increments), dtype=bool)
     is_known = np.isfinite(increments)
@@ -304,6 +308,8 @@ SPEED_LOSS = "loss over speed"
 MOVING_BIAS = "bias in motion"
 #: All terms that are zero in some states of the machine.
 STATES = TURNING, HOLDING, MOVING_BIAS
+#: Flow from the supply past a valve at its null, while the piston rests: constant part, and part over p_A - p_B.
+NULL_FLOW, LOADED_NULL_FLOW = "flow past the valve at rest", "flow past the valve at rest, under load"
 #: Names of two balances: of a pump-controlled cylinder with a recorded position, and of a load held by valves.
 CYLINDER, LOCKED = "cylinder", "locked"
 #: Name of a derived signal: the decay, with the drive's time constant, of the speed loop's unknown initial state.
@@ -442,26 +448,106 @@ _CYLINDER = (
 )
 
 
-def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float) -> tuple[Term, ...]:
+def _masked(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Term, ...]:
+    """Multiply the increments of terms by a `mask` (n - 1,) that is computed from the signals."""
+
+    def masked(s: Signals, increments: Callable[[Signals], Array]) -> Array:
+        """Compute the masked increments of one term."""
+        return np.asarray(mask(s) * increments(s))
+
+    return tuple(term._replace(increments=partial(masked, increments=term.increments)) for term in terms)
+
+
+def _separate_at_rest(
+    equation: Equation, null_flow: Callable[[Signals], Array], leaks: Sequence[str] = (LEAK, ORIFICE)
+) -> Equation:
+    """Give a balance behind a valve terms of its own while the piston rests, of whose coefficients nothing is known.
+
+    While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
+    return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
+    hardly changes the flow. Therefore the terms `leaks` count only while the piston moves, and before them the balance
+    gets two terms at rest: `null_flow` dt, and (p_A - p_B) dt.
+    """
+    left = equation.left
+    at_rest = (
+        _sensor_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_flow(s) * s.dt, drift="bias"),
+        _conductance_term(
+            LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
+        ),
+    )
+    terms = [_masked([term], lambda s: s.moving(left))[0] if term.name in leaks else term for term in equation.terms]
+    return _insert_before_leaks(equation._replace(terms=tuple(terms)), *at_rest)
+
+
+def is_separate_at_rest(equation: Equation) -> bool:
+    """Return True if a balance has terms of its own while the piston rests (`_separate_at_rest`)."""
+    return any(term.name == NULL_FLOW for term in equation.terms)
+
+
+def _supply_volume(s: Signals) -> Array:
+    """Compute the volume [m^3] through a meter in a valve's supply line in each interval, positive into chamber A."""
+    return np.asarray(s.mean("q_supply") * s.dt)
+
+
+def _supply_equation(rig: Rig) -> Equation:
+    """Make the volume balance of a cylinder behind a valve whose supply line has a flow meter.
+
+    The meter sees only the chamber that the supply feeds, A if the flow is positive, so that compression and external
+    leaks of the other chamber do not count.
+    """
+
+    def fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
+        """Let terms of the chamber `side` count only while the supply feeds it and the piston moves."""
+        sign = 1.0 if side == "A" else -1.0
+        return _masked(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
+
+    def direction(s: Signals) -> Array:
+        """Compute the sign of the flow in each interval; a meter without a sign has a zero in its direction."""
+        return np.sign(s.mean("q_supply"))
+
+    terms = (
+        *(_motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+        *fed("A", _chamber_terms("A")),
+        *fed("B", _chamber_terms("B")),
+        _LAG,
+        _BIAS._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
+        *fed("A", (_external_leak_term("A"),)),
+        *fed("B", (_external_leak_term("B", weight=-1.0),)),
+        _free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float)),
+        *_LEAKS,
+    )
+    equation = Equation(CYLINDER, _supply_volume, terms, area_ratio=rig.cylinder.A_B / rig.cylinder.A_A)
+    return _separate_at_rest(equation, direction)
+
+
+def _metering_edge_terms(
+    edge: str, upstream: str, downstream: str, sign: float, channels: Container[str], return_pressure: float
+) -> tuple[Term, ...]:
     """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
     `edge`: name of the edge, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of
-    the command u that opens the edge, 1 or -1. With dp = upstream pressure - downstream pressure, the flow is
+    the command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure
+    [Pa] in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
 
         flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain (dead band of u),
 
     delayed by the lag of the spool. Up to their signs, the unknown coefficients are gain, gain times lag, and overlap.
     """
+    recorded = tuple(name for name in (upstream, downstream) if name in channels)
+
+    def pressure(s: Signals, name: str) -> Array | float:
+        """Return the pressure [Pa] on one side of the edge in the middle of each interval."""
+        return s.mean(name) if name in recorded else return_pressure
 
     def pressure_root(s: Signals) -> Array:
         """Compute sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure drop dp over the edge, shape (n - 1,)."""
-        return _signed_root(s.mean(upstream) - s.mean(downstream))
+        return _signed_root(np.asarray(pressure(s, upstream) - pressure(s, downstream)))
 
     def proportional_flow(s: Signals) -> Array:
         """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s], 0 unless u opens the edge."""
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * pressure_root(s) * s.dt)
 
-    edge_term = partial(_sensor_term, drift="edge", needs=("u", upstream, downstream))
+    edge_term = partial(_sensor_term, drift="edge", needs=("u", *recorded))
     return (
         edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_flow),
         edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
@@ -469,7 +555,7 @@ def _metering_edge_terms(edge: str, upstream: str, downstream: str, sign: float)
     )
 
 
-def _chamber_equation(side: str, rig: Rig) -> Equation:
+def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation:
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
     The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
@@ -479,9 +565,10 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
     sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
+    return_pressure = rig.supply.p_return
     terms = (
-        *_metering_edge_terms(f"P to {side}", "p_1", f"p_{side}", sign),
-        *_metering_edge_terms(f"{side} to T", f"p_{side}", "p_2", -sign),
+        *_metering_edge_terms(f"P to {side}", "p_1", f"p_{side}", sign, channels, return_pressure),
+        *_metering_edge_terms(f"{side} to T", f"p_{side}", "p_2", -sign, channels, return_pressure),
         *_chamber_terms(side),
         _BIAS,
         # each chamber's balance has the same terms of air and external leaks; those of the other chamber are zero
@@ -490,23 +577,30 @@ def _chamber_equation(side: str, rig: Rig) -> Equation:
         _external_leak_term("B", weight=-float(not is_A)),
         *_LEAKS,
     )
-    return Equation(f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0)
+    equation = Equation(
+        f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0
+    )
+    return _separate_at_rest(equation, lambda s: np.ones_like(s.time_step))
 
 
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded `channels`; empty if none can.
 
-    Where a valve meters the flow into the chambers, and x, u, p_1 and p_2 are recorded, there is one balance for each
-    chamber. Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its
-    speed, a flow meter or, without these, the command.
+    Where a valve meters the flow into the chambers, and x, u and p_1 are recorded, there is one balance for each
+    chamber. If neither p_2 nor a flow meter is recorded, the return has the pressure of the rig, `supply.p_return`.
+    Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its speed, a
+    flow meter or, without these, the command.
     """
-    if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1", "p_2"} <= channels:
+    has_return = "p_2" in channels or not channels & {*METERS}
+    if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
         if not channels.issuperset(_PRESSURES):
             return ()
-        return tuple(_select_recorded_terms(_chamber_equation(side, rig), channels) for side in "AB")
+        return tuple(_select_recorded_terms(_chamber_equation(side, rig, channels), channels) for side in "AB")
     left, source = pump_volume(rig, channels), flow_source(channels)
     if left is None or not {"x", *_PRESSURES} <= channels:
         return ()
+    if source == "q_supply":
+        return (_select_recorded_terms(_supply_equation(rig), channels),)
     # a speed computed from an angle has no offset, so that a constant residual flow is external leakage
     bias = _BIAS._replace(cause="external leak", drift="outside") if "theta" in channels else _BIAS
     terms = [bias if term is _BIAS else term for term in _CYLINDER]
@@ -586,6 +680,8 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
         return lambda s: displacement * s.step("theta")
     if source == "q_pump":
         return lambda s: s.mean("q_pump") * s.dt
+    if source == "q_supply":
+        return _supply_volume
     if source == "omega" or (source == "u" and rig.circuit.pump_feeds_chambers):
         return lambda s: displacement * s.mean("omega") * s.dt
     return None

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.parameters.rig import ASSUMED
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Recording
 
 #: Who stated the rig: the caller, the recording's provenance, or nobody.
@@ -35,7 +35,7 @@ class AssumedMachine:
     area_stated, displacement_stated : bool
         Whether the size is known from the rig, or was stated separately.
     flow_meter : bool
-        Whether a flow meter, channel `q_pump`, measures the flow, so that neither size is needed.
+        Whether a flow meter, channel `q_pump` or `q_supply`, measures the flow, so that neither size is needed.
     areas : tuple of float, optional
         Piston areas of sides A and B [m^2].
     bypass : bool
@@ -108,11 +108,12 @@ def states_rig(rig: Rig) -> bool:
 
 
 def measures_flow(units: Mapping[str, str]) -> bool:
-    """Return True if the best source for the flow to the cylinder is a flow meter, the channel `q_pump`, in m^3/s.
+    """Return True if the best source for the flow to the cylinder is a flow meter (`METERS`) in m^3/s.
 
     The result is False if the pump's angle or speed is recorded, too. `units` has the unit of each recorded channel.
     """
-    return flow_source(units) == "q_pump" and units["q_pump"] == "m^3/s"
+    source = flow_source(units)
+    return source in METERS and units[source] == "m^3/s"
 
 
 def healthy_leakage(rig: Rig) -> float:

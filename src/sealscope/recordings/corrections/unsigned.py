@@ -1,5 +1,9 @@
 """Speeds and flows without a sign: an encoder or a flow meter that counts pulses does not measure the direction.
 
+A flow meter beside the command of a valve has no sign where it is in the valve's supply line: the flow is positive, and
+the spool chooses the chamber. Its channel is then `q_supply`, since while the piston rests this flow is not the
+cylinder's but passes the valve (`diagnosis.inference.terms`).
+
 If a speed is never negative while the piston moves both ways, either it has no sign, or the pump turns one way and a
 valve chooses the side. In both cases the flow into chamber A is about a v + c (p_A - p_B), with the piston speed v;
 the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to the signed
@@ -26,16 +30,17 @@ _PRIORS = RECORDINGS.unsigned
 _MAX_ITERATIONS = 10
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
-_NAMES = {"omega": "speed", "q_pump": "flow"}
+_NAMES = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 
 
 def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
     The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
-    cannot be found stays as it is. Also returns a finding for each channel that was changed.
+    cannot be found stays as it is. If a valve's command is recorded beside a flow q_pump without a sign, the result has
+    the channel q_supply in its place. Also returns a finding for each channel that was changed.
     """
-    channels, findings = dict(recording.channels), list[Finding]()
+    channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     for name, quantity in _NAMES.items():
         if name not in recording or not _has_one_sign(recording[name]):
             continue
@@ -47,8 +52,11 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
+        if name == "q_pump" and "x" in recording and "u" in recording and _moves_both_ways(recording["u"]):
+            channels["q_supply"], units["q_supply"] = channels.pop(name), units.pop(name)
+            text += ", and it counts as the flow in the valve's supply line (q_supply)"
         findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
-    return (replace(recording, channels=channels) if findings else recording), findings
+    return (replace(recording, channels=channels, units=units) if findings else recording), findings
 
 
 def _has_one_sign(values: Array) -> bool:

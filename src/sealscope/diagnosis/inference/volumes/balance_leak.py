@@ -31,6 +31,7 @@ from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
+from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
@@ -77,9 +78,10 @@ class BalanceLeak:
         - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
           too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
           `held_oil.rare` (`priors.toml`), as it does beside a chamber that is open to the tank.
-        - "piston leak" if a servo valve drives the cylinder, or if holds measure the leakage, i.e. times in which shut
-          valves separate the pump from the loaded cylinder. Then `rise` must be the rise in holds. In addition, the
-          balance must already assume shut valves at every rest, or the rise must be too high for a healthy machine.
+        - "piston leak" if a servo valve drives the cylinder, if a flow meter measures the flow behind the pump, or if
+          holds measure the leakage, i.e. times in which shut valves separate the pump from the loaded cylinder. Then
+          `rise` must be the rise in holds. In addition, the balance must already assume shut valves at every rest, or
+          the rise must be too high for a healthy machine.
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
@@ -92,7 +94,8 @@ class BalanceLeak:
         if is_measured_in_holds and chambers is not None:
             is_external = chambers.piston_leak.probability < 1.0 - INFERENCE.held_oil.rare
             return "internal or external leak" if is_external else "piston leak"
-        return "piston leak" if has_servo_valve or is_measured_in_holds else "piston or pump leak"
+        is_behind_pump = has_servo_valve or flow_source(self.balance.recording.channels) in METERS
+        return "piston leak" if is_behind_pump or is_measured_in_holds else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:
@@ -460,10 +463,11 @@ class BalanceLeak:
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
-        the pump. `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the
-        recording, computed with the assumed piston area and displacement; None if that was not tested. The result
-        states it as `findable_lpm` and `findable_share`.
+        The limit is that of the rig's file, None if healthy recordings are compared instead. The flow is not stated
+        behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of the pump.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
+        computed with the assumed piston area and displacement; None if that was not tested. The result states it as
+        `findable_lpm` and `findable_share`.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -481,7 +485,7 @@ class BalanceLeak:
             interval_lpm=(low, high) if is_stated else None,
             pressure=pressure,
             findable_lpm=None if detectable_flow is None or not size.stated else detectable_flow * lpm_per_flow,
-            healthy_lpm=limit * pressure / LITRE_PER_MINUTE if limit > 0.0 else None,
+            healthy_lpm=limit * pressure / LITRE_PER_MINUTE if limit > 0.0 and self.rise is None else None,
             pump_share=max(value, 0.0) * pressure / pump_flow if pump_flow > 0.0 and is_single else None,
             findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,
         )

@@ -60,7 +60,7 @@ from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakag
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
-from sealscope.recordings.channels import COUNTS, flow_source
+from sealscope.recordings.channels import COUNTS, METERS, flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording
@@ -497,7 +497,7 @@ class RecordedBalance:
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)
-        has_flow_unit = source == "q_pump" or (source, COUNTS) not in self.units  # the area scales a meter without unit
+        has_flow_unit = source in METERS or (source, COUNTS) not in self.units  # the area scales a meter without unit
         has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & self.units
         states_displacement = rig.states("pump.q_b") and has_flow_unit
         states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
