@@ -287,7 +287,7 @@ def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
 def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
     healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
     judged = balance(7, odds=10.0, leak=leak)
-    held, wide = BalanceLeak(VolumeBalance.name, judged, healthy), Rise(leak, 5e-14, np.inf)
+    held, wide = BalanceLeak(judged, healthy), Rise(leak, 5e-14, np.inf)
     held.__dict__["_motion_rise"] = wide
     assert leak * judged.mean_pressure() < held.bound_flow
     assert held.bound_flow < 0.7 * wide.bound() * judged.mean_pressure()
@@ -298,7 +298,7 @@ def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
     healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
     for leak, since in ((1e-13, 0.0), (1e-13, 50.0)):
         judged = balance(7, odds=10.0, leak=leak, since=since)
-        onset = BalanceLeak(VolumeBalance.name, judged, healthy).rise_onset
+        onset = BalanceLeak(judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high
 

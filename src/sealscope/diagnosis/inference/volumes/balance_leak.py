@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,11 +24,11 @@ from sealscope.diagnosis.inference.leak_law import (
     mixture_flow,
     older_log_ratios,
 )
-from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
+from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, Flow, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR, LITRE_PER_MINUTE
@@ -49,26 +48,21 @@ class _HoldLaws(NamedTuple):
     deviations: Array
 
 
-@dataclass(frozen=True, eq=False)
-class BalanceLeak:
-    """The leakage of a recording as measured by its volume balance (`observable.LeakMeasure`).
+class BalanceLeak(LeakMeasure):
+    """The leakage of a recording as measured by its volume balance; its flows are averaged over the laws of a leak.
 
     Parameters
     ----------
-    provider : str
-        Name of the detector.
     balance : RecordedBalance
         Volume balance of the recording.
     healthy : sequence of RecordingSums
         Summaries of the healthy recordings of the machine whose volume balance has the same terms.
     """
 
-    provider: str
-    balance: RecordedBalance
-    healthy: Sequence[RecordingSums] = ()
+    provider = VOLUME_BALANCE
 
-    #: Flows are averaged over the laws of a leak.
-    flow_factors: tuple[float, float] = (1.0, 1.0)
+    def __init__(self, balance: RecordedBalance, healthy: Sequence[RecordingSums] = ()) -> None:
+        self.balance, self.healthy = balance, healthy
 
     @property
     def cause(self) -> Cause:
@@ -108,7 +102,7 @@ class BalanceLeak:
         """
         balance, test = self.balance, self.balance.test
         if test is None:
-            return Flow(0.0, np.inf)
+            return UNKNOWN_FLOW
         flow = estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 

@@ -139,7 +139,7 @@ class VolumeBalance:
             for cycle in balances
         )
         usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
-        return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
+        return min(usable, key=lambda candidate: BalanceLeak(candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
         """Compute the blocks for a volume balance with a position, only once for each recording.
@@ -306,7 +306,7 @@ class VolumeBalance:
         and compared with that of the `healthy` recordings, if there are any. If neither is possible, the report states
         only the reason.
         """
-        leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
+        leak, rows = BalanceLeak(balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             reason = "finds p_A and p_B too similar, or too few samples without gaps, to show a leak"
             return Observed(self.name, lack=reason)
