@@ -207,7 +207,7 @@ def test_behind_a_flow_meter_a_load_that_creeps_by_a_leak_does_not_move_by_the_v
         assert measured is not None and measured.shut and measured.test is not None
         assert measured.test.chance < 1e-4
         assert measured.test.onset().low < 50.0 < measured.test.onset().high
-        assert measured.test.fitted.size == pytest.approx(2e-13, rel=0.1)
+        assert measured.test.fitted.value == pytest.approx(2e-13, rel=0.1)
         assert measured.conductance.value == pytest.approx(2e-13 * 46.0 / 96.0, rel=0.1)
 
 

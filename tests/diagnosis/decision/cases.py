@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, LeakRise, Observable
-from sealscope.diagnosis.inference.onset import Information, Interval, StepTest, step_test
+from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable
+from sealscope.diagnosis.inference.onset import Estimate, Information, Interval, StepTest, step_test
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
 
 #: Flow of the pump, and of a step of one [m^3/s]; L/min of 1 m^3/s.
@@ -40,9 +40,9 @@ def measured_leak(
         provider="volume balance",
         cause="piston or pump leak",
         step=step,
-        step_flow=Flow(step_size * DRIVING, step_deviation * DRIVING),
+        step_flow=Estimate(step_size * DRIVING, step_deviation * DRIVING),
         rise=rise,
-        rise_flow=None if rise is None else Flow(rise.value * DRIVING, rise.deviation * DRIVING),
+        rise_flow=None if rise is None else Estimate(rise.value * DRIVING, rise.deviation * DRIVING),
         step_rise=None if rise is None else LeakRise(rise, rise.log_ratio(0.5 * step_size)),
         bound_flow=bound_flow,
         flow_per_conductance=DRIVING,

@@ -15,18 +15,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.onset import Interval, StepTest
+from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
-
-
-class LogScale(NamedTuple):
-    """Logarithm `value` of the factor by which both pressures would have to be scaled to cause a change.
-
-    `deviation`: standard deviation of this logarithm.
-    """
-
-    value: float
-    deviation: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +44,9 @@ class Observable:
         prior on its size.
     log_ratio_to_leak : float, optional
         Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
-    pressure_scale : LogScale, optional
-        Scale of both pressures that would cause this change by itself; None if it is unknown, or if none would.
+    pressure_scale : Estimate, optional
+        Logarithm of the factor by which both pressures would have to be scaled to cause this change by itself; None if
+        it is unknown, or if none would.
     """
 
     name: str
@@ -66,7 +57,7 @@ class Observable:
     size: float = 0.0
     advantage: float = 0.0
     log_ratio_to_leak: float | None = None
-    pressure_scale: LogScale | None = None
+    pressure_scale: Estimate | None = None
 
     @property
     def surprisal(self) -> float:
@@ -82,7 +73,7 @@ class Observable:
         *,
         n_tests: float = 1.0,
         advantage: float = 0.0,
-        pressure_scale: LogScale | None = None,
+        pressure_scale: Estimate | None = None,
     ) -> Observable:
         """Make an observable from a test for a step, a sudden lasting change, within the recording.
 
@@ -95,24 +86,14 @@ class Observable:
             score=test.score,
             chance=min(1.0, n_tests * test.chance),
             onset=test.onset(),
-            size=test.sign * test.fitted.size,
+            size=test.sign * test.fitted.value,
             advantage=advantage,
             pressure_scale=pressure_scale,
         )
 
 
-class Flow(NamedTuple):
-    """A leakage flow and its standard error [m^3/s].
-
-    The error excludes the errors of the piston's area and the pump's displacement, which scale all flows.
-    """
-
-    value: float
-    deviation: float
-
-
 #: Flow of a leak that was not tested.
-UNKNOWN_FLOW = Flow(0.0, math.inf)
+UNKNOWN_FLOW = Estimate(0.0, math.inf)
 
 
 class Remark(NamedTuple):
@@ -139,7 +120,7 @@ class LeakRise(NamedTuple):
     step_log_ratio: float = 0.0
     onset_log_ratio: float = math.inf
     older_log_ratio: float = 0.0
-    older_flow: Flow | None = None
+    older_flow: Estimate | None = None
 
 
 class RiseTest(Protocol):
@@ -174,7 +155,9 @@ class DatedTest(RiseTest, Protocol):
 class LeakMeasure:
     """Leakage that one detector measures in a recording: tests and flows, without a verdict.
 
-    A subclass may replace fields by properties, which are computed when they are first read (`BalanceLeak`).
+    The standard errors of flows exclude the errors of the piston's area and the pump's displacement, which scale all
+    flows (`size_deviation`). A subclass may replace fields by properties, which are computed when they are first read
+    (`BalanceLeak`).
 
     Parameters
     ----------
@@ -184,7 +167,7 @@ class LeakMeasure:
         Cause of a leak, e.g. "piston or pump leak", as precise as the recorded channels allow.
     step : DatedTest, optional
         Test for a leak that begins within the recording; None if the recording is too short.
-    step_flow : Flow
+    step_flow : Estimate
         Mean flow [m^3/s] of a leak that begins within the recording, averaged from its onset to the end.
     flow_factors : tuple of two floats
         Smallest and largest ratio of the leak's true flow to the stated one, if its path or law is unknown.
@@ -192,7 +175,7 @@ class LeakMeasure:
         Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures.
     rise : RiseTest, optional
         Test of the mean leakage against the leakage of healthy recordings; None without such recordings.
-    rise_flow : Flow, optional
+    rise_flow : Estimate, optional
         Mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if unknown.
     rise_onset : Interval, optional
         Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning.
@@ -220,11 +203,11 @@ class LeakMeasure:
     provider: str
     cause: Cause
     step: DatedTest | None = None
-    step_flow: Flow = UNKNOWN_FLOW
+    step_flow: Estimate = UNKNOWN_FLOW
     flow_factors: tuple[float, float] = (1.0, 1.0)
     flow_per_conductance: float = 0.0
     rise: RiseTest | None = None
-    rise_flow: Flow | None = None
+    rise_flow: Estimate | None = None
     rise_onset: Interval | None = None
     step_rise: LeakRise | None = None
     excess: float | None = None
@@ -236,7 +219,7 @@ class LeakMeasure:
     remarks: Sequence[Remark] = ()
     total_leakage: TotalLeakage | None = None
 
-    def relative(self, flow: Flow) -> RelativeLeak | None:
+    def relative(self, flow: Estimate) -> RelativeLeak | None:
         """Convert a leak's flow to a fraction of the pump's flow and a creep speed [m/s]; None if both are unknown."""
         return None
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.observable import Flow, LeakMeasure
-from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Interval
+from sealscope.diagnosis.inference.observable import LeakMeasure
+from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import (
     GROUP,
@@ -207,7 +207,7 @@ class Watch:
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
             max_flow = estimator.orifice_factor * self._detector.bound() * pressure
             bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
-        flow = Flow(test.size * pressure, test.deviation * pressure)  # mean increase of the leakage
+        flow = Estimate(test.size * pressure, test.deviation * pressure)  # mean increase of the leakage
         return LeakMeasure(
             provider=WATCH,
             cause=cause,

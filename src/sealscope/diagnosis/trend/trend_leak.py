@@ -81,7 +81,6 @@ def _measure_leak(
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
     # the flow at `pressure` is the level times `pressure` for a laminar leak, k = 1; other laws have a further factor
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
-    leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
     # mean flow of the pump in the trend's unit, converted like a level, which is a flow over a pressure
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
     pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
@@ -92,7 +91,7 @@ def _measure_leak(
         cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
         rise=rise,
         step_rise=None if rise is None else LeakRise(rise),
-        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
+        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
         pump_flow=(pump_flow, pump_flow),

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise, student_rise
-from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, Flow, LeakMeasure, LeakRise
-from sealscope.diagnosis.inference.onset import WITHIN_95, Information, StepTest, fit_history, step_test
+from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, TotalLeakage
 from sealscope.recordings.recording import Array
@@ -86,7 +86,7 @@ class ResponseLeak(LeakMeasure):
         return step_test(self.information)
 
     @property
-    def step_flow(self) -> Flow:
+    def step_flow(self) -> Estimate:
         """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
         The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
@@ -100,7 +100,7 @@ class ResponseLeak(LeakMeasure):
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
         law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
-        return Flow(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
+        return Estimate(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
 
     @property
     def flow_per_conductance(self) -> float:
@@ -143,7 +143,7 @@ class ResponseLeak(LeakMeasure):
         if self.rise is None:
             return None
         step = self.step
-        rise_by_step = 0.0 if step is None else step.fitted.size * self.information.fraction_after(step.onset().value)
+        rise_by_step = 0.0 if step is None else step.fitted.value * self.information.fraction_after(step.onset().value)
         return LeakRise(self.rise, step_log_ratio=self.rise.log_ratio(rise_by_step))
 
     @property

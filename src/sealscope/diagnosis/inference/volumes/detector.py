@@ -24,8 +24,9 @@ from sealscope.diagnosis.inference.comparison.conditions import find_unusual_con
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.terms import CYLINDER, HOLDING, TURNING, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
