@@ -7,12 +7,12 @@ import pytest
 from scipy.stats import binom
 
 from sealscope.diagnosis.inference.differences import (
-    Estimate,
     PriorScatter,
     compare_estimates,
     compare_with_healthy,
     excess_error,
 )
+from sealscope.diagnosis.inference.onset import Estimate
 
 from ..representatives import SLOW, few
 

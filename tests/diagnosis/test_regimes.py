@@ -207,7 +207,7 @@ def test_behind_a_flow_meter_a_load_that_creeps_by_a_leak_does_not_move_by_the_v
         assert measured is not None and measured.shut and measured.test is not None
         assert measured.test.chance < 1e-4
         assert measured.test.onset().low < 50.0 < measured.test.onset().high
-        assert measured.test.fitted.size == pytest.approx(2e-13, rel=0.1)
+        assert measured.test.fitted.value == pytest.approx(2e-13, rel=0.1)
         assert measured.conductance.value == pytest.approx(2e-13 * 46.0 / 96.0, rel=0.1)
 
 
@@ -287,7 +287,7 @@ def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
 def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
     healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
     judged = balance(7, odds=10.0, leak=leak)
-    held, wide = BalanceLeak(VolumeBalance.name, judged, healthy), Rise(leak, 5e-14, np.inf)
+    held, wide = BalanceLeak(judged, healthy), Rise(leak, 5e-14, np.inf)
     held.__dict__["_motion_rise"] = wide
     assert leak * judged.mean_pressure() < held.bound_flow
     assert held.bound_flow < 0.7 * wide.bound() * judged.mean_pressure()
@@ -298,7 +298,7 @@ def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
     healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
     for leak, since in ((1e-13, 0.0), (1e-13, 50.0)):
         judged = balance(7, odds=10.0, leak=leak, since=since)
-        onset = BalanceLeak(VolumeBalance.name, judged, healthy).rise_onset
+        onset = BalanceLeak(judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high
 

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable
-from sealscope.diagnosis.inference.onset import Information, Interval, StepTest, step_test
-from sealscope.diagnosis.verdict.evidence import Cause, TotalLeakage
+from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable
+from sealscope.diagnosis.inference.onset import Estimate, Information, Interval, StepTest, step_test
+from sealscope.diagnosis.verdict.evidence import TotalLeakage
 
 #: Flow of the pump, and of a step of one [m^3/s]; L/min of 1 m^3/s.
 PUMP_FLOW, DRIVING, LITRES = 1e-4, 1e-7, 6e4
@@ -32,48 +31,23 @@ def step(size: float, blocks: int = 40, seed: int = 0) -> StepTest:
     return test
 
 
-@dataclass(frozen=True, eq=False)
-class MeasuredLeak:
-    """A leak as a provider would measure it (`observable.LeakMeasure`)."""
-
-    step: StepTest | None = None
-    rise: Rise | None = None
-    excess: float | None = None
-    bound: float = 2e-7
-    provider: str = "volume balance"
-    cause: Cause = "piston or pump leak"
-    lpm_per_flow: float | None = LITRES
-    size_deviation: float = 0.0
-    ratio: None = None
-    remarks: tuple[()] = ()
-    rise_onset: Interval | None = None
-    flow_factors: tuple[float, float] = (1.0, 1.0)
-    flow_per_conductance: float = DRIVING
-    pump_flow: tuple[float, float] = (PUMP_FLOW, PUMP_FLOW)
-
-    @property
-    def step_flow(self) -> Flow:
-        size, deviation = (0.0, 1.0) if self.step is None else self.step.fitted
-        return Flow(size * DRIVING, deviation * DRIVING)
-
-    @property
-    def step_rise(self) -> LeakRise | None:
-        size = 0.0 if self.step is None else 0.5 * self.step.fitted[0]
-        return None if self.rise is None else LeakRise(self.rise, self.rise.log_ratio(size))
-
-    @property
-    def rise_flow(self) -> Flow | None:
-        return None if self.rise is None else Flow(self.rise.value * DRIVING, self.rise.deviation * DRIVING)
-
-    @property
-    def bound_flow(self) -> float:
-        return self.bound
-
-    def relative(self, flow: Flow) -> None:
-        return None
-
-    def total(self, detectable_flow: float | None) -> TotalLeakage:
-        return TotalLeakage(lpm=0.01, interval_lpm=(0.009, 0.011), pressure=1e5, healthy_lpm=0.001)
-
-    def history(self, onset_s: float | None) -> None:
-        return None
+def measured_leak(
+    step: StepTest | None = None, rise: Rise | None = None, bound_flow: float = 2e-7, **fields: Any
+) -> LeakMeasure:
+    """Measure a leak as a detector would, with a flow of `DRIVING` per unit of a step and of a rise."""
+    step_size, step_deviation = (0.0, 1.0) if step is None else step.fitted
+    return LeakMeasure(
+        provider="volume balance",
+        cause="piston or pump leak",
+        step=step,
+        step_flow=Estimate(step_size * DRIVING, step_deviation * DRIVING),
+        rise=rise,
+        rise_flow=None if rise is None else Estimate(rise.value * DRIVING, rise.deviation * DRIVING),
+        step_rise=None if rise is None else LeakRise(rise, rise.log_ratio(0.5 * step_size)),
+        bound_flow=bound_flow,
+        flow_per_conductance=DRIVING,
+        pump_flow=(PUMP_FLOW, PUMP_FLOW),
+        total_leakage=TotalLeakage(lpm=0.01, interval_lpm=(0.009, 0.011), pressure=1e5, healthy_lpm=0.001),
+        lpm_per_flow=LITRES,
+        **fields,
+    )

@@ -14,30 +14,30 @@ from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.verdict.evidence import Evidence
 
-from .cases import DRIVING, LITRES, MeasuredLeak, observable, step
+from .cases import DRIVING, LITRES, measured_leak, observable, step
 
 ALLOWED = 0.01
 SOURCE = Path(__file__).resolve().parents[3] / "src" / "sealscope" / "diagnosis"
 
 
-def report_of(leak: MeasuredLeak, *rivals: Observable) -> Observed:
+def report_of(leak: LeakMeasure, *rivals: Observable) -> Observed:
     """Report a leak's step as an observable, and others of the same balance beside it."""
     tests = [] if leak.step is None else [Observable.from_test("leak", "volumes", leak.step)]
     return Observed("volume balance", (*tests, *rivals), leak)
 
 
 def judge_leak(
-    leak: MeasuredLeak, *rivals: Observable, null: HealthyNull | None = None, also: Sequence[Observable] = ()
+    leak: LeakMeasure, *rivals: Observable, null: HealthyNull | None = None, also: Sequence[Observable] = ()
 ) -> Evidence:
     report = report_of(leak, *rivals)
     return decide(report, [Observed("signals", tuple(also))], null or HealthyNull(), ALLOWED)
 
 
-def case_of(leak: MeasuredLeak, *rivals: Observable) -> Case:
+def case_of(leak: LeakMeasure, *rivals: Observable) -> Case:
     report = report_of(leak, *rivals)
     return Case(report, report.observables, HealthyNull(), ALLOWED)
 
@@ -49,7 +49,7 @@ def test_a_larger_step_is_never_less_of_a_leak(rivals: tuple[str, ...]) -> None:
     """Rivals that describe the same residual a hundred times worse."""
     leaks = []
     for size in (0.0, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 64.0):
-        leak = MeasuredLeak(step(size))
+        leak = measured_leak(step(size))
         beside = [observable(name, min(1.0, 1e2 * leak.step.chance)) for name in rivals]
         leaks.append(judge_leak(leak, *beside).verdict == "leak")
     assert leaks == sorted(leaks)
@@ -59,7 +59,7 @@ def test_a_larger_step_is_never_less_of_a_leak(rivals: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("surprisals", [(), (1.0, 0.5), (3.0, 4.0, 2.0)])
 def test_a_rarer_healthy_machine_asks_for_more(surprisals: tuple[float, ...]) -> None:
     null = HealthyNull({"volume balance: step": surprisals, "volumes: leak": surprisals})
-    leaks = [judge_leak(MeasuredLeak(step(size)), null=null) for size in (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)]
+    leaks = [judge_leak(measured_leak(step(size)), null=null) for size in (0.0, 1.0, 2.0, 4.0, 8.0, 16.0)]
     verdicts = [leak.verdict == "leak" for leak in leaks]
     assert verdicts == sorted(verdicts) and verdicts[-1]
     for leak in leaks:
@@ -68,7 +68,7 @@ def test_a_rarer_healthy_machine_asks_for_more(surprisals: tuple[float, ...]) ->
 
 def test_the_onset_of_a_rise_is_stated_where_something_dates_it() -> None:
     for onset in (None, Interval(50.0, 45.0, 55.0)):
-        evidence = judge_leak(MeasuredLeak(rise=Rise(20.0, 1.0, np.inf), rise_onset=onset))
+        evidence = judge_leak(measured_leak(rise=Rise(20.0, 1.0, np.inf), rise_onset=onset))
         assert evidence.verdict == "leak"
         assert evidence.onset_s == (None if onset is None else onset.value)
         assert evidence.onset_interval_s == (None if onset is None else (onset.low, onset.high))
@@ -77,14 +77,14 @@ def test_the_onset_of_a_rise_is_stated_where_something_dates_it() -> None:
 @pytest.mark.parametrize(("rise", "begins_within"), [(4.0, True), (60.0, False)])
 def test_a_rise_that_no_step_makes_is_older_than_the_recording(rise: float, begins_within: bool) -> None:
     """A step of 8 half-way raises the mean by 4; a rise of 60 was there from the start, whatever else stepped."""
-    evidence = judge_leak(MeasuredLeak(step(8.0), rise=Rise(rise, 1.0, 30.0)))
+    evidence = judge_leak(measured_leak(step(8.0), rise=Rise(rise, 1.0, 30.0)))
     assert evidence.verdict == "leak"
     assert (evidence.onset_s is not None) == begins_within
 
 
 def test_a_noise_step_changes_neither_verdict_nor_size_nor_onset() -> None:
     """3 leaks of 60 passed for none above a tenth of them where the noise of the pressures had stepped by 4 %."""
-    leak = MeasuredLeak(step(8.0))
+    leak = measured_leak(step(8.0))
     alone = judge_leak(leak)
     for key in ("noise: noise of the pressures", "hum: hum of 50 Hz", "levels: zero of p_B", "duty: size of the duty"):
         beside = judge_leak(leak, also=[observable(key, 1e-60)])
@@ -95,7 +95,7 @@ def test_a_noise_step_changes_neither_verdict_nor_size_nor_onset() -> None:
 @pytest.mark.parametrize("factor", [1e3, 1.0, 1e-3, 1e-6, 1e-9])
 def test_a_leak_that_may_be_is_below_the_bound(factor: float) -> None:
     """Whatever competes: the verdict is `leak`, or the step is within the bound, or it has less than 5 %."""
-    leak = MeasuredLeak(step(4.0))
+    leak = measured_leak(step(4.0))
     rival = observable("volumes: external leak A", min(1.0, factor * leak.step.chance))
     evidence, case = judge_leak(leak, rival), case_of(leak, rival)
     (alarm,) = case.alarms
@@ -106,14 +106,14 @@ def test_a_leak_that_may_be_is_below_the_bound(factor: float) -> None:
 
 
 def test_the_bound_is_no_larger_than_what_would_have_shown_where_nothing_did() -> None:
-    leak = MeasuredLeak(step(0.0))
+    leak = measured_leak(step(0.0))
     evidence = judge_leak(leak)
     assert evidence.verdict == "no leak"
-    assert evidence.bound_lpm == pytest.approx(leak.bound * LITRES)
+    assert evidence.bound_lpm == pytest.approx(leak.bound_flow * LITRES)
 
 
 def test_a_bound_that_nobody_could_use_is_no_verdict() -> None:
-    evidence = judge_leak(MeasuredLeak(step(0.0), bound=5e-5))
+    evidence = judge_leak(measured_leak(step(0.0), bound_flow=5e-5))
     assert evidence.verdict == "cannot tell"
     assert evidence.bound_lpm == pytest.approx(5e-5 * LITRES)
 
@@ -130,7 +130,7 @@ def test_a_bound_that_nobody_could_use_is_no_verdict() -> None:
 )
 def test_questions_share_the_probability(values: dict[str, object], names: tuple[str, ...]) -> None:
     given = {**values, "step": step(0.0)} if "step" in values else values
-    questions = case_of(MeasuredLeak(**given)).tests  # type: ignore[arg-type]
+    questions = case_of(measured_leak(**given)).tests  # type: ignore[arg-type]
     assert tuple(question.name for question in questions) == names
     assert sum(question.probability for question in questions) == pytest.approx(ALLOWED)
     for question in questions:
@@ -138,7 +138,7 @@ def test_questions_share_the_probability(values: dict[str, object], names: tuple
 
 
 def test_a_rise_alone_is_a_leak_without_an_onset() -> None:
-    evidence = judge_leak(MeasuredLeak(step(0.0), rise=Rise(40.0, 2.0, 20.0)))
+    evidence = judge_leak(measured_leak(step(0.0), rise=Rise(40.0, 2.0, 20.0)))
     assert (evidence.verdict, evidence.onset_s) == ("leak", None)
     assert evidence.leak_lpm == pytest.approx(40.0 * DRIVING * LITRES)
     assert [part.verdict for part in evidence.parts] == ["no leak", "leak"]
@@ -182,10 +182,10 @@ def test_what_cannot_be_observed_is_said() -> None:
 
 
 def test_what_happened_is_named_only_where_it_is_sure() -> None:
-    sure = judge_leak(MeasuredLeak(step(0.0)), also=[observable("noise: noise of the pressures", 1e-40)])
+    sure = judge_leak(measured_leak(step(0.0)), also=[observable("noise: noise of the pressures", 1e-40)])
     assert (sure.verdict, sure.cause) == ("no leak", "sensor fault")
     alike = [observable("levels: friction", 1e-12), observable("levels: load", 1e-12)]
-    assert judge_leak(MeasuredLeak(step(0.0)), also=alike).cause is None
+    assert judge_leak(measured_leak(step(0.0)), also=alike).cause is None
 
 
 #: Files of the diagnosis that may hold a verdict's words as a constant: the types, and the one decision.
@@ -249,7 +249,7 @@ def test_scores_are_finite_for_any_chance() -> None:
 )
 def test_the_outside_is_named_unless_the_data_exclude_it(likelihood_ratio: float, cause: str) -> None:
     """Rivals that describe the residual as well as the leak, and a thousand times worse."""
-    leak = MeasuredLeak(step(8.0))
+    leak = measured_leak(step(8.0))
     chance = leak.step.chance / likelihood_ratio
     outside = [observable(f"volumes: external leak {side}", chance) for side in "AB"]
     evidence = judge_leak(leak, *outside)
@@ -269,7 +269,7 @@ def test_oil_that_leaks_inside_or_outside_is_a_leak_until_one_of_them_is_sure(
     ratio: float, verdict: str, cause: str
 ) -> None:
     """With a likelihood ratio of 30 it is outside by three to one, which is too little to exclude the piston."""
-    leak = MeasuredLeak(step(8.0))
+    leak = measured_leak(step(8.0))
     outside = [observable(f"volumes: external leak {side}", leak.step.chance / ratio) for side in "AB"]
     evidence = judge_leak(leak, *outside)
     assert (evidence.verdict, evidence.cause) == (verdict, cause)

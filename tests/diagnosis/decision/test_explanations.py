@@ -20,7 +20,8 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import LeakRise, LogScale, Observable, Observed
+from sealscope.diagnosis.inference.observable import LeakRise, Observable, Observed
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.states import state_of
 
@@ -78,7 +79,7 @@ def test_one_observable_by_hand() -> None:
 
 
 def scaled(key: str, log_scale: float) -> Observable:
-    return replace(observable(key, 1e-12), pressure_scale=LogScale(log_scale, 0.05))
+    return replace(observable(key, 1e-12), pressure_scale=Estimate(log_scale, 0.05))
 
 
 @pytest.mark.parametrize(("log_scales", "is_scale"), [((-0.7, -0.7, -0.7), True), ((-0.7, -2.5, 0.9), False)])

@@ -21,7 +21,8 @@ from sealscope.diagnosis.decision.explanations import (
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
 from sealscope.diagnosis.inference.comparison.rise import RISE
-from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observable, Observed
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.states import joint_causes
@@ -170,7 +171,7 @@ class Case:
         older_gain = older_leak_gain(step_gain, rise) + rise.older_log_ratio
         return step_gain + rise.step_log_ratio > max(older_gain, log_bayes_factor(rise.rise.chance))
 
-    def leak_flow(self, alarm: LeakTest) -> Flow | None:
+    def leak_flow(self, alarm: LeakTest) -> Estimate | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
         After an alarm by comparison with healthy recordings, this is the flow of the rise over them; after an alarm by

@@ -33,8 +33,8 @@ from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import reason_of
-from sealscope.diagnosis.inference.observable import Flow, LeakMeasure, Observed
-from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (
@@ -143,7 +143,7 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     return "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
 
 
-def _size_fields(leak: LeakMeasure, flow: Flow | None) -> dict[str, Any]:
+def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:
     """Compute the fields of `Evidence` on the size of a leak, by their names; none without a `flow`.
 
     The mean `flow` is stated relative to the machine. If `leak` has a factor to L/min, it is also stated in L/min with

@@ -30,6 +30,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.inference import StepSize
 
 #: Minimum number of healthy recordings for a scatter.
@@ -44,13 +45,6 @@ MAX_RATIO_TO_VALUES = 10.0
 INFLATIONS = 9
 #: Smallest positive number that is divided by.
 TINY = float(np.finfo(float).tiny)
-
-
-class Estimate(NamedTuple):
-    """An estimate `value` and its standard error `deviation`."""
-
-    value: float
-    deviation: float
 
 
 class PriorScatter(NamedTuple):

@@ -22,8 +22,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
-from sealscope.diagnosis.inference.observable import Flow
 from sealscope.diagnosis.inference.onset import (
+    Estimate,
     Information,
     StepTest,
     constant_log_ratio,
@@ -137,7 +137,7 @@ def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Infor
     )
 
 
-def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Flow | None]:
+def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Estimate | None]:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its curvature over pressure.
 
     With dp = p_A - p_B, the flow of the leak is c |dp|^e. The healthy leakage is laminar (e = 1) and not curved. The
@@ -156,10 +156,14 @@ def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: f
     coefficient = float(bend.vector.sum()) / noise / precision
     root = float(np.average(blocks.mean_root(), weights=blocks.pressure_weights))
     factors = [None if exponent == 1.0 else root / (4.0 * exponent * (1.0 - exponent)) for exponent in EXPONENTS]
-    return [None if factor is None else Flow(coefficient * factor, factor / math.sqrt(precision)) for factor in factors]
+    return [
+        None if factor is None else Estimate(coefficient * factor, factor / math.sqrt(precision)) for factor in factors
+    ]
 
 
-def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flows: Sequence[Flow | None]) -> Flow:
+def estimate_older_flow(
+    log_ratios: Array, rise_flows: Sequence[Estimate], bend_flows: Sequence[Estimate | None]
+) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
 
     The flow is proportional to |p_A - p_B|^e, with an exponent e of `EXPONENTS`. For each e it is estimated from the
@@ -171,14 +175,14 @@ def estimate_older_flow(log_ratios: Array, rise_flows: Sequence[Flow], bend_flow
     `older_log_ratios`).
     """
     log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
-    weights, flows = list[float](), list[Flow]()
+    weights, flows = list[float](), list[Estimate]()
     for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
         flow, weight = by_rise, float(log_prior)
         if by_bend is not None:
             variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)
             weight += log_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
             value = float(np.average([by_rise.value, by_bend.value], weights=1.0 / variances))
-            flow = Flow(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
+            flow = Estimate(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
         weights.append(weight)
         flows.append(flow)
     values, deviations = np.array(flows).T
@@ -201,7 +205,7 @@ def _onset_positions(leak: Information, test: StepTest) -> Array:
     return test.positions - float(np.isfinite(leak.level))
 
 
-def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Flow:
+def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
     It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
@@ -235,7 +239,7 @@ def estimate_rise_flow(
     deviation: float,
     laws: Sequence[tuple[float, float]],
     max_flow: float,
-) -> Flow:
+) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
 
     - `leak`: likelihood of the leak's coefficient in the blocks of the recording; `test`: test for a step of it, None
@@ -254,12 +258,12 @@ def estimate_rise_flow(
     flows = value * unit_flows / fractions[:, None]  # (onset, law)
     log_weights = np.where(np.abs(flows) > max_flow, -np.inf, log_weights[:, None] + law_log_weights)
     if not np.isfinite(log_weights).any():
-        return Flow(value * float(unit_flows[0]), deviation * float(unit_flows[0]))
+        return Estimate(value * float(unit_flows[0]), deviation * float(unit_flows[0]))
     weights = np.exp(log_weights - log_weights.max())
     law = int(weights.sum(axis=0).argmax())  # the most probable
     flow = float(weights[:, law] @ flows[:, law] / weights[:, law].sum())
     variances = (deviation * unit_flows / fractions[:, None]) ** 2 + (flows - flow) ** 2
-    return Flow(flow, float(np.sqrt((weights * variances).sum() / weights.sum())))
+    return Estimate(flow, float(np.sqrt((weights * variances).sum() / weights.sum())))
 
 
 def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
@@ -285,11 +289,11 @@ def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -
     return np.append(0.0, log_weights[is_used]), np.append(1.0, fraction_after[is_used])
 
 
-def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Flow:
+def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:
     """Compute mean and standard deviation of a mixture of k estimates of a flow [m^3/s] or another quantity.
 
     `weights` (k,): weights of the estimates, of any sum; `flows`, `deviations` (k,): their values and standard errors.
     """
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)
-    return Flow(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))
+    return Estimate(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))

@@ -15,18 +15,8 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.onset import Interval, StepTest
+from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
-
-
-class LogScale(NamedTuple):
-    """Logarithm `value` of the factor by which both pressures would have to be scaled to cause a change.
-
-    `deviation`: standard deviation of this logarithm.
-    """
-
-    value: float
-    deviation: float
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,8 +44,9 @@ class Observable:
         prior on its size.
     log_ratio_to_leak : float, optional
         Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
-    pressure_scale : LogScale, optional
-        Scale of both pressures that would cause this change by itself; None if it is unknown, or if none would.
+    pressure_scale : Estimate, optional
+        Logarithm of the factor by which both pressures would have to be scaled to cause this change by itself; None if
+        it is unknown, or if none would.
     """
 
     name: str
@@ -66,7 +57,7 @@ class Observable:
     size: float = 0.0
     advantage: float = 0.0
     log_ratio_to_leak: float | None = None
-    pressure_scale: LogScale | None = None
+    pressure_scale: Estimate | None = None
 
     @property
     def surprisal(self) -> float:
@@ -82,7 +73,7 @@ class Observable:
         *,
         n_tests: float = 1.0,
         advantage: float = 0.0,
-        pressure_scale: LogScale | None = None,
+        pressure_scale: Estimate | None = None,
     ) -> Observable:
         """Make an observable from a test for a step, a sudden lasting change, within the recording.
 
@@ -95,20 +86,14 @@ class Observable:
             score=test.score,
             chance=min(1.0, n_tests * test.chance),
             onset=test.onset(),
-            size=test.sign * test.fitted.size,
+            size=test.sign * test.fitted.value,
             advantage=advantage,
             pressure_scale=pressure_scale,
         )
 
 
-class Flow(NamedTuple):
-    """A leakage flow and its standard error [m^3/s].
-
-    The error excludes the errors of the piston's area and the pump's displacement, which scale all flows.
-    """
-
-    value: float
-    deviation: float
+#: Flow of a leak that was not tested.
+UNKNOWN_FLOW = Estimate(0.0, math.inf)
 
 
 class Remark(NamedTuple):
@@ -135,7 +120,7 @@ class LeakRise(NamedTuple):
     step_log_ratio: float = 0.0
     onset_log_ratio: float = math.inf
     older_log_ratio: float = 0.0
-    older_flow: Flow | None = None
+    older_flow: Estimate | None = None
 
 
 class RiseTest(Protocol):
@@ -166,91 +151,88 @@ class DatedTest(RiseTest, Protocol):
         """
 
 
-class LeakMeasure(Protocol):
-    """Interface of the leakage that one detector measures in a recording: tests and flows, without a verdict."""
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LeakMeasure:
+    """Leakage that one detector measures in a recording: tests and flows, without a verdict.
 
-    @property
-    def provider(self) -> str:
-        """Name of the detector that measured the leakage."""
+    The standard errors of flows exclude the errors of the piston's area and the pump's displacement, which scale all
+    flows (`size_deviation`). A subclass may replace fields by properties, which are computed when they are first read
+    (`BalanceLeak`).
 
-    @property
-    def cause(self) -> Cause:
-        """Cause of a leak, e.g. "piston or pump leak", as precise as the recorded channels allow."""
+    Parameters
+    ----------
+    provider : str
+        Name of the detector that measured the leakage.
+    cause : str
+        Cause of a leak, e.g. "piston or pump leak", as precise as the recorded channels allow.
+    step : DatedTest, optional
+        Test for a leak that begins within the recording; None if the recording is too short.
+    step_flow : Estimate
+        Mean flow [m^3/s] of a leak that begins within the recording, averaged from its onset to the end.
+    flow_factors : tuple of two floats
+        Smallest and largest ratio of the leak's true flow to the stated one, if its path or law is unknown.
+    flow_per_conductance : float
+        Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures.
+    rise : RiseTest, optional
+        Test of the mean leakage against the leakage of healthy recordings; None without such recordings.
+    rise_flow : Estimate, optional
+        Mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if unknown.
+    rise_onset : Interval, optional
+        Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning.
+    step_rise : LeakRise, optional
+        Leakage above that of healthy recordings, and the evidence for its causes; None without such recordings.
+    excess : float, optional
+        Total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if unknown.
+    bound_flow : float
+        95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested.
+    pump_flow : tuple of two floats
+        Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers.
+    lpm_per_flow : float, optional
+        Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min]. None if
+        they depend on dimensions that the rig's file does not state, such as the piston's area.
+    size_deviation : float
+        Relative standard deviation of the dimension that scales all flows: pump's displacement or piston's area.
+    ratio : Interval, optional
+        Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured.
+    remarks : sequence of Remark
+        Remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of channels.
+    total_leakage : TotalLeakage, optional
+        Total leakage, if the detector does not state the smallest detectable leak with it (`total`).
+    """
 
-    @property
-    def step(self) -> DatedTest | None:
-        """Test for a leak that begins within the recording; None if the recording is too short."""
+    provider: str
+    cause: Cause
+    step: DatedTest | None = None
+    step_flow: Estimate = UNKNOWN_FLOW
+    flow_factors: tuple[float, float] = (1.0, 1.0)
+    flow_per_conductance: float = 0.0
+    rise: RiseTest | None = None
+    rise_flow: Estimate | None = None
+    rise_onset: Interval | None = None
+    step_rise: LeakRise | None = None
+    excess: float | None = None
+    bound_flow: float = math.inf
+    pump_flow: tuple[float, float] = (0.0, 0.0)
+    lpm_per_flow: float | None = None
+    size_deviation: float = 0.0
+    ratio: Interval | None = None
+    remarks: Sequence[Remark] = ()
+    total_leakage: TotalLeakage | None = None
 
-    @property
-    def step_flow(self) -> Flow:
-        """Mean flow [m^3/s] of a leak that begins within the recording, averaged from its onset to the end."""
-
-    @property
-    def flow_factors(self) -> tuple[float, float]:
-        """Smallest and largest ratio of the leak's true flow to the stated one, if its path or law is unknown."""
-
-    @property
-    def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures."""
-
-    @property
-    def rise(self) -> RiseTest | None:
-        """Test of the mean leakage against the leakage of healthy recordings; None without such recordings."""
-
-    @property
-    def rise_flow(self) -> Flow | None:
-        """Mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if unknown."""
-
-    @property
-    def rise_onset(self) -> Interval | None:
-        """Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning."""
-
-    @property
-    def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if unknown."""
-
-    @property
-    def bound_flow(self) -> float:
-        """95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested."""
-
-    @property
-    def pump_flow(self) -> tuple[float, float]:
-        """Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers."""
-
-    @property
-    def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and the evidence for its causes; None without such recordings."""
-
-    @property
-    def lpm_per_flow(self) -> float | None:
-        """Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min].
-
-        None if they depend on dimensions that the rig's file does not state, such as the piston's area.
-        """
-
-    @property
-    def size_deviation(self) -> float:
-        """Relative standard deviation of the dimension that scales all flows: pump's displacement or piston's area."""
-
-    @property
-    def ratio(self) -> Interval | None:
-        """Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured."""
-
-    @property
-    def remarks(self) -> Sequence[Remark]:
-        """Remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of channels."""
-
-    def relative(self, flow: Flow) -> RelativeLeak | None:
+    def relative(self, flow: Estimate) -> RelativeLeak | None:
         """Convert a leak's flow to a fraction of the pump's flow and a creep speed [m/s]; None if both are unknown."""
+        return None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
         """Return the total leakage and the smallest detectable leak; None if both are unknown.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected, None if it is unknown.
         """
+        return self.total_leakage
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Return the leakage over time, or its growth since `onset_s` [s] if that is given; None if it is unknown."""
+        return None
 
 
 class Ringing(NamedTuple):

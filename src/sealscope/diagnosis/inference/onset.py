@@ -101,6 +101,13 @@ class Information(NamedTuple):
         return float(np.clip(after / max(weights.sum(), np.finfo(float).tiny), 0.0, 1.0))
 
 
+class Estimate(NamedTuple):
+    """An estimate `value` and its standard error `deviation`."""
+
+    value: float
+    deviation: float
+
+
 class Interval(NamedTuple):
     """An estimate `value` with its 95 % interval from `low` to `high`."""
 
@@ -108,12 +115,10 @@ class Interval(NamedTuple):
     low: float
     high: float
 
-
-class FittedStep(NamedTuple):
-    """Fitted `size` of a step (a sudden lasting change) of a coefficient, and its standard error `deviation`."""
-
-    size: float
-    deviation: float
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of a normal distribution with a 95 % interval of this width."""
+        return (self.high - self.low) / (2.0 * WITHIN_95)
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +140,7 @@ class StepTest:
         Log likelihood of a step at each onset, with fitted size and random walk.
     size, deviation : array of float, shape (o,)
         Step at each onset and its standard error, with the walk's variance as fitted without a step.
-    fitted : FittedStep
+    fitted : Estimate
         Step at the best onset and its standard error, with the walk's variance as fitted together with it.
     walk, noise : tuple of two floats
         Variance q of the walk and variance kappa of the noise, each without a step and with the best one.
@@ -153,7 +158,7 @@ class StepTest:
     likelihood: Array
     size: Array
     deviation: Array
-    fitted: FittedStep
+    fitted: Estimate
     walk: tuple[float, float]
     noise: tuple[float, float]
     law: NullLaw
@@ -642,7 +647,7 @@ def _test_step_up(whitening: _Whitening, onsets: Array, steps: Array, fits: _Ste
         likelihood=log_likelihood_with_step.max(axis=0),
         size=size,
         deviation=np.sqrt(np.maximum(squares, 0.0) / n) / np.sqrt(energies[walk_without_step]),
-        fitted=FittedStep(float(size_at_best), float(error_at_best)),
+        fitted=Estimate(float(size_at_best), float(error_at_best)),
         walk=(unit * float(WALKS[walk_without_step]), unit * float(WALKS[walk])),
         noise=(float(total[walk_without_step]) / n, noise),
         law=law,

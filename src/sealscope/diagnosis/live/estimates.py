@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.observable import Flow
-from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
 from sealscope.diagnosis.inference.onset import Interval as Onset
 from sealscope.diagnosis.live.rise import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -207,7 +206,7 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
     return HealthyLevel(before, low, high, deviation=leak.rise_sd, known_s=leak.onset_s, count=1)
 
 
-def mean_flow(flows: Array, errors: Array) -> Flow:
+def mean_flow(flows: Array, errors: Array) -> Estimate:
     """Average the flows of n blocks (n,) [L/min] with standard `errors` (n,); return the mean and its standard error.
 
     The standard error is sqrt(sum(errors^2)/n^2 + s^2/n). Here s is the standard deviation of the flows, 0 for a single
@@ -215,7 +214,7 @@ def mean_flow(flows: Array, errors: Array) -> Flow:
     """
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
-    return Flow(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))
+    return Estimate(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.inference.observable import Flow, Observed, Remark
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.verdict.evidence import Cause, Evidence
+from sealscope.diagnosis.verdict.evidence import Evidence
 
 #: Name of the watch as a detector (`Evidence.detector`).
 WATCH = "watch"
@@ -60,62 +59,7 @@ class LiveRise(NamedTuple):
         return math.inf
 
 
-@dataclass(frozen=True, eq=False)
-class LiveLeak:
-    """The leakage of a watched machine, in the form that `decision.decide` judges.
-
-    The protocol `observable.LeakMeasure` explains the fields. In addition, `test` is the increase that a test has
-    detected, or a step too small for an alarm. `flow_per_conductance` is the mean of abs(p_A - p_B) [Pa].
-    """
-
-    test: LiveRise
-    cause: Cause
-    flow_per_conductance: float
-    flow_factors: tuple[float, float]
-    bound_flow: float
-    pump_flow: tuple[float, float]
-    lpm_per_flow: float | None
-    size_deviation: float
-    provider: str = WATCH
-    excess: None = None
-    step_rise: None = None
-    ratio: Interval | None = None
-    remarks: tuple[Remark, ...] = ()
-
-    @property
-    def step(self) -> LiveRise | None:
-        """Test for a step (sudden lasting change) within the stream; None if another test found the increase."""
-        return self.test if self.test.test == STEP else None
-
-    @property
-    def rise(self) -> LiveRise | None:
-        """Test of the conductance against that of the healthy machine; None if another test found the increase."""
-        return self.test if self.test.test == LEVEL else None
-
-    @property
-    def step_flow(self) -> Flow:
-        """Mean flow by which the leakage has increased, and its standard deviation [m^3/s]."""
-        pressure = self.flow_per_conductance
-        return Flow(self.test.size * pressure, self.test.deviation * pressure)
-
-    rise_flow = step_flow
-
-    @property
-    def rise_onset(self) -> Interval:
-        """Onset of the increase of the leakage, with its 95 % interval [s]."""
-        return self.test.interval
-
-    def relative(self, flow: Flow) -> None:
-        """Return None for any leak `flow`, as no leak of a running machine is stated relative to the pump's flow."""
-
-    def total(self, detectable_flow: float | None) -> None:
-        """Return None, as the estimates of the blocks state the total leakage; `detectable_flow` is not used."""
-
-    def history(self, onset_s: float | None) -> None:
-        """Return None, as the estimates of the blocks state the leakage over time; `onset_s` is not used."""
-
-
-def decide_on_stream(leak: LiveLeak | None, false_alarm_probability: float, lack: str = "") -> Evidence:
+def decide_on_stream(leak: LeakMeasure | None, false_alarm_probability: float, lack: str = "") -> Evidence:
     """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate.
 
     `false_alarm_probability` is the allowed probability that the test for the leak raises a false alarm.

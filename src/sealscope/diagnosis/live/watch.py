@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Interval
+from sealscope.diagnosis.inference.observable import LeakMeasure
+from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import (
     GROUP,
@@ -33,7 +34,7 @@ from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanati
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.null import StepNull
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveLeak, LiveRise, decide_on_stream
+from sealscope.diagnosis.live.rise import LEVEL, STEP, WATCH, LiveRise, decide_on_stream
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
@@ -189,8 +190,8 @@ class Watch:
             return decide_on_stream(None, probability, lack=f"waits for the first blocks{why}")
         return decide_on_stream(measure, probability)
 
-    def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LiveLeak:
-        """Convert the detected `leak` to a LiveLeak, from which `decide_on_stream` decides the verdict.
+    def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LeakMeasure:
+        """Convert the detected `leak` to a LeakMeasure, from which `decide_on_stream` decides the verdict.
 
         If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
         the 95 % upper bound of an undetected leak. The flow per conductance is the mean pressure of a laminar leak; the
@@ -206,9 +207,15 @@ class Watch:
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
             max_flow = estimator.orifice_factor * self._detector.bound() * pressure
             bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
-        return LiveLeak(
-            test,
-            cause,
+        flow = Estimate(test.size * pressure, test.deviation * pressure)  # mean increase of the leakage
+        return LeakMeasure(
+            provider=WATCH,
+            cause=cause,
+            step=test if test.test == STEP else None,
+            step_flow=flow,
+            rise=test if test.test == LEVEL else None,
+            rise_flow=flow,
+            rise_onset=test.interval,
             flow_per_conductance=pressure,
             flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
             bound_flow=bound,

@@ -109,7 +109,7 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
             return Observed(RmsChange.name, lack=f"{name} gives no information in most blocks")
         up, down = steps
         step, sign = (up, 1.0) if up.chance <= down.chance else (down, -1.0)
-        changes[name] = step, sign * weight * step.fitted.size
+        changes[name] = step, sign * weight * step.fitted.value
         if _is_judged(name):
             judged_steps.append(step)
             bounds.append(max(up.bound(), down.bound()))

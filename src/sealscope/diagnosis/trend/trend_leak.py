@@ -11,7 +11,6 @@ onset, and of the ringing (RMS of the pressures' wavelet details) in the last re
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -20,62 +19,17 @@ from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
-from sealscope.diagnosis.inference.observable import Flow, LeakRise, Observable, Observed, Remark, Ringing
+from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries
 from sealscope.diagnosis.trend.reading import TrendPoint
 from sealscope.diagnosis.trend.wear import Episode, Wear
-from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Cause, Evidence, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence, TotalLeakage
 from sealscope.units import DAYS_PER_YEAR
 
 #: Smallest number of comparable recordings for a verdict.
 MIN_RECORDINGS = 3
-
-
-@dataclass(frozen=True, eq=False, kw_only=True)
-class TrendLeak:
-    """Increase of the leakage from recording to recording, in the form that `decision.decide` judges.
-
-    The protocol `observable.LeakMeasure` explains the fields; flows are in the unit of the trend.
-    """
-
-    provider: str
-    cause: Cause
-    rise: Rise | None
-    rise_flow: Flow
-    rise_onset: Interval | None
-    bound_flow: float
-    pump_flow: tuple[float, float]
-    lpm_per_flow: float | None
-    size_deviation: float
-    present_leakage: TotalLeakage | None
-    step: None = None
-    flow_per_conductance: float = 0.0
-    flow_factors: tuple[float, float] = (1.0, 1.0)
-    excess: float | None = None
-    ratio: Interval | None = None
-    remarks: Sequence[Remark] = ()
-
-    @property
-    def step_flow(self) -> Flow:
-        """A flow of 0 with infinite standard error, as no step within a recording is tested."""
-        return Flow(0.0, np.inf)
-
-    @property
-    def step_rise(self) -> LeakRise | None:
-        """Increase of the leakage over that of the healthy recordings; None if it has not increased."""
-        return None if self.rise is None else LeakRise(self.rise)
-
-    def relative(self, flow: Flow) -> None:
-        """Return None for any flow of a leak, as a trend states no leak relative to the pump's flow."""
-
-    def total(self, detectable_flow: float | None) -> TotalLeakage | None:
-        """Return the present flow past pump and piston; None if no L/min are stated. The argument is not used."""
-        return self.present_leakage
-
-    def history(self, onset_s: float | None) -> None:
-        """Return None for any onset, as the trend itself is the history of the leak."""
 
 
 def decide_trend(
@@ -113,35 +67,37 @@ def decide_trend(
 
 def _measure_leak(
     points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
-) -> TrendLeak:
+) -> LeakMeasure:
     """Describe the increase of the leakage since the last repair, from the recordings (`points`) since then.
 
     `chance` is the probability of such an increase in a healthy machine, `trend_units_per_level` the factor from a
-    level (leakage over pressure of a recording) to the unit of the trend, and `pressure` the pressure difference at
-    which flows are stated [Pa], None if that unit is %. The flow of the leak is proportional to p^k, with k from
-    `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
+    level (leakage over pressure of a recording) to the unit of the trend, in which the result states flows, and
+    `pressure` the pressure difference at which they are stated [Pa], None if that unit is %. The flow of the leak is
+    proportional to p^k, with k from `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the
+    mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
     # the flow at `pressure` is the level times `pressure` for a laminar leak, k = 1; other laws have a further factor
     flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
-    leak_sd = (wear.leak.high - wear.leak.low) / (2.0 * WITHIN_95)
     # mean flow of the pump in the trend's unit, converted like a level, which is a flow over a pressure
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
     pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
     size_deviation = max(point.size_error for point in points)
-    return TrendLeak(
+    rise = _normal_rise(wear, chance)
+    return LeakMeasure(
         provider=str(points[0].basis),
         cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
-        rise=_normal_rise(wear, chance),
-        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, leak_sd * flow_factors),
+        rise=rise,
+        step_rise=None if rise is None else LeakRise(rise),
+        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
         pump_flow=(pump_flow, pump_flow),
         lpm_per_flow=None if pressure is None else 1.0,
         size_deviation=size_deviation,
-        present_leakage=None if pressure is None else _total_leakage(wear.total, size_deviation, pressure),
+        total_leakage=None if pressure is None else _total_leakage(wear.total, size_deviation, pressure),
     )
 
 

@@ -36,14 +36,9 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.differences import (
-    MIN_HEALTHY,
-    Estimate,
-    PriorScatter,
-    compare_estimates,
-    size_penalty,
-)
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once

@@ -34,8 +34,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.observable import LogScale
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Information, step_test
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, step_test
 from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
@@ -90,7 +89,7 @@ class LevelChange(NamedTuple):
     chance: float
     onset: float
     block: float
-    pressure_scale: LogScale | None = None
+    pressure_scale: Estimate | None = None
 
 
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
@@ -255,7 +254,7 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     return changes
 
 
-def _pressure_scale(before: Array, after: Array) -> LogScale | None:
+def _pressure_scale(before: Array, after: Array) -> Estimate | None:
     """Compute the factor on both pressures that would explain the change of the friction between two groups of blocks.
 
     `before`, `after` (k, 4) [Pa]: `PressureLevels.values`. The friction shows in the difference of half_A and half_B.
@@ -268,7 +267,7 @@ def _pressure_scale(before: Array, after: Array) -> LogScale | None:
     if not means.min() > 0.0:
         return None
     errors = [friction.std(ddof=1) / np.sqrt(len(friction)) for friction in frictions]
-    return LogScale(math.log(means[1] / means[0]), math.hypot(*(errors / means)))
+    return Estimate(math.log(means[1] / means[0]), math.hypot(*(errors / means)))
 
 
 def _whitening_matrix(values: Array) -> Array:

@@ -15,8 +15,8 @@ import numpy as np
 
 from sealscope.diagnosis.inference.changes.features import BLOCKS, NOISE, ORDER, duty_tests, sensor_tests
 from sealscope.diagnosis.inference.changes.levels import LevelChange, level_tests
-from sealscope.diagnosis.inference.observable import LogScale, Observable, Observed
-from sealscope.diagnosis.inference.onset import Interval, StepTest
+from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -63,7 +63,7 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size
     are those of the test with the lower score. The p-value is twice the higher one, since a step may be up or down.
     """
-    steps = np.abs([test.fitted.size for test in tests])
+    steps = np.abs([test.fitted.value for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
         weakest = min(tests, key=lambda test: test.score)
         least_certain = max(tests, key=lambda test: test.chance)
@@ -73,7 +73,7 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
             score=weakest.score,
             chance=min(1.0, 2.0 * least_certain.chance),
             onset=weakest.onset(),
-            size=weakest.fitted.size,
+            size=weakest.fitted.value,
         )
 
 
@@ -86,7 +86,7 @@ def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observ
     for name, test in tests:
         observable = Observable.from_test(name, name.split()[0], test, n_tests=2.0)
         if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
-            scale = LogScale(0.25 * observable.size, 0.25 * test.fitted.deviation)
+            scale = Estimate(0.25 * observable.size, 0.25 * test.fitted.deviation)
             observable = replace(observable, pressure_scale=scale)
         yield observable
 

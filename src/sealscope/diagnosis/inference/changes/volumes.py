@@ -24,8 +24,8 @@ from sealscope.diagnosis.inference.blocks import (
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
-from sealscope.diagnosis.inference.observable import LogScale, Observable
-from sealscope.diagnosis.inference.onset import WITHIN_95, Information, StepTest, fit_history, step_tests
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_tests
 from sealscope.diagnosis.inference.terms import (
     AIR,
     BIAS,
@@ -99,7 +99,7 @@ def volume_observables(
         if name in (LEAK, PUMP):
             advantage = -leak_disadvantage
         else:
-            advantage = -_size_penalty(name, step.fitted.size, recorded, columns[0].names, volume_ratio, flow_scale)
+            advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
         advantage += 2.0 * _law_log_prior(name)
         # MADE_UP at the end of a name marks a leak whose lost oil a check valve replaces
         if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
@@ -108,7 +108,7 @@ def volume_observables(
             term = name.removesuffix(MADE_UP)
             # the coefficient of a loss to the outside (OUTSIDE) is a flow, that of other leaks a flow per pressure
             unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
-            flow = step.fitted.size * unit_flow * flow_scale
+            flow = step.fitted.value * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
             Observable.from_test(
@@ -123,7 +123,7 @@ def volume_observables(
     return tuple(sorted(observables, key=lambda observable: -observable.score))
 
 
-def _pressure_scale(conductance: Information, step: StepTest) -> LogScale | None:
+def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None:
     """Compute the scale of both pressures that would make a leak's conductance appear to rise by a step.
 
     If both pressures are scaled and the leakage stays the same, the apparent conductance becomes G_2 = G_1 / scale
@@ -138,7 +138,7 @@ def _pressure_scale(conductance: Information, step: StepTest) -> LogScale | None
     if not min(before.value, after.value) > 0.0:
         return None
     relative_errors = [(mean.high - mean.value) / (WITHIN_95 * mean.value) for mean in (before, after)]
-    return LogScale(math.log(before.value / after.value), math.hypot(*relative_errors))
+    return Estimate(math.log(before.value / after.value), math.hypot(*relative_errors))
 
 
 def _size_penalty(
@@ -228,7 +228,7 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
     """
     onset = balance_test.onsets[balance_test.best]
     nearest = int(np.abs(accumulator_test.onsets - onset).argmin())
-    sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.size])
+    sizes = np.array([accumulator_test.size[nearest], balance_test.fitted.value])
     measured, expected = sizes / accumulator_test.deviation[nearest]  # a/s and b/s
     return float(measured**2 - (measured - expected) ** 2)
 

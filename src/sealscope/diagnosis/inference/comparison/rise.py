@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
@@ -190,6 +190,11 @@ class Rise(NamedTuple):
         tail = 0.5 - 0.5 * probability  # on either side of the interval
         max_error, min_error = (self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail))
         return self.value - max_error, self.value - min_error
+
+    @property
+    def normal_deviation(self) -> float:
+        """Standard deviation of a normal distribution with a 95 % interval of the same width as the true rise's."""
+        return Interval(self.value, *self.interval()).deviation
 
 
 def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -57,7 +56,7 @@ class PressureResponse:
             return Observed(
                 self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
             )
-        leak = replace(leak, healthy=[summary["level"] for summary in healthy_summaries(self, baseline)])
+        leak.healthy = [summary["level"] for summary in healthy_summaries(self, baseline)]
         if leak.step is None and leak.rise is None:
             return Observed(self.name, lack="too little motion: no leak would show")
         is_known = np.ones(len(recording), bool) if recording.bridged is None else ~recording.bridged

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise, student_rise
-from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
-from sealscope.diagnosis.inference.onset import WITHIN_95, Information, Interval, StepTest, fit_history, step_test
+from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.priors.pressures import PRESSURE
-from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, TotalLeakage
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
 
@@ -39,37 +38,36 @@ def states_flow(rig: Rig) -> bool:
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
-@dataclass(frozen=True, eq=False)
-class ResponseLeak:
-    """The leakage of a recording as measured by the response of its pressures (`observable.LeakMeasure`).
+class ResponseLeak(LeakMeasure):
+    """The leakage of a recording as measured by the response of its pressures.
 
     - `parameters`: likelihood in K blocks of each parameter of the response, by the parameter's name; "G" is the
       conductance past the piston [m^3/(s Pa)].
     - `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa].
-    - `pump_flow`: mean flow of the pump [m^3/s] over the recording, and while the pump delivers; both are equal here.
+    - `mean_flow`: mean flow of the pump [m^3/s] over the recording.
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
     - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
 
-    The other fields are explained in `LeakMeasure`.
+    The leakage has no `rise_flow`, since the level of the conductance depends on the assumed friction. It is not
+    related to the pump's flow, which is only assumed from the command.
     """
 
-    parameters: Mapping[str, Information]
-    pressure: Array
-    pump_flow: tuple[float, float]
-    stated: bool
-    healthy: Sequence[float] = ()
-
-    provider: str = PRESSURE_RESPONSE
+    provider = PRESSURE_RESPONSE
     #: Without a position, external leakage has the same effect.
     cause: Cause = "internal or external leak"
-    size_deviation: float = conductance_scale_error()
-    flow_factors: tuple[float, float] = (1.0, 1.0)
-    ratio: Interval | None = None
-    remarks: Sequence[Remark] = ()
-    excess: float | None = None
-    #: None, since the level of the conductance depends on the assumed friction.
-    rise_flow: Flow | None = None
-    rise_onset: Interval | None = None
+    size_deviation = conductance_scale_error()
+
+    def __init__(
+        self,
+        parameters: Mapping[str, Information],
+        pressure: Array,
+        mean_flow: float,
+        *,
+        stated: bool,
+        healthy: Sequence[float] = (),
+    ) -> None:
+        self.parameters, self.pressure, self.mean_flow = parameters, pressure, mean_flow
+        self.stated, self.healthy = stated, healthy
 
     @property
     def information(self) -> Information:
@@ -88,7 +86,7 @@ class ResponseLeak:
         return step_test(self.information)
 
     @property
-    def step_flow(self) -> Flow:
+    def step_flow(self) -> Estimate:
         """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
         The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
@@ -96,13 +94,13 @@ class ResponseLeak:
         the two were the ends of a 95 % interval. Without a step test the flow is 0 with an infinite standard error.
         """
         if self.step is None:
-            return Flow(0.0, np.inf)
+            return UNKNOWN_FLOW
         size, deviation = self.step.fitted
         # flow over that of a laminar leak: between 1 and `ORIFICE_RATIO`
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
         law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
-        return Flow(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
+        return Estimate(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
 
     @property
     def flow_per_conductance(self) -> float:
@@ -145,24 +143,25 @@ class ResponseLeak:
         if self.rise is None:
             return None
         step = self.step
-        rise_by_step = 0.0 if step is None else step.fitted.size * self.information.fraction_after(step.onset().value)
+        rise_by_step = 0.0 if step is None else step.fitted.value * self.information.fraction_after(step.onset().value)
         return LeakRise(self.rise, step_log_ratio=self.rise.log_ratio(rise_by_step))
+
+    @property
+    def pump_flow(self) -> tuple[float, float]:
+        """Mean flow of the pump [m^3/s] over the recording, which also stands for the flow while it delivers."""
+        return self.mean_flow, self.mean_flow
 
     @property
     def lpm_per_flow(self) -> float | None:
         """Factor from a flow [m^3/s] to L/min; None if the rig's file does not state piston areas and moving mass."""
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
-    def relative(self, flow: Flow) -> RelativeLeak | None:
-        """Return None, since the pump's flow is not measured, only assumed from the command."""
-        return None
-
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return a `TotalLeakage` that states only the smallest detectable leak, as the pressures show only changes.
 
         `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected within the recording, or None.
         """
-        (pump_flow, _), lpm_per_flow = self.pump_flow, self.lpm_per_flow
+        pump_flow, lpm_per_flow = self.mean_flow, self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
             interval_lpm=None,

@@ -483,7 +483,7 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
     mean_speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
     mean_flow = mean_speed * rig.pump.q_b / (2.0 * np.pi)
-    return ResponseLeak(parameters, pressure, pump_flow=(mean_flow, mean_flow), stated=states_flow(rig))
+    return ResponseLeak(parameters, pressure, mean_flow, stated=states_flow(rig))
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:

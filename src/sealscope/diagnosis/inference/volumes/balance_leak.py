@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,11 +24,19 @@ from sealscope.diagnosis.inference.leak_law import (
     mixture_flow,
     older_log_ratios,
 )
-from sealscope.diagnosis.inference.observable import Flow, LeakRise, Remark
-from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, UPPER_95, WITHIN_95, Interval, StepTest, fit_history
+from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
+from sealscope.diagnosis.inference.onset import (
+    BOUND_PROBABILITY,
+    UPPER_95,
+    WITHIN_95,
+    Estimate,
+    Interval,
+    StepTest,
+    fit_history,
+)
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
@@ -50,26 +57,21 @@ class _HoldLaws(NamedTuple):
     deviations: Array
 
 
-@dataclass(frozen=True, eq=False)
-class BalanceLeak:
-    """The leakage of a recording as measured by its volume balance (`observable.LeakMeasure`).
+class BalanceLeak(LeakMeasure):
+    """The leakage of a recording as measured by its volume balance; its flows are averaged over the laws of a leak.
 
     Parameters
     ----------
-    provider : str
-        Name of the detector.
     balance : RecordedBalance
         Volume balance of the recording.
     healthy : sequence of RecordingSums
         Summaries of the healthy recordings of the machine whose volume balance has the same terms.
     """
 
-    provider: str
-    balance: RecordedBalance
-    healthy: Sequence[RecordingSums] = ()
+    provider = VOLUME_BALANCE
 
-    #: Flows are averaged over the laws of a leak.
-    flow_factors: tuple[float, float] = (1.0, 1.0)
+    def __init__(self, balance: RecordedBalance, healthy: Sequence[RecordingSums] = ()) -> None:
+        self.balance, self.healthy = balance, healthy
 
     @property
     def cause(self) -> Cause:
@@ -103,7 +105,7 @@ class BalanceLeak:
         return self.balance.test
 
     @cached_property
-    def step_flow(self) -> Flow:
+    def step_flow(self) -> Estimate:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
         The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow in holds
@@ -111,7 +113,7 @@ class BalanceLeak:
         """
         balance, test = self.balance, self.balance.test
         if test is None:
-            return Flow(0.0, np.inf)
+            return UNKNOWN_FLOW
         flow = estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 
@@ -120,10 +122,10 @@ class BalanceLeak:
         """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa), equal to the mean of abs(p_A - p_B)."""
         return self.balance.mean_pressure()
 
-    def _add_law_uncertainty(self, flow: Flow) -> Flow:
+    def _add_law_uncertainty(self, flow: Estimate) -> Estimate:
         """Add the uncertainty of a leak's law, the fraction `size.law` (`priors.toml`) of the flow, to its error."""
         law: float = INFERENCE.size.law
-        return Flow(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
+        return Estimate(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
 
     @cached_property
     def rise(self) -> Rise | None:
@@ -173,29 +175,28 @@ class BalanceLeak:
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
     @cached_property
-    def rise_flow(self) -> Flow:
+    def rise_flow(self) -> Estimate:
         """Mean flow [m^3/s], since its onset, of the leakage above that of healthy recordings.
 
         Without healthy recordings it is the mean flow of the total leakage.
         """
         balance = self.balance
         if self.rise is None:
-            value, low, high = (balance.mean_pressure() * conductance for conductance in balance.conductance)
-            return self._add_law_uncertainty(Flow(value, (high - low) / (2.0 * WITHIN_95)))
+            total = Interval(*(balance.mean_pressure() * conductance for conductance in balance.conductance))
+            return self._add_law_uncertainty(Estimate(total.value, total.deviation))
         motion_rise = self._motion_rise
         assert motion_rise is not None
-        low, high = motion_rise.interval()
         flow = estimate_rise_flow(
             balance.compared_leak,
             self.step,
             value=motion_rise.value,
-            deviation=(high - low) / (2.0 * WITHIN_95),
+            deviation=motion_rise.normal_deviation,
             laws=self._rise_laws(),
             max_flow=balance.blocks.moving_flow,
         )
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 
-    def _mix_with_holds(self, flow: Flow) -> Flow:
+    def _mix_with_holds(self, flow: Estimate) -> Estimate:
         """Combine the flow of a leak over the whole recording with its flow during holds, if the holds show a leak.
 
         In a hold shut valves keep the load in place. The estimate from holds has the weight `held_oil.right` of
@@ -218,16 +219,15 @@ class BalanceLeak:
             return None
         return chambers.piston_onset
 
-    def _hold_flow(self, hold_rise: Rise) -> Flow:
+    def _hold_flow(self, hold_rise: Rise) -> Estimate:
         """Estimate the mean flow of a leak from the times in which shut valves hold the load, averaged over its laws.
 
         The variance of `hold_rise`, the rise over healthy recordings in these times, and the relative scatter
         `held_oil.scatter` (`priors.toml`) are added to the variances of the fits.
         """
         laws = self._hold_laws
-        low, high = hold_rise.interval()
         laminar_unit_flow = laws.unit_flows[0]  # the rise is that of a laminar leak
-        rise_flow_deviation = (high - low) / (2.0 * WITHIN_95) * laminar_unit_flow
+        rise_flow_deviation = hold_rise.normal_deviation * laminar_unit_flow
         scatter = INFERENCE.held_oil.scatter * laws.flows
         deviations = np.sqrt(rise_flow_deviation**2 + laws.deviations**2 + scatter**2)
         return mixture_flow(laws.weights, laws.flows, deviations)
@@ -312,9 +312,9 @@ class BalanceLeak:
         is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
         if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
-        value, low, high = (size.scale * conductance for conductance in balance.conductance)
-        deviation = float(np.hypot((high - low) / (2.0 * WITHIN_95), value * size.deviation))
-        return (value - limit) / max(deviation, np.finfo(float).tiny)
+        total = Interval(*(size.scale * conductance for conductance in balance.conductance))
+        deviation = float(np.hypot(total.deviation, total.value * size.deviation))
+        return (total.value - limit) / max(deviation, np.finfo(float).tiny)
 
     @property
     def bound_flow(self) -> float:
@@ -395,15 +395,15 @@ class BalanceLeak:
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
         if rise_after is None:
             fraction = balance.compared_leak.fraction_after(step.onset().value)
-            mean_rise = step.fitted.size * fraction  # mean over the recording
+            mean_rise = step.fitted.value * fraction  # mean over the recording
             step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
             return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
         log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
         whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
-        step_log_ratio = whole_rise.log_ratio(step.fitted.size, log_deviation)
+        step_log_ratio = whole_rise.log_ratio(step.fitted.value, log_deviation)
         return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
 
-    def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Flow | None]:
+    def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Estimate | None]:
         """Compare the rise of the leakage above healthy recordings with the size of a leak older than the recording.
 
         This size is estimated from the curvature of the leak's flow over the pressure. Returns the fields
@@ -414,8 +414,7 @@ class BalanceLeak:
         """
         balance, total_rise = self.balance, self.rise
         assert total_rise is not None
-        low, high = motion_rise.interval()
-        deviation = (high - low) / (2.0 * WITHIN_95)
+        deviation = motion_rise.normal_deviation
         units = [unit for unit, _ in self._rise_laws()]  # mean flow for a rise of 1
         bend_flows = estimate_bend_flows(balance.running_blocks, balance.columns, noise)
         rises = [flow.value / unit for flow, unit in zip(bend_flows, units, strict=True) if flow is not None]
@@ -426,7 +425,7 @@ class BalanceLeak:
         log_ratio = float(np.logaddexp.reduce(rise_log_ratios) - np.log(len(rises)))
         if self._hold_rise is not None:
             return log_ratio, None
-        rise_flows = [Flow(motion_rise.value * unit, deviation * unit) for unit in units]
+        rise_flows = [Estimate(motion_rise.value * unit, deviation * unit) for unit in units]
         return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_ratios, rise_flows, bend_flows))
 
     @property
@@ -445,7 +444,7 @@ class BalanceLeak:
         """Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured."""
         return self.balance.size.ratio
 
-    def relative(self, flow: Flow) -> RelativeLeak:
+    def relative(self, flow: Estimate) -> RelativeLeak:
         """Convert a leak's flow to a fraction of the pump's mean flow, and to the speed [m/s] of a creeping piston.
 
         Both have 95 % intervals. The fraction is None if the pump's flow is zero, the speed if the area is unknown.

@@ -24,8 +24,9 @@ from sealscope.diagnosis.inference.comparison.conditions import find_unusual_con
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.differences import Estimate, PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.terms import CYLINDER, HOLDING, TURNING, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
@@ -139,7 +140,7 @@ class VolumeBalance:
             for cycle in balances
         )
         usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
-        return min(usable, key=lambda candidate: BalanceLeak(self.name, candidate).bound_flow, default=None)
+        return min(usable, key=lambda candidate: BalanceLeak(candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
         """Compute the blocks for a volume balance with a position, only once for each recording.
@@ -306,7 +307,7 @@ class VolumeBalance:
         and compared with that of the `healthy` recordings, if there are any. If neither is possible, the report states
         only the reason.
         """
-        leak, rows = BalanceLeak(self.name, balance, healthy), balance.blocks.rows
+        leak, rows = BalanceLeak(balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
             reason = "finds p_A and p_B too similar, or too few samples without gaps, to show a leak"
             return Observed(self.name, lack=reason)

@@ -21,7 +21,7 @@ import numpy as np
 from sealscope.diagnosis.inference.changes.motion_fit import fit_robustly, influence_factor, jackknife_errors
 from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.differences import Estimate
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over

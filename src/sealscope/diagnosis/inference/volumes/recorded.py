@@ -31,12 +31,12 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.differences import Estimate
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
     MIN_BLOCKS,
     WITHIN_95,
+    Estimate,
     History,
     Information,
     Interval,
@@ -346,8 +346,7 @@ class RecordedBalance:
         if pump is not None:  # the total leakage is that of the pump and the leak in holds, whose error then cancels
             total, difference_variance = pump.value + hold_leak.value, pump.deviation**2
         else:
-            deviation = (conductance.high - conductance.low) / (2.0 * WITHIN_95)
-            total, difference_variance = conductance.value, variance + deviation**2
+            total, difference_variance = conductance.value, variance + conductance.deviation**2
         return rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
 
     def _cylinder_sides(self) -> CylinderSides | None:

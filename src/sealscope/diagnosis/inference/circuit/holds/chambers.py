@@ -65,8 +65,7 @@ from sealscope.diagnosis.inference.circuit.holds.oil import (
     residual_squares,
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
-from sealscope.diagnosis.inference.observable import Flow
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.inference.onset import Estimate, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over
@@ -595,7 +594,7 @@ class HeldChambers:
             for probability, (fit, index) in zip(probabilities, fits, strict=True)
         ]
 
-    def total_leak(self) -> Flow:
+    def total_leak(self) -> Estimate:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
         A leak may be past the piston, to the outside, or through open valves and the pump; each of these is weighted by
@@ -612,7 +611,7 @@ class HeldChambers:
         # a leak that is estimated as 0 adds no uncertainty
         variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
         # without any leak, the deviation is that of a leak past the piston
-        return Flow(sum(means), variance**0.5 if any(means) else deviations[0])
+        return Estimate(sum(means), variance**0.5 if any(means) else deviations[0])
 
     @cached_property
     def leaks(self) -> HeldLeaks:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.leak_law import mixture_flow
-from sealscope.diagnosis.inference.observable import Flow
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.recordings.recording import Array
 
 #: Standard deviation of a leak without information.
@@ -137,7 +137,7 @@ def flow_of_side(flow: Array, is_A: bool) -> Array:
     return np.array([flow, no_flow] if is_A else [no_flow, flow])
 
 
-def average_fits(fits: Sequence[LeakFit]) -> Flow:
+def average_fits(fits: Sequence[LeakFit]) -> Estimate:
     """Average alternative fits of a leak by their likelihoods; the deviation includes noise and uncertain oil."""
     values, deviations, by_oil, log_likelihoods = np.array(fits).T
     return mixture_flow(np.exp(log_likelihoods - log_likelihoods.max()), values, np.hypot(deviations, by_oil))
