@@ -18,7 +18,7 @@ from sealscope.campaigns.plans.duty import (
     check_duty,
     find_voltage_command,
     parse_plan_fault,
-    throttle_values,
+    parse_throttle_values,
 )
 from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.diagnose import check_probability
@@ -188,7 +188,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
     elif name in (COMMAND, CONTROLLER, LOAD):
         check_duty(name, level, plan.rig, plan.duration_s)
     else:  # a parameter of the rig, or "closed", the closed fraction of its throttles; raises for an invalid value
-        plan.rig.with_overrides(throttle_values(level) if name == "closed" else {name: level})
+        plan.rig.with_overrides(parse_throttle_values(level) if name == "closed" else {name: level})
 
 
 def _check_records(plan: SimulatedPlan) -> None:
