@@ -291,11 +291,6 @@ class Experiment:
                 )
         return leaks
 
-    @property
-    def changes_viscosity(self) -> bool:
-        """True if a fault changes the oil's viscosity within the run."""
-        return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
-
     def readings(self) -> Readings:
         """Collect the changes of instruments within the run, and the spans in which a sensor is stuck."""
         effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)

@@ -14,7 +14,7 @@ from sealscope.parameters import Rig
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.experiment import check_target, throttle_values
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force, parse_position
+from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
 from sealscope.units import parse_quantity
 
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
@@ -61,11 +61,6 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
             )
         if name not in CONTROLLERS:
             controller_named(name, plan.rig)
-
-
-def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
-    """Find the first command that is a voltage; return None if all are targets of the piston's position."""
-    return next((str(command) for command in commands if parse_position(str(command)) is None), None)
 
 
 def parse_throttle_values(level: str | float) -> dict[str, str | float]:
