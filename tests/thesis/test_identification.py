@@ -21,9 +21,9 @@ from sealscope.thesis.identification import (
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
+    GROUPS,
     Condition,
     DataSheet,
-    groups,
 )
 from sealscope.units import PSI
 
@@ -33,7 +33,7 @@ from .conftest import ITEMS, Kept, needs_sheet
 def test_conditions_are_the_tests_of_the_appendix() -> None:
     assert len(APPENDIX_C) == 41
     assert [one.number for one in APPENDIX_C] == list(range(1, 42))
-    assert len(groups()) == 15
+    assert len(GROUPS) == 15
     assert min(one.mean_leak_lpm for one in APPENDIX_C) == 0.0042
     assert max(one.mean_leak_lpm for one in APPENDIX_C) == 0.0185
 

@@ -27,7 +27,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import format_note, load_texts
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, Condition, DataSheet, groups
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, GROUPS, Condition, DataSheet
 from sealscope.units import PSI
 
 #: Start-up that is left out, and length of the analysed part [s]: two cycles of the slowest command (2 pi s each).
@@ -92,7 +92,7 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     Returns (tests, chambers, 5). `rig`: rig to simulate, at its own sampling rate; `sheet`: the measured RMS.
     """
     group_squares = {}
-    for command, closed_pct in groups():
+    for command, closed_pct in GROUPS:
         # number and level have no effect on the simulation
         condition = Condition(number=0, command=command, closed_pct=closed_pct, mean_leak_lpm=0.0, level="")
         group_squares[condition.group] = noise_free_mean_squares(rig, condition)
@@ -195,7 +195,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         mean, scatter = float(np.exp(log_ratios.mean())), float(np.exp(log_ratios.std(ddof=1)))
         rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= _MAX_ERROR else "no", scatter))
     by_condition: list[tuple[Cell, ...]] = []
-    for group in groups():
+    for group in GROUPS:
         is_member = np.array([condition.group == group for condition in APPENDIX_C])
         ratios = np.exp(residuals[is_member].mean(axis=0)).ravel().tolist()
         by_condition.append((*group, int(is_member.sum()), *ratios))

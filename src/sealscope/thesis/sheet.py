@@ -67,11 +67,8 @@ APPENDIX_C: tuple[Condition, ...] = tuple(
     Condition(number, command, float(closed_pct), float(leak), level)
     for number, (command, closed_pct, leak, level) in enumerate(csv.reader(_LINES), 1)
 )
-
-
-def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
-    """List the distinct operating conditions (command, closing [%]) of some tests, in order of first appearance."""
-    return tuple(dict.fromkeys(condition.group for condition in conditions))
+#: The distinct operating conditions (command, closing [%]) of these tests, in order of first appearance.
+GROUPS = tuple(dict.fromkeys(condition.group for condition in APPENDIX_C))
 
 
 def mean_leaks() -> Array:
