@@ -1,4 +1,4 @@
-"""One pattern of names: `read_` and `write_` for files, `plot` for what is drawn; names of the release before warn."""
+"""One pattern of names: `read_` and `write_` for files, `plot` for what is drawn."""
 
 from __future__ import annotations
 
@@ -18,14 +18,6 @@ def recording():
     return ss.simulate(duration="20 s", seed=1)
 
 
-@pytest.mark.parametrize(("name", "instead"), [("load_machine", "read_machine"), ("write_page", "report")])
-def test_names_of_the_release_before_say_what_is_used_instead(name, instead):
-    with pytest.warns(DeprecationWarning, match=f"sealscope.{name} is deprecated.*use {instead}"):
-        old = getattr(ss, name)
-    assert callable(old)
-    assert name not in ss.__all__ and instead in ss.__all__
-
-
 @pytest.mark.slow
 def test_files_of_each_kind_are_read_and_written_alike(recording, tmp_path):
     ss.write(recording, tmp_path / "healthy.nc")
@@ -38,9 +30,8 @@ def test_files_of_each_kind_are_read_and_written_alike(recording, tmp_path):
 def test_a_report_needs_the_recording_alone(recording, tmp_path):
     page = ss.report(recording, tmp_path / "report.html")
     assert page == tmp_path / "report.html"
-    with pytest.warns(DeprecationWarning):
-        before = ss.write_page(tmp_path / "before.html", recording, ss.diagnose(recording))
-    assert before.read_bytes() == page.read_bytes()
+    diagnosed = ss.report(recording, tmp_path / "diagnosed.html", ss.diagnose(recording))
+    assert diagnosed.read_bytes() == page.read_bytes()
 
 
 def test_packaged_rigs_are_named():

@@ -89,4 +89,3 @@ def test_the_stub_names_each_export_once_and_is_what_python_loads():
     assert {*names, "__version__"} == {*ss.__all__, "LeakDetector"}
     for module, alias in lines:
         assert getattr(ss, alias.name) is getattr(import_module(str(module)), str(alias.asname))
-    assert {node.name for node in tree.body if isinstance(node, ast.FunctionDef)} == set(ss._DEPRECATED)

@@ -15,30 +15,18 @@ from typing import Any
 _STUB = Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8")
 #: Export -> module that it is loaded from.
 _HOMES = {name: home for home, name in re.findall(r"^from (\S+) import (\w+) as \2$", _STUB, re.MULTILINE)}
-#: Deprecated name -> its replacement, and the module and name that it still stands for.
-_DEPRECATED = {
-    "load_machine": ("read_machine", "sealscope.diagnosis.commissioned.machine_file", "read_machine"),
-    "write_page": ("report(recording, path, diagnosis)", "sealscope.reporting.page", "write_page"),
-}
 # `import *` must not load LeakDetector, which needs the extra `learn`
 __all__ = list(sorted({*_HOMES, "__version__"} - {"LeakDetector"}))
 
 
 def __getattr__(name: str) -> Any:
-    """Load the exported object `name` of the package when it is first used; warn if the name is deprecated."""
+    """Load the exported object `name` of the package when it is first used."""
     if name == "__version__":
         from importlib.metadata import version
 
         return version("sealscope")
     if name in _HOMES:
         return getattr(import_module(_HOMES[name]), name)
-    if name in _DEPRECATED:
-        from warnings import warn
-
-        replacement, home, attribute = _DEPRECATED[name]
-        message = f"sealscope.{name} is deprecated and goes with the next release: use {replacement}"
-        warn(message, DeprecationWarning, stacklevel=2)  # 2: the line that uses the name
-        return getattr(import_module(home), attribute)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

@@ -1,10 +1,4 @@
 # What `import sealscope` exports, and from where: `__init__.py` loads each name from here when it is first used.
-from os import PathLike
-from pathlib import Path
-from typing import Any
-
-from typing_extensions import deprecated
-
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine as CommissionedMachine
 from sealscope.diagnosis.commissioned.machine import commission as commission
 from sealscope.diagnosis.commissioned.machine_file import read_machine as read_machine
@@ -37,9 +31,3 @@ from sealscope.simulation.simulate import simulate as simulate
 from sealscope.simulation.simulate import simulate_with_truth as simulate_with_truth
 
 __version__: str
-
-# Names of the release before, gone in the next one: `__init__.py` gives them with a DeprecationWarning.
-@deprecated("use read_machine")
-def load_machine(path: str | PathLike[str]) -> CommissionedMachine: ...
-@deprecated("use report(recording, path, diagnosis)")
-def write_page(path: str | PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path: ...

@@ -28,9 +28,9 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
     )
 
 
-def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int, width: int = WIDTH) -> list[str]:
+def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int) -> list[str]:
     """Format pairs (label, text) as paragraphs, the label in the first `columns` characters; omit any without text."""
-    return [paragraph(text, f"  {label}".ljust(columns), indent=columns, width=width) for label, text in rows if text]
+    return [paragraph(text, f"  {label}".ljust(columns), indent=columns) for label, text in rows if text]
 
 
 def format_count(count: int, noun: str) -> str:

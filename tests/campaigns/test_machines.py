@@ -8,7 +8,7 @@ import pytest
 from sealscope.campaigns.cases.case import list_cases, profile_key
 from sealscope.campaigns.cases.machines import SIZING_SECONDS, case_experiment
 from sealscope.campaigns.cases.work import run_case
-from sealscope.campaigns.plans.duty import parse_plan_fault, throttle_values
+from sealscope.campaigns.plans.duty import parse_plan_fault, parse_throttle_values
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.simulation.bench import profile
 from sealscope.simulation.simulate import simulate_experiment
@@ -89,7 +89,7 @@ def test_a_profile_beside_the_plan_is_found(text, tmp_path):
 
 
 def test_closing_is_a_share():
-    assert throttle_values("25 %")["line.closed_A"] == throttle_values(0.25)["line.closed_A"] == 0.25
+    assert parse_throttle_values("25 %")["line.closed_A"] == parse_throttle_values(0.25)["line.closed_A"] == 0.25
     for wrong in ("100 %", -0.1, 1.0):
         with refusal("closed"):
-            throttle_values(wrong)
+            parse_throttle_values(wrong)

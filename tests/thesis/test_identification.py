@@ -8,6 +8,7 @@ import pytest
 from sealscope.parameters import load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.details import QUANTITIES, details
+from sealscope.simulation.experiment import throttle_values
 from sealscope.thesis.identification import (
     Hypothesis,
     fit_table,
@@ -20,10 +21,9 @@ from sealscope.thesis.identification import (
 from sealscope.thesis.sheet import (
     APPENDIX_C,
     BENCH_RIG,
+    GROUPS,
     Condition,
     DataSheet,
-    experiment_values,
-    groups,
 )
 from sealscope.units import PSI
 
@@ -33,14 +33,14 @@ from .conftest import ITEMS, Kept, needs_sheet
 def test_conditions_are_the_tests_of_the_appendix() -> None:
     assert len(APPENDIX_C) == 41
     assert [one.number for one in APPENDIX_C] == list(range(1, 42))
-    assert len(groups()) == 15
+    assert len(GROUPS) == 15
     assert min(one.mean_leak_lpm for one in APPENDIX_C) == 0.0042
     assert max(one.mean_leak_lpm for one in APPENDIX_C) == 0.0185
 
 
 @pytest.mark.parametrize("closed", [0.0, 25.0, 50.0, 75.0])
-def test_a_condition_sets_both_throttles_alike_and_leaves_an_open_line_to_the_rig(closed: float) -> None:
-    values = experiment_values(Condition(1, "3 sin(4t)", closed, 0.01, "small"))
+def test_both_throttles_are_set_alike_and_an_open_line_is_left_to_the_rig(closed: float) -> None:
+    values = throttle_values(closed / 100)
     for orifices in ("absent", "present"):
         rig = load_rig("thesis").with_overrides({"orifices": orifices}).with_overrides(values)
         assert rig.line.closed_A == rig.line.closed_B == pytest.approx(closed / 100)

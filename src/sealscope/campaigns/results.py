@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,27 +52,6 @@ def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowle
     return knowledge
 
 
-def _judge(
-    plan: SimulatedPlan | RecordedPlan,
-    rows: Sequence[CaseRow],
-    onset_s: float | None = None,
-    hours: float | None = None,
-) -> Judgement:
-    """Judge the rows of a campaign with the detectors and probabilities of its plan.
-
-    `onset_s` [s]: true onset of the leaks, None if unknown; `hours`: operating time of a record, None if unknown.
-    """
-    return judge(
-        rows,
-        plan.detectors,
-        false_alarm=plan.false_alarm,
-        promise=plan.promise,
-        confidence=plan.confidence,
-        onset_s=onset_s,
-        hours=hours,
-    )
-
-
 def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResult:
     """Judge a simulated campaign from the rows, the stored results of its records, in its folder.
 
@@ -82,7 +61,10 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
     head = store.read_head(folder) or store.collect_row_inputs(plan)
-    judgement = _judge(plan, rows, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0)
+    judgement = judge(
+        rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence,
+        onset_s=plan.onset_s, hours=plan.duration_s / 3600.0,
+    )  # fmt: skip
     mode = str(head.get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
 
@@ -92,7 +74,10 @@ def judge_recorded_campaign(
 ) -> CampaignResult:
     """Judge the recordings in a folder with the detectors of a plan; `progress` is called after each recording."""
     rows = judge_recordings(plan, folder, progress)
-    return CampaignResult(plan, tuple(rows), missing=0, judgement=_judge(plan, rows), known=prior_knowledge(plan))
+    judgement = judge(
+        rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence
+    )  # fmt: skip
+    return CampaignResult(plan, tuple(rows), missing=0, judgement=judgement, known=prior_knowledge(plan))
 
 
 def write_result(result: CampaignResult, folder: Path) -> list[Path]:

@@ -106,27 +106,6 @@ class RigChoice(NamedTuple):
         return cls(laws, exponent, literal_metering, implicit=implicit, euler=rig.motor.integrator == "euler")
 
 
-def _build_parameters_law(
-    laws: tuple[bool | tuple[bool, ...], ...], exponent: float, literal_metering: bool
-) -> Callable[..., Any]:
-    """Build the compiled function that computes the model's parameters `RigNumbers` from the FMU's parameter values.
-
-    The built function takes the values (n,), in the order of `variables.VALUES`, and conductances [m^3/(s Pa)] of
-    external leakage out of chambers A and B, added to the rig's. `laws` and the other arguments: fields of `RigChoice`.
-    """
-
-    @law
-    def model_parameters(v: Any, G_ext_A: float, G_ext_B: float) -> Any:
-        """Compute `RigNumbers` from the values v, with `G_ext_A`, `G_ext_B` [m^3/(s Pa)] added to those in v."""
-        derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
-        parameters = to_fixed_tuple(v, _N_PARAMETERS)
-        parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + G_ext_A)
-        parameters = tuple_setitem(parameters, _G_EXT_B, parameters[_G_EXT_B] + G_ext_B)
-        return RigNumbers(*(parameters + derived + laws))
-
-    return model_parameters  # type: ignore[no-any-return]
-
-
 def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
 
@@ -139,12 +118,15 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])
-    parameters_from_values = _build_parameters_law(laws, exponent, literal_metering)
 
     @law
     def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute `RigNumbers` from the values v and from the external leakage among `inputs`."""
-        return parameters_from_values(v, inputs[_ADDED_G_EXT_A], inputs[_ADDED_G_EXT_B])
+        """Compute `RigNumbers` from the values v, with the external leakage among `inputs` added to the rig's."""
+        derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
+        parameters = to_fixed_tuple(v, _N_PARAMETERS)
+        parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + inputs[_ADDED_G_EXT_A])
+        parameters = tuple_setitem(parameters, _G_EXT_B, parameters[_G_EXT_B] + inputs[_ADDED_G_EXT_B])
+        return RigNumbers(*(parameters + derived + laws))
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
         """Set the state `y` to standstill at x_0 [m] under the load among `inputs`; return 0 or a failure's code."""

@@ -16,7 +16,7 @@ from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, TotalLeakage
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.states import MachineState
 from sealscope.errors import printable
-from sealscope.paragraphs import WIDTH, format_count, join_names, paragraph, paragraphs
+from sealscope.paragraphs import format_count, join_names, paragraph, paragraphs
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import suggest_map_entry
 from sealscope.units import from_si
@@ -394,8 +394,8 @@ def format_unused_columns(diagnosis: Diagnosis) -> str | None:
     return f"{join_names(diagnosis.unused)}: recorded, and used for no channel; if they are channels: {lines}"
 
 
-def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Format a short text of a diagnosis: the verdict, its numbers and the next step; `width`: columns of a line."""
+def short_text(diagnosis: Diagnosis) -> str:
+    """Format a short text of a diagnosis: the verdict, its numbers and the next step."""
     odds = odds_or_false_alarms(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
     rows = [
         ("state", state_text(diagnosis.state)),
@@ -408,11 +408,11 @@ def short_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
         ("not used", format_unused_columns(diagnosis)),
         ("next", next_steps(diagnosis)[0]),
     ]
-    return _format_lines(diagnosis, rows, width)
+    return _format_lines(diagnosis, rows)
 
 
-def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
-    """Format a whole diagnosis as text: verdict, numbers, all methods and all findings; `width`: columns of a line.
+def diagnosis_text(diagnosis: Diagnosis) -> str:
+    """Format a whole diagnosis as text: verdict, numbers, all methods and all findings.
 
     The text has no colours. Unprintable characters, which file names or headers may contain, are replaced.
     """
@@ -434,7 +434,7 @@ def diagnosis_text(diagnosis: Diagnosis, *, width: int = WIDTH) -> str:
     rows += [(finding.severity, finding.text) for finding in diagnosis.quality]
     # only the first of the steps has a label
     rows += [("" if k else "next", step) for k, step in enumerate(next_steps(diagnosis)[:2])]
-    return _format_lines(diagnosis, rows, width)
+    return _format_lines(diagnosis, rows)
 
 
 def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
@@ -445,13 +445,13 @@ def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
     return [("since", since(diagnosis)), ("how much", size), ("how bad", how_bad(diagnosis))]
 
 
-def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]], width: int) -> str:
-    """Format a diagnosis as lines of text: file and verdict, then a paragraph of `width` columns for each row.
+def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]]) -> str:
+    """Format a diagnosis as lines of text: file and verdict, then a paragraph for each row.
 
     `rows`: pairs (label, text). A row without a text is left out.
     """
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
-    return "\n".join((first, *paragraphs(rows, columns=12, width=width)))
+    return "\n".join((first, *paragraphs(rows, columns=12)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:

@@ -97,11 +97,6 @@ def report(
     return template.write(target, page)
 
 
-def write_page(path: str | os.PathLike[str], recording: Recording, diagnosis: Diagnosis, **options: Any) -> Path:
-    """Write the page of a diagnosis; deprecated: `report` does the same, with `recording` before `path`."""
-    return report(recording, path, diagnosis, **options)
-
-
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
     """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
 

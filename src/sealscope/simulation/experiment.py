@@ -57,6 +57,15 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
     return method
 
 
+def throttle_values(closed: float) -> dict[str, str | float]:
+    """Build the parameters of a rig whose throttles both have the closed fraction `closed` of their area, by name.
+
+    Above 0 they include `line.orifices`, which gives the rig throttles. At 0 the rig decides if it has open ones.
+    """
+    values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
+    return {**values, "line.orifices": "present"} if closed > 0 else values
+
+
 def check_target(target: Position, t: Array, half_stroke: float) -> None:
     """Raise InputError unless a position target stays within +-`half_stroke` [m] at the times `t` [s]."""
     x = np.broadcast_to(target.value_at(t), t.shape)
@@ -281,11 +290,6 @@ class Experiment:
                     for leak in leaks
                 )
         return leaks
-
-    @property
-    def changes_viscosity(self) -> bool:
-        """True if a fault changes the oil's viscosity within the run."""
-        return any(fault.viscosity_ratio(self.rig) is not None for fault in self.faults)
 
     def readings(self) -> Readings:
         """Collect the changes of instruments within the run, and the spans in which a sensor is stuck."""

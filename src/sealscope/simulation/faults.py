@@ -167,7 +167,8 @@ class Fault:
         """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
 
         If `_EFFECTS` has a function for this kind of fault, it builds the effects. Otherwise each parameter in
-        `row.parameters` is multiplied by a factor or gets an addend, to the extent of the fault's opening (0 to 1).
+        `row.parameters` is multiplied by a factor or gets an addend, to the extent of the fault's opening (0 to 1). The
+        addend is the rig's parameter that `row.adds` names, or else the fault's value, over the parameter `row.over`.
         Raises InputError if this rig cannot have the fault: a part is absent, or a needed parameter is 0.
         """
         row = self.row
@@ -181,7 +182,11 @@ class Fault:
             healthy, size = 1.0, self.value - 1.0
             max_change = FAULT_MAX_CHANGE * max(abs(size), 1e-3)  # above 0 for a factor of 1
         else:
-            healthy, size = 0.0, self._addend(rig)
+            healthy, size = 0.0, self.value
+            if row.adds:
+                size = float(rig[row.adds])
+            elif row.over:
+                size /= float(rig[row.over])
             max_change = FAULT_MAX_CHANGE * size or math.inf  # infinite for size 0, which changes nothing
         return tuple(
             Effect(
@@ -194,16 +199,6 @@ class Fault:
             )
             for name in row.parameters
         )
-
-    def _addend(self, rig: Rig) -> float:
-        """Compute the amount by which the fault at full size changes a parameter.
-
-        It is the rig's parameter that `row.adds` names, if any. Otherwise it is `value`, divided by the rig's parameter
-        that `row.over` names, if any.
-        """
-        if self.row.adds:
-            return float(rig[self.row.adds])
-        return self.value / float(rig[self.row.over]) if self.row.over else self.value
 
     def holds(self) -> tuple[Hold, ...]:
         """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""

@@ -20,14 +20,14 @@ from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES, details, mean_squares
-from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.experiment import Experiment, throttle_values
 from sealscope.simulation.instruments import decimate
 from sealscope.simulation.integrate import oversampling, run_with_sized_leaks
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import format_note, load_texts
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, Condition, DataSheet, experiment_values, groups
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, GROUPS, Condition, DataSheet
 from sealscope.units import PSI
 
 #: Start-up that is left out, and length of the analysed part [s]: two cycles of the slowest command (2 pi s each).
@@ -52,7 +52,7 @@ def noise_free_mean_squares(
     piston; `values`: by name, parameters that replace those of the test.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
-    values = {**experiment_values(condition), **(values or {})}
+    values = {**throttle_values(condition.closed_pct / 100.0), **(values or {})}
     experiment = Experiment.of(rig=rig, command=condition.command, set=values, leak=leak, duration=duration, x_0=x_0)
     _, trajectory = run_with_sized_leaks(experiment)
     factor = oversampling(experiment)  # outputs of the solver for each sample
@@ -92,7 +92,7 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     Returns (tests, chambers, 5). `rig`: rig to simulate, at its own sampling rate; `sheet`: the measured RMS.
     """
     group_squares = {}
-    for command, closed_pct in groups():
+    for command, closed_pct in GROUPS:
         # number and level have no effect on the simulation
         condition = Condition(number=0, command=command, closed_pct=closed_pct, mean_leak_lpm=0.0, level="")
         group_squares[condition.group] = noise_free_mean_squares(rig, condition)
@@ -195,7 +195,7 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         mean, scatter = float(np.exp(log_ratios.mean())), float(np.exp(log_ratios.std(ddof=1)))
         rows.append((chamber, name, mean, "yes" if abs(mean - 1.0) <= _MAX_ERROR else "no", scatter))
     by_condition: list[tuple[Cell, ...]] = []
-    for group in groups():
+    for group in GROUPS:
         is_member = np.array([condition.group == group for condition in APPENDIX_C])
         ratios = np.exp(residuals[is_member].mean(axis=0)).ravel().tolist()
         by_condition.append((*group, int(is_member.sum()), *ratios))

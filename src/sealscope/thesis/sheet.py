@@ -41,9 +41,10 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 class Condition:
     """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the printed order.
 
-    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%]; `mean_leak_lpm`: mean leak
-    [L/min] after the bypass valve was opened; `level`: position of the bypass's needle valve, which does not
-    determine the leak (10 to 16 mL/min for "large", 4 to 14 for "extra-small").
+    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%], which cause no pressure drop in
+    the thesis's model if they are open (section 4.2.1); `mean_leak_lpm`: mean leak [L/min] after the bypass valve was
+    opened; `level`: position of the bypass's needle valve, which does not determine the leak (10 to 16 mL/min for
+    "large", 4 to 14 for "extra-small").
     """
 
     number: int
@@ -58,19 +59,6 @@ class Condition:
         return self.command, self.closed_pct
 
 
-def experiment_values(condition: Condition) -> dict[str, str | float]:
-    """Return the rig's parameters in a test of Appendix C by name, as `Experiment.of` takes them in `set`.
-
-    Each line has an orifice that can be closed. If both are open, `line.orifices` is not set, and the rig decides
-    whether they cause a pressure drop. They cause none in the thesis's model (section 4.2.1).
-    """
-    closed = condition.closed_pct / 100.0
-    values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
-    if closed > 0:
-        values["line.orifices"] = "present"
-    return values
-
-
 _, *_LINES = files(__package__).joinpath("appendix_c.csv").read_text(encoding="utf-8").splitlines()
 
 
@@ -79,11 +67,8 @@ APPENDIX_C: tuple[Condition, ...] = tuple(
     Condition(number, command, float(closed_pct), float(leak), level)
     for number, (command, closed_pct, leak, level) in enumerate(csv.reader(_LINES), 1)
 )
-
-
-def groups(conditions: tuple[Condition, ...] = APPENDIX_C) -> tuple[tuple[str, float], ...]:
-    """List the distinct operating conditions (command, closing [%]) of some tests, in order of first appearance."""
-    return tuple(dict.fromkeys(condition.group for condition in conditions))
+#: The distinct operating conditions (command, closing [%]) of these tests, in order of first appearance.
+GROUPS = tuple(dict.fromkeys(condition.group for condition in APPENDIX_C))
 
 
 def mean_leaks() -> Array:

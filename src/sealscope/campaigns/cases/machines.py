@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from sealscope.campaigns.cases.case import FAMILY, CampaignCase
-from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, LOAD, parse_plan_fault, throttle_values
+from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, LOAD, parse_plan_fault, parse_throttle_values
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.parameters import declared_names
 from sealscope.parameters.names import resolve_name
@@ -63,7 +63,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
             machine = replace(machine, load=parse_force(str(level)))
         elif name == "closed":
             # closed throttles: `line.orifices` of the drawn machine must not remain, so it is set for a level of 0, too
-            values |= {"line.orifices": str(plan.rig["line.orifices"])} | throttle_values(level)
+            values |= {"line.orifices": str(plan.rig["line.orifices"])} | parse_throttle_values(level)
         elif name != FAMILY:
             values[name] = level
     # full names; if two entries are for the same parameter, the later one counts

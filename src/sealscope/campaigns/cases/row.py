@@ -81,11 +81,6 @@ def matches_cause(named: str, true_cause: str) -> bool:
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
 
 
-def finite_or_none(value: float | None) -> float | None:
-    """Return a number as it is, or None if it is None, infinite or nan."""
-    return None if value is None or not math.isfinite(value) else float(value)
-
-
 def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 

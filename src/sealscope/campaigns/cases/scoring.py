@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 
-from sealscope.campaigns.cases.row import Scores, Statement, finite_or_none, ranking_score
+from sealscope.campaigns.cases.row import Scores, Statement, ranking_score
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.scorers import SplitRms
@@ -72,8 +72,8 @@ def score_details(
     for name in names:
         detector = parse_detector_name(name)
         if detector.scorer is not None:
-            value = detector.scorer.score(split_rms.through(views.get(detector.view, ALL_CHANNELS)))
-            scores[name] = (finite_or_none(value), None)
+            visible_rms = split_rms.through(views.get(detector.view, ALL_CHANNELS))
+            scores[name] = (detector.scorer.score(visible_rms), None)
     return scores
 
 

@@ -21,19 +21,14 @@ def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None
     """
     start_time = time.process_time()
     try:
-        row = _simulate_and_judge(plan, case, folder)
+        simulated = simulate_experiment(case_experiment(plan, case))
+        if folder is not None:
+            from sealscope.recordings import write
+
+            write(simulated.recording, folder / f"{case.id}.nc")
+        scores, statements = judge_record(simulated.recording, plan.onset_s, plan, plan.assumed)
+        flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
+        row = CaseRow.from_case(case, flow_lpm=flow, scores=scores, statements=statements)
     except Exception as error:  # a program defect in one case must not end the campaign; its row carries the error
         row = CaseRow.from_case(case, error=error_text(error))
     return replace(row, seconds=round(time.process_time() - start_time, 4))
-
-
-def _simulate_and_judge(plan: SimulatedPlan, case: CampaignCase, folder: Path | None) -> CaseRow:
-    """Simulate and judge the record of a case, and return its row; `folder`: where the record is written, if any."""
-    simulated = simulate_experiment(case_experiment(plan, case))
-    if folder is not None:
-        from sealscope.recordings import write
-
-        write(simulated.recording, folder / f"{case.id}.nc")
-    scores, statements = judge_record(simulated.recording, plan.onset_s, plan, plan.assumed)
-    flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
-    return CaseRow.from_case(case, flow_lpm=flow, scores=scores, statements=statements)

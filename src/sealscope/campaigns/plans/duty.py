@@ -12,9 +12,9 @@ from sealscope.control.registry import CONTROLLERS, check_controller_name, contr
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.simulation.bench.profile import load_profile
-from sealscope.simulation.experiment import check_target
+from sealscope.simulation.experiment import check_target, throttle_values
 from sealscope.simulation.faults import Fault, parse_fault
-from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force, parse_position
+from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
 from sealscope.units import parse_quantity
 
 COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
@@ -63,21 +63,15 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
             controller_named(name, plan.rig)
 
 
-def find_voltage_command(commands: tuple[str | float, ...]) -> str | None:
-    """Find the first command that is a voltage; return None if all are targets of the piston's position."""
-    return next((str(command) for command in commands if parse_position(str(command)) is None), None)
+def parse_throttle_values(level: str | float) -> dict[str, str | float]:
+    """Parse a closed fraction of the throttles, 0.25 or '25 %', to the parameters of a rig (`throttle_values`).
 
-
-def throttle_values(level: str | float) -> dict[str, str | float]:
-    """Compute the parameters of a rig whose throttles are closed by a fraction of their area, such as 0.25 or '25 %'.
-
-    Above 0 they include `line.orifices`, which gives the rig throttles. Raises InputError for a fraction < 0 or >= 1.
+    Raises InputError for a fraction < 0 or >= 1.
     """
     fraction = parse_quantity(level, "1") if isinstance(level, str) else float(level)
     if not 0.0 <= fraction < 1.0:
         raise InputError(f"closed must be 0 to under 100 %, got {level!r}")
-    values: dict[str, str | float] = {"line.closed_A": fraction, "line.closed_B": fraction}
-    return {**values, "line.orifices": "present"} if fraction > 0 else values
+    return throttle_values(fraction)
 
 
 def parse_plan_fault(text: str, onset_s: float) -> Fault:

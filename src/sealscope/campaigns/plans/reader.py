@@ -16,9 +16,8 @@ from sealscope.campaigns.plans.duty import (
     CONTROLLER,
     LOAD,
     check_duty,
-    find_voltage_command,
     parse_plan_fault,
-    throttle_values,
+    parse_throttle_values,
 )
 from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.diagnose import check_probability
@@ -26,6 +25,7 @@ from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import records_needed
 from sealscope.parameters import load_rig
 from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.targets_and_loads import parse_position
 from sealscope.storage.opening import is_file_path
 from sealscope.storage.toml_file import read_model, read_toml
 
@@ -161,9 +161,10 @@ def _check_factors(plan: SimulatedPlan) -> None:
     cells = math.prod(map(len, plan.factors.values()))
     if cells > MAX_CELLS:
         raise InputError(f"factors: their levels must make at most {MAX_CELLS} cells, got {cells} ({plan.place})")
-    if CONTROLLER in plan.factors and (command := find_voltage_command(_commands(plan))) is not None:
-        rule = f"must have targets to follow ('position 50 mm sin(2t)'), got {command!r}"
-        raise InputError(f"factors.{CONTROLLER} {rule} ({plan.place})")
+    for command in map(str, _commands(plan) if CONTROLLER in plan.factors else ()):
+        if parse_position(command) is None:  # a voltage
+            rule = f"must have targets to follow ('position 50 mm sin(2t)'), got {command!r}"
+            raise InputError(f"factors.{CONTROLLER} {rule} ({plan.place})")
 
 
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
@@ -188,7 +189,7 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
     elif name in (COMMAND, CONTROLLER, LOAD):
         check_duty(name, level, plan.rig, plan.duration_s)
     else:  # a parameter of the rig, or "closed", the closed fraction of its throttles; raises for an invalid value
-        plan.rig.with_overrides(throttle_values(level) if name == "closed" else {name: level})
+        plan.rig.with_overrides(parse_throttle_values(level) if name == "closed" else {name: level})
 
 
 def _check_records(plan: SimulatedPlan) -> None:

@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
-from sealscope.errors import InputError, MissingExtra
+from sealscope.errors import InputError
 from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.formats.libraries import import_library
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.batch.run import ExperimentSet, SetRun, group_experiments, with_leak_coefficient
@@ -90,10 +91,7 @@ class Batch:
         as `d3 of p_A [Pa]`; `d3d4` of the product of two), mean_leak [L/min], the leak's coefficient, and the solver's
         step [s]. Raises MissingExtra if pandas is not installed.
         """
-        try:
-            import pandas as pd
-        except ImportError:
-            raise MissingExtra("a table needs pandas: pip install 'sealscope[io]'") from None
+        pandas = import_library("pandas", "a table", "pandas")
         runs, _, segments, _ = self.rms.shape
         run, segment = (index.ravel() for index in np.indices((runs, segments)))
         columns: dict[str, Any] = {"run": run, "segment": segment}
@@ -105,7 +103,7 @@ class Batch:
         columns["mean_leak [L/min]"] = self.mean_leak_lpm[run]
         columns["coefficient"] = self.coefficients[run]
         columns["step [s]"] = self.steps[run]
-        return pd.DataFrame(columns)
+        return pandas.DataFrame(columns)  # type: ignore[no-any-return]
 
 
 def _index_of(name: str, names: tuple[str, ...], what: str) -> int:

@@ -86,7 +86,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
         violated_rules.append("motor.integrator = state, got euler")
     if any(fault.row.is_sensor_fault for fault in experiment.faults):
         violated_rules.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
-    if leaks and experiment.changes_viscosity:
+    if leaks and any(fault.viscosity_ratio(rig) is not None for fault in experiment.faults):
         violated_rules.append("no leak while the oil's temperature changes")
     not_modelled = ["daq.jitter"]  # parameters that the instruments of a batch do not model (`batch.signals`)
     not_modelled += [

@@ -15,7 +15,7 @@ from sealscope.errors import InputError
 from sealscope.simulation.bench.profile import DriftRange, Nuisance, NuisanceChoice, Profile, load_profile
 from sealscope.simulation.changes import ParameterDrift, Wander, linear_path
 from sealscope.simulation.commands import Command, parse_command
-from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.experiment import Experiment, throttle_values
 from sealscope.simulation.targets_and_loads import Force, Position, command_or_target, parse_force
 
 if TYPE_CHECKING:
@@ -204,9 +204,7 @@ def draw(
         return options[int(random.integers(len(options)))]
 
     command, closed_fraction = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
-    overrides |= {"line.closed_A": closed_fraction, "line.closed_B": closed_fraction}
-    if closed_fraction > 0:
-        overrides["line.orifices"] = "present"
+    overrides |= throttle_values(closed_fraction)
     amplitude = float(random.uniform(*duty.amplitude))
     if amplitude != 1.0:
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]

@@ -18,12 +18,12 @@ from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.signals.filters import reach
 from sealscope.simulation.changes import ParameterDrift
 from sealscope.simulation.commands import polyline_from_table
-from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.experiment import Experiment, throttle_values
 from sealscope.thesis.engine.context import Context, first_table, simulate_run
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import format_note, load_texts
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition, DataSheet, experiment_values
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, UNITS, Condition, DataSheet
 from sealscope.units import PSI
 
 #: Length of the part without and of the part with the leak [s]; a quick reproduction takes the shorter one.
@@ -67,7 +67,7 @@ def leak_test(
     return Experiment.of(
         rig=BENCH_RIG,
         command=condition.command,
-        set=experiment_values(condition),
+        set=throttle_values(condition.closed_pct / 100.0),
         duration=2 * half,
         leak=f"{condition.mean_leak_lpm:g} L/min from {half:g} s" if leak else None,
         drifts=drifts,

@@ -7,7 +7,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -191,24 +190,16 @@ class ControlledRig:
         return damper_power / electrical_power, damper_power / hydraulic_power
 
 
-class Tracking(NamedTuple):
-    """Result of a run in which the piston follows a sine of the position (`DUTY`).
+def tracking(run: Trajectory, mask: Array) -> tuple[float, float, float]:
+    """Compute how the piston follows the position sine `DUTY` in the samples `mask` of whole cycles.
 
-    `error_mm`: rms error of the position [mm]; `energy_J`: electrical energy of the motor in a cycle [J];
-    `compensated_lpm`: mean leakage flow [L/min] that the controller compensates, 0 if it reports none.
+    Returns the rms error of the position [mm], the electrical energy of the motor in a cycle [J], and the mean leakage
+    flow [L/min] that the controller compensates, 0 if it reports none.
     """
-
-    error_mm: float
-    energy_J: float
-    compensated_lpm: float
-
-
-def tracking(run: Trajectory, mask: Array) -> Tracking:
-    """Compute the `Tracking` of a run that follows the position sine `DUTY`; `mask`: samples of whole cycles."""
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
     energy = float(np.mean(run["V"][mask] * run["i"][mask])) * CYCLE
-    return Tracking(1e3 * float(np.sqrt(np.mean(error**2))), energy, flow)
+    return 1e3 * float(np.sqrt(np.mean(error**2))), energy, flow
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:

@@ -15,6 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
 from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.signals.windows import rms
@@ -32,7 +33,7 @@ from sealscope.thesis.chapters.chapter4.cases import (
     make_experiment,
     steady_output,
 )
-from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, friction_at_threshold, thesis_rig
+from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, friction_at_threshold
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
@@ -87,7 +88,7 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
         fit = sine_fit(run.t[cases.steady_mask(run)], steady_output(run, "omega"), command.omega)
         amplitude = float(np.abs(fit.amplitudes[0]))
         residual_ratio = rms(fit.residual) / (amplitude / math.sqrt(2.0))
-        speed_ratio = amplitude / (command.amplitude * thesis_rig().motor.omega_per_volt)
+        speed_ratio = amplitude / (command.amplitude * load_rig("thesis").motor.omega_per_volt)
         residual = f"{residual_ratio * 100:.2f} % rms residual from the sine"
         fits.append(f"{name}: {residual}, {speed_ratio * 100:.0f} % of the commanded speed")
         tests.append(residual_ratio < _MAX_RESIDUAL)
@@ -157,7 +158,7 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     jump at the threshold velocity, whichever way eq. (4.22) is read. 4.23: the throttles as printed let oil flow to the
     cylinder with less resistance than back, on both sides.
     """
-    rig = thesis_rig()
+    rig = load_rig("thesis")
     charge = rig.fluid.p_charge * 1e-6  # [MPa]
     run = context.run(make_experiment(COMMANDS[0], closed_pct=25.0))
     peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.parameters import Rig, load_rig
+from sealscope.parameters import load_rig
 from sealscope.physics.friction import stribeck_friction
 from sealscope.recordings.recording import Array
 from sealscope.thesis.engine.context import Context
@@ -21,18 +21,13 @@ from sealscope.thesis.engine.texts import format_note
 _AXES = ("v [m/s]", "F_f [N]")
 
 
-def thesis_rig() -> Rig:
-    """Load the rig of the thesis."""
-    return load_rig("thesis")
-
-
 def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Array:
     """Compute the friction [N] of the thesis's rig at the velocities `v` (n,) [m/s], eqs. (4.21), (4.22) of the thesis.
 
     `F_C` [N]: Coulomb force; `literal_bracket`: True to close the unbalanced bracket of eq. (4.22) at its end. The
     friction then jumps at the threshold velocity v_th.
     """
-    f = thesis_rig().friction
+    f = load_rig("thesis").friction
     friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
     return np.array([friction(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
@@ -42,7 +37,7 @@ def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
 
     The keys are "continuous", and "literal" for the unbalanced bracket closed at its end. `F_C`: Coulomb force [N].
     """
-    v_th = thesis_rig().friction.v_th
+    v_th = load_rig("thesis").friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
     forces = {}
     for name, literal_bracket in (("continuous", False), ("literal", True)):
@@ -57,7 +52,7 @@ def falling_friction_limit(F_C: float) -> float:
     The limit v solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), with the parameters of the thesis's rig: F_v [N s/m]
     viscous coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
     """
-    f = thesis_rig().friction
+    f = load_rig("thesis").friction
     # slope of the Stribeck friction at standstill over that of the viscous friction
     steepness = F_C * (f.K_brk - 1.0) * f.C_c / f.F_v
     return math.log(max(steepness, 1.0)) / f.C_c
@@ -65,7 +60,7 @@ def falling_friction_limit(F_C: float) -> float:
 
 def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw Fig. 4.2: Coulomb, static and stick-slip friction and the Stribeck curve; `context` is not used."""
-    f = thesis_rig().friction
+    f = load_rig("thesis").friction
     F, F_brk, v_th = f.F_pr, f.F_pr * f.K_brk, f.v_th
     v = np.linspace(-0.1, 0.1, 801)
     sketches: dict[str, tuple[str, Any, Any]] = {
@@ -92,7 +87,7 @@ def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     The equation's closing bracket can stand in two places; one of them makes friction continuous at v_th. `context` is
     not used.
     """
-    rig = thesis_rig()
+    rig = load_rig("thesis")
     f = rig.friction
     # Coulomb force with both chambers at charge pressure; F_cfr multiplies the sum of the pressures, eq. (4.20)
     charged = f.F_pr + f.F_cfr * 2.0 * rig.fluid.p_charge
