@@ -38,8 +38,6 @@ from sealscope.storage.plain_values import convert_type, parse_json
 
 #: Ending of the file's name, and its first line.
 SUFFIX, _HEAD = ".healthy", b"sealscope healthy summaries 1\n"
-#: The same of files from before version 0.1, which are still read. Their key "lessons" is now "summaries".
-OLD_SUFFIX, _OLD_HEAD = ".lessons", b"sealscope lessons 1\n"
 #: Largest file and longest line [bytes]; most summaries in a file.
 MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
 #: Most commas, brackets and braces in a line: the first number plus the second times the number of bytes. The limit
@@ -346,10 +344,7 @@ def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
     try:
         if n_marks > max_marks:
             raise ValueError(f"it must hold its numbers in arrays, got {n_marks} values")
-        tree = parse_json(line.data)
-        if isinstance(tree, dict) and "lessons" in tree:  # the key of files from before version 0.1
-            tree["summaries"] = tree.pop("lessons")
-        fields = convert_type(_RECORDING, tree).model_dump(exclude_unset=True)
+        fields = convert_type(_RECORDING, parse_json(line.data)).model_dump(exclude_unset=True)
     except ValueError as error:
         raise InputError(f"the summary of {file} is wrong: {error} ({place})") from None
     return SummarisedRecording(file, **{"start_s": None, **fields})  # an unknown start is not stored
@@ -408,7 +403,7 @@ def _iter_lines(path: Path) -> Iterator[Line]:
             file.seek(0)
             if size > MAX_SIZE:
                 raise InputError(f"{noun} must be at most {MAX_SIZE} bytes, got {size} ({path})")
-            if file.readline(len(_HEAD)) not in (_HEAD, _OLD_HEAD):
+            if file.readline(len(_HEAD)) != _HEAD:
                 raise InputError(f"{noun} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
             for _ in range(_MAX_SUMMARIES + 1):  # the last pass finds the end, unless there are too many lines
                 row = file.readline(_MAX_LINE)
