@@ -6,7 +6,7 @@ from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping
 from dataclasses import is_dataclass
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -101,7 +101,8 @@ def _to_plain_value(value: Any) -> Any:
     """Convert one attribute of an object to a value that JSON can store.
 
     An object with a method `state` is converted by this method. Dataclasses become dicts, arrays become mappings
-    (`plain_array`), tuples become lists, and a float that is not finite becomes None. Inner values are not converted.
+    (`plain_array`), also those in a list, tuples become lists, and a float that is not finite becomes None. Other inner
+    values are not converted.
     """
     if callable(getattr(value, "state", None)):
         return value.state()
@@ -113,7 +114,9 @@ def _to_plain_value(value: Any) -> Any:
         return None
     if isinstance(value, dict):
         return dict(value)
-    return list(value) if isinstance(value, tuple | list) else value
+    if isinstance(value, tuple | list):
+        return [plain_array(item) if isinstance(item, np.ndarray) else item for item in value]
+    return value
 
 
 def restore_attributes(
@@ -122,7 +125,7 @@ def restore_attributes(
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
     - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
-      `owner` is a named tuple, its arrays are filled in place.
+      `owner` is a named tuple, its arrays are filled in place. The same holds for each array of a list.
     - An attribute with a method `load_state` restores itself.
     - A saved None leaves an attribute unchanged if its present value is a float or None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
@@ -131,22 +134,49 @@ def restore_attributes(
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)
-        value = require_part(state, key, object)
-        if isinstance(present, np.ndarray):
-            value, dtype = restore_array(value, key), present.dtype
-            present = _as_plain_array(present)
-            if value.ndim != present.ndim or any(
-                length not in (saved_length, 0) for saved_length, length in zip(value.shape, present.shape, strict=True)
-            ):
-                raise InputError(f"saved state's {key} must have the shape {present.shape}, got {value.shape}")
-            if dtype.names:  # turn the last axis into the named columns of a structured array
-                value = value.view(dtype)[:, 0]
-        elif hasattr(present, "load_state"):  # an object with a state restores itself
-            present.load_state(value)
-            continue
-        elif value is not None or not isinstance(present, float | None):
-            value = restore(kinds.get(name, type(present)), value, key)
-        if isinstance(owner, tuple):  # the arrays of a named tuple are filled in place
-            present[:] = value
-        elif value is not None:
-            setattr(owner, name, value)
+        saved = require_part(state, key, object)
+        if hasattr(present, "load_state"):  # an object with a state restores itself
+            present.load_state(saved)
+        elif isinstance(present, np.ndarray) and isinstance(owner, tuple):
+            present[:] = _restore_like(present, saved, key)
+        elif isinstance(present, np.ndarray):
+            setattr(owner, name, _restore_like(present, saved, key))
+        elif isinstance(present, list) and present and isinstance(present[0], np.ndarray):
+            if not isinstance(saved, list) or len(saved) != len(present):
+                raise InputError(f"saved state's {key} must be a list of {len(present)} arrays, got another value")
+            arrays = [_restore_like(array, value, key) for array, value in zip(present, saved, strict=True)]
+            setattr(owner, name, arrays)
+        elif saved is not None or not isinstance(present, float | None):
+            setattr(owner, name, restore(kinds.get(name, type(present)), saved, key))
+
+
+def _restore_like(present: NDArray[Any], saved: Any, name: str) -> NDArray[Any]:
+    """Restore an array, saved as the entry `name` of a state, with the columns and the shape of the `present` one.
+
+    Where the present array has an axis of length 0, any length is accepted. Raises InputError for another shape.
+    """
+    values, shape = restore_array(saved, name), _as_plain_array(present).shape
+    if values.ndim != len(shape) or any(
+        length not in (saved_length, 0) for saved_length, length in zip(values.shape, shape, strict=True)
+    ):
+        raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
+    # the last axis holds the named columns of a structured array
+    return values.view(present.dtype)[:, 0] if present.dtype.names else values
+
+
+class SavedAttributes:
+    """An object whose attributes `SAVED` are saved as plain values for JSON, and restored to the last bit.
+
+    `SAVED_TYPES`: by name, the types of saved attributes whose first value has another type, such as None.
+    """
+
+    SAVED: ClassVar[tuple[str, ...]] = ()
+    SAVED_TYPES: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+
+    def state(self) -> dict[str, Any]:
+        """Return the attributes to save as plain values for JSON, which `load_state` restores."""
+        return save_attributes(self, self.SAVED)
+
+    def load_state(self, state: Any) -> None:
+        """Restore the attributes that `state` saved; raise InputError if one is missing or does not fit."""
+        restore_attributes(self, self.SAVED, state, self.SAVED_TYPES)

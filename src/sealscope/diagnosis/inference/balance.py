@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,7 +48,7 @@ from sealscope.recordings.corrections.gaps import flag_holes
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
-from sealscope.storage.plain_state import plain_array, require_part, restore_array
+from sealscope.storage.plain_state import SavedAttributes, plain_array, require_part, restore_array
 from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
 BATCH_SAMPLES = 8192
 
 
-class BlockStream:
+class BlockStream(SavedAttributes):
     """Division of a stream of samples into blocks, each reduced to Gram matrices of the volume balance.
 
     The blocks do not depend on how many samples arrive at a time.
@@ -95,6 +95,9 @@ class BlockStream:
     on_samples : callable, optional
         Called with the start time [s] and the samples of each block before the block is computed.
     """
+
+    SAVED = ("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_weighting")
+    SAVED_TYPES: ClassVar = {"_absolute_offsets": dict[str, float], "left_signs": tuple[float, ...]}
 
     def __init__(
         self,
@@ -182,29 +185,16 @@ class BlockStream:
         minus gauge pressures, signs of the flows), and weighted sums over all blocks.
         """
         return {
+            **super().state(),
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
-            "begin": self._begin,
-            "first": self._first,
-            "done": self._n_closed,
-            "zeros": self._absolute_offsets,
-            "signs": list(self.left_signs),
-            "weighting": self._weighting.state(),
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore what `state` returned; raise InputError if the values do not fit the balances of this stream."""
+        super().load_state(state)
         samples = require_part(state, "samples", Mapping)
-        self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
-        self._first = int(require_part(state, "first", int))
-        self._n_closed = int(require_part(state, "done", int))
         self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
-        absolute_offsets = require_part(state, "zeros", (Mapping, type(None)))
-        if absolute_offsets is not None:
-            absolute_offsets = {name: float(offset) for name, offset in absolute_offsets.items()}
-        self._absolute_offsets = absolute_offsets
-        self.left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
-        self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
