@@ -22,6 +22,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.charge_pressure import LowDrifts
+from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
@@ -215,6 +217,8 @@ _RMS = table_type(
     levels=_Array,
     duty=_Array,
 )
+#: Numbers in the summary of friction and drifts, and their standard errors.
+_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *LowDrifts._fields)
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
@@ -223,18 +227,7 @@ _SUMMARIES = {
     SIGNALS: (
         table_type(
             "allow",
-            friction_pressure=(_Number, None),
-            friction_error=(_Magnitude, None),
-            friction_beside_loads=(_Number, None),
-            friction_beside_loads_error=(_Magnitude, None),
-            drift_A=(_Number, None),
-            drift_A_error=(_Magnitude, None),
-            drift_B=(_Number, None),
-            drift_B_error=(_Magnitude, None),
-            low_A=(_Number, None),
-            low_A_error=(_Magnitude, None),
-            low_B=(_Number, None),
-            low_B_error=(_Magnitude, None),
+            **{name: (_Magnitude if name.endswith("_error") else _Number, None) for name in _SIGNAL_NUMBERS},
             **{name: (Annotated[_Array, AfterValidator(_check_octaves)], None) for name in PAIRS},
         ),
         None,
