@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping
-from dataclasses import is_dataclass
 from types import MappingProxyType
 from typing import Any, ClassVar, TypeVar
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
-from sealscope.storage.plain_values import convert_type
+from sealscope.storage.plain_values import convert_type, to_plain
 
 _T = TypeVar("_T")
 #: Most numbers in an array that is restored.
@@ -91,32 +90,21 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, dicts, arrays, dataclasses, or objects with a method `state`. A float that is
-    not finite becomes None. Keys of the result are the names without leading underscores.
+    An object with a method `state` is converted by it, arrays, also those in a list, by `plain_array`, and other values
+    by `to_plain`. Keys of the result are the names without leading underscores.
     """
-    return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
+    return {name.lstrip("_"): _save_value(getattr(owner, name)) for name in names}
 
 
-def _to_plain_value(value: Any) -> Any:
-    """Convert one attribute of an object to a value that JSON can store.
-
-    An object with a method `state` is converted by this method. Dataclasses become dicts, arrays become mappings
-    (`plain_array`), also those in a list, tuples become lists, and a float that is not finite becomes None. Other inner
-    values are not converted.
-    """
+def _save_value(value: Any) -> Any:
+    """Convert the value of an attribute to a value that JSON can store, as `save_attributes` describes."""
     if callable(getattr(value, "state", None)):
         return value.state()
-    if is_dataclass(value):  # its lists are copied, as they may grow
-        return {name: list(item) if isinstance(item, list) else item for name, item in vars(value).items()}
     if isinstance(value, np.ndarray):
         return plain_array(value)
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return dict(value)
-    if isinstance(value, tuple | list):
-        return [plain_array(item) if isinstance(item, np.ndarray) else item for item in value]
-    return value
+    if isinstance(value, list) and value and isinstance(value[0], np.ndarray):
+        return [plain_array(array) for array in value]
+    return to_plain(value)
 
 
 def restore_attributes(

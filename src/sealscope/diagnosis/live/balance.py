@@ -197,7 +197,7 @@ class LiveBalance(SavedAttributes):
                 self._rate = run.rate
                 new_stream = self._make_stream()
                 if stream is not None:  # keep offsets, signs and weights of the equations, drop samples at the old rate
-                    new_stream.load_state({**stream.state(), "samples": {}, "first": 0, "n_closed": 0})
+                    new_stream.load_state(stream.state())
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
