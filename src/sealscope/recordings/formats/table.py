@@ -217,7 +217,8 @@ def convert_columns(
     if label is None:
         assert choice.rate is not None
         t, rate = np.arange(count) / choice.rate, choice.rate
-    elif description is not None and not request.infers_rate:
+    elif description is not None and request.file and not request.map:
+        # a map may choose another time column; in a data frame, i.e. without a file, rows may have been removed
         t, rate = time, description["rate"]
     else:
         t, rate, start, time_notes = time_base(time, label.unit, label.whole, choice.rate, state)
