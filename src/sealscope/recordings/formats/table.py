@@ -32,6 +32,7 @@ from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.formats.timebase import (
     TimeState,
+    interpolate_samples,
     is_falling,
     iso_moment,
     nominal_rate,
@@ -454,12 +455,8 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
     if rate > base_rate:
         note = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
         return _average(values, times, t, 1.0 / base_rate), note
-    result = np.interp(t, times, values, left=np.nan, right=np.nan)
-    next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
-    interval = times[next_sample] - times[next_sample - 1]
-    is_long = interval > _MAX_INTERVAL * float(np.median(np.diff(times)))
-    result[is_long & (times[next_sample] != t)] = np.nan
-    return result, f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
+    note = f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
+    return interpolate_samples(t, times, values, _MAX_INTERVAL), note
 
 
 def _average(values: Array, times: Array, t: Array, step: float) -> Array:
