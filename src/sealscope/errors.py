@@ -16,6 +16,11 @@ def printable(text: str, kept: str = "", instead: str = "\N{REPLACEMENT CHARACTE
     return "".join(character if character.isprintable() or character in kept else instead for character in text)
 
 
+def escape_text(text: str, kept: str = "") -> str:
+    r"""Escape unprintable characters as Python writes them, such as \x1b, except the characters in `kept`."""
+    return "".join(letter if letter.isprintable() or letter in kept else repr(letter)[1:-1] for letter in text)
+
+
 class SealscopeError(Exception):
     """Base class of the errors that Sealscope raises on purpose; the message is one line.
 

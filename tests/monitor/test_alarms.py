@@ -21,6 +21,7 @@ from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.events import EventLines
 from sealscope.monitor.settings import WatchSettings
 from sealscope.storage.plain_state import restore
+from sealscope.storage.plain_values import to_plain
 
 SETTINGS = WatchSettings(warning_lpm=0.002, error_lpm=0.01, debounce_blocks=2, return_share=0.5)
 LEAK = WatchedLeak(
@@ -161,7 +162,7 @@ def test_an_invalid_alarm_has_a_reason():
 def test_its_state_is_plain_and_what_is_over_is_gone(steps: list[tuple[float, str]]):
     judge, over = AlarmJudge("a"), 0
     for lpm, mark in steps:
-        again = restore(AlarmJudge, json.loads(json.dumps(judge.state())), "alarm")
+        again = restore(AlarmJudge, json.loads(json.dumps(to_plain(judge))), "alarm")
         assert again == judge
         through(judge, [lpm])
         if judge.alarm is not None and mark:

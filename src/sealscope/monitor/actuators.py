@@ -37,7 +37,7 @@ from sealscope.monitor.supervisor import Supervisor, describe_error
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict, judge_stream
 from sealscope.recordings.oil import measured_oil_temperature
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import require_part, restore, save_attributes
+from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
 
 _log = logging.getLogger(__name__)
 _MAX_COMMENT_LENGTH = 2000
@@ -47,6 +47,8 @@ PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 DROPPED = "blocks that raised an error"
 #: Fields of the verdict on a recording that the summary of an actuator contains.
 _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
+#: Last results of an actuator that a checkpoint stores: type of each by attribute, which may also be None.
+_RESULT_TYPES = {"last": BlockEstimate, "oil_celsius": float, "judged_s": float, "verdict": RecordingVerdict}
 #: Length of the last samples that are kept during an alarm [s].
 _ALARM_SAMPLES_S = 120.0
 
@@ -167,17 +169,13 @@ class _Actuator:
 
     def state(self) -> dict[str, Any]:
         """Convert the detector, the alarm and the last results to plain values, for a checkpoint in the database."""
-        saved = ("watch", "judge", "last", "oil_celsius", "judged_s", "verdict", "n_stored")
-        return {**save_attributes(self, saved), "recorder": None if self.recorder is None else self.recorder.state()}
+        return save_attributes(self, ("watch", "judge", *_RESULT_TYPES, "n_stored", "recorder"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore the detector and the last results from `state`, plain values of a checkpoint; keep the alarm."""
         self.watch = Watch.from_state(state["watch"])
-        self.last = None if state["last"] is None else restore(BlockEstimate, state["last"], "last")
-        self.oil_celsius, self.judged_s = state.get("oil_celsius"), state.get("judged_s")
-        if state.get("verdict") is not None:
-            self.verdict = restore(RecordingVerdict, state["verdict"], "verdict")
-        if self.recorder is not None and state.get("recorder") is not None:
+        restore_attributes(self, _RESULT_TYPES, state, _RESULT_TYPES)
+        if self.recorder is not None and state["recorder"] is not None:
             self.recorder.load_state(state["recorder"])
 
     def _machine_state(self) -> MachineState:

@@ -24,7 +24,6 @@ from sealscope.diagnosis.verdict.states import state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict
-from sealscope.storage.plain_state import save_attributes
 
 Level = Literal["warning", "error"]
 AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
@@ -317,10 +316,6 @@ class AlarmJudge:
         if mark in ("invalid", "repaired"):
             self.evidence = 0.0
         return self._set_alarm(replace(alarm, updated_s=t, **changes[mark]))
-
-    def state(self) -> dict[str, Any]:
-        """Convert the alarm and its counters to plain values, from which `restore` can rebuild this object."""
-        return save_attributes(self, vars(self))
 
 
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from sealscope.errors import escape_text
 from sealscope.storage.atomic import atomic_write
 
 #: Beginnings of a cell that spreadsheets read as a formula.
@@ -24,9 +25,7 @@ def guard_cell(value: Any) -> Any:
     """
     if not isinstance(value, str):
         return value
-    text = "".join(  # escapes as Python writes them, such as \x1b, without quotation marks
-        character if character.isprintable() or character == "\n" else repr(character)[1:-1] for character in value
-    )
+    text = escape_text(value, kept="\n")
     return f"'{text}" if value.startswith(_FORMULA_BEGINNINGS) and not _NUMBER.fullmatch(value) else text
 
 

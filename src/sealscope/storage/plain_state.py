@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from base64 import b64decode, b64encode
 from collections.abc import Iterable, Mapping
-from dataclasses import is_dataclass
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.errors import InputError
-from sealscope.storage.plain_values import convert_type
+from sealscope.storage.plain_values import convert_type, to_plain
 
 _T = TypeVar("_T")
 #: Most numbers in an array that is restored.
@@ -91,29 +90,21 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    Attributes are numbers, texts, lists, dicts, arrays, dataclasses, or objects with a method `state`. A float that is
-    not finite becomes None. Keys of the result are the names without leading underscores.
+    An object with a method `state` is converted by it, arrays, also those in a list, by `plain_array`, and other values
+    by `to_plain`. Keys of the result are the names without leading underscores.
     """
-    return {name.lstrip("_"): _to_plain_value(getattr(owner, name)) for name in names}
+    return {name.lstrip("_"): _save_value(getattr(owner, name)) for name in names}
 
 
-def _to_plain_value(value: Any) -> Any:
-    """Convert one attribute of an object to a value that JSON can store.
-
-    An object with a method `state` is converted by this method. Dataclasses become dicts, arrays become mappings
-    (`plain_array`), tuples become lists, and a float that is not finite becomes None. Inner values are not converted.
-    """
+def _save_value(value: Any) -> Any:
+    """Convert the value of an attribute to a value that JSON can store, as `save_attributes` describes."""
     if callable(getattr(value, "state", None)):
         return value.state()
-    if is_dataclass(value):  # its lists are copied, as they may grow
-        return {name: list(item) if isinstance(item, list) else item for name, item in vars(value).items()}
     if isinstance(value, np.ndarray):
         return plain_array(value)
-    if isinstance(value, float) and not np.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return dict(value)
-    return list(value) if isinstance(value, tuple | list) else value
+    if isinstance(value, list) and value and isinstance(value[0], np.ndarray):
+        return [plain_array(array) for array in value]
+    return to_plain(value)
 
 
 def restore_attributes(
@@ -122,7 +113,7 @@ def restore_attributes(
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
     - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
-      `owner` is a named tuple, its arrays are filled in place.
+      `owner` is a named tuple, its arrays are filled in place. The same holds for each array of a list.
     - An attribute with a method `load_state` restores itself.
     - A saved None leaves an attribute unchanged if its present value is a float or None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
@@ -131,22 +122,49 @@ def restore_attributes(
     """
     for name in names:
         key, present = name.lstrip("_"), getattr(owner, name)
-        value = require_part(state, key, object)
-        if isinstance(present, np.ndarray):
-            value, dtype = restore_array(value, key), present.dtype
-            present = _as_plain_array(present)
-            if value.ndim != present.ndim or any(
-                length not in (saved_length, 0) for saved_length, length in zip(value.shape, present.shape, strict=True)
-            ):
-                raise InputError(f"saved state's {key} must have the shape {present.shape}, got {value.shape}")
-            if dtype.names:  # turn the last axis into the named columns of a structured array
-                value = value.view(dtype)[:, 0]
-        elif hasattr(present, "load_state"):  # an object with a state restores itself
-            present.load_state(value)
-            continue
-        elif value is not None or not isinstance(present, float | None):
-            value = restore(kinds.get(name, type(present)), value, key)
-        if isinstance(owner, tuple):  # the arrays of a named tuple are filled in place
-            present[:] = value
-        elif value is not None:
-            setattr(owner, name, value)
+        saved = require_part(state, key, object)
+        if hasattr(present, "load_state"):  # an object with a state restores itself
+            present.load_state(saved)
+        elif isinstance(present, np.ndarray) and isinstance(owner, tuple):
+            present[:] = _restore_like(present, saved, key)
+        elif isinstance(present, np.ndarray):
+            setattr(owner, name, _restore_like(present, saved, key))
+        elif isinstance(present, list) and present and isinstance(present[0], np.ndarray):
+            if not isinstance(saved, list) or len(saved) != len(present):
+                raise InputError(f"saved state's {key} must be a list of {len(present)} arrays, got another value")
+            arrays = [_restore_like(array, value, key) for array, value in zip(present, saved, strict=True)]
+            setattr(owner, name, arrays)
+        elif saved is not None or not isinstance(present, float | None):
+            setattr(owner, name, restore(kinds.get(name, type(present)), saved, key))
+
+
+def _restore_like(present: NDArray[Any], saved: Any, name: str) -> NDArray[Any]:
+    """Restore an array, saved as the entry `name` of a state, with the columns and the shape of the `present` one.
+
+    Where the present array has an axis of length 0, any length is accepted. Raises InputError for another shape.
+    """
+    values, shape = restore_array(saved, name), _as_plain_array(present).shape
+    if values.ndim != len(shape) or any(
+        length not in (saved_length, 0) for saved_length, length in zip(values.shape, shape, strict=True)
+    ):
+        raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
+    # the last axis holds the named columns of a structured array
+    return values.view(present.dtype)[:, 0] if present.dtype.names else values
+
+
+class SavedAttributes:
+    """An object whose attributes `SAVED` are saved as plain values for JSON, and restored to the last bit.
+
+    `SAVED_TYPES`: by name, the types of saved attributes whose first value has another type, such as None.
+    """
+
+    SAVED: ClassVar[tuple[str, ...]] = ()
+    SAVED_TYPES: ClassVar[Mapping[str, Any]] = MappingProxyType({})
+
+    def state(self) -> dict[str, Any]:
+        """Return the attributes to save as plain values for JSON, which `load_state` restores."""
+        return save_attributes(self, self.SAVED)
+
+    def load_state(self, state: Any) -> None:
+        """Restore the attributes that `state` saved; raise InputError if one is missing or does not fit."""
+        restore_attributes(self, self.SAVED, state, self.SAVED_TYPES)

@@ -116,26 +116,6 @@ def test_a_pair_is_renamed_or_its_text_alone(pair, tmp_path):
     assert 'summaries = "press.healthy"' in alone.read_text()
 
 
-def test_a_machine_of_before_version_0_1_is_read_and_written_anew(pair):
-    """Its summaries are a file of `lessons`, which the text that is kept as .bak still finds."""
-    text, summaries = pair
-    rows = text.read_text().replace("summaries = ", "lessons = ").replace(".healthy", ".lessons")
-    lessons = [line.data.replace(b'"summaries":', b'"lessons":') for line in read_lines(summaries)]
-    for line, lesson in zip(read_lines(summaries), lessons, strict=True):
-        rows = rows.replace(f'summary = "{line.checksum}"', f'lesson = "{sha256(lesson).hexdigest()}"')
-    data = b"".join(b"%b %b\n" % (sha256(lesson).hexdigest().encode(), lesson) for lesson in lessons)
-    summaries.with_suffix(".lessons").write_bytes(b"sealscope lessons 1\n" + data)
-    new, _ = ss.read_machine(text), (summaries.unlink(), text.write_text(rows))
-    old = ss.read_machine(text)
-    assert [format_summary(entry) for entry in old.healthy] == [format_summary(entry) for entry in new.healthy]
-    ss.write_machine(old, text)
-    assert "lesson" not in text.read_text()
-    summaries.with_suffix(".lessons").unlink()
-    assert len(ss.read_machine(text).healthy) == 3
-    text.with_suffix(".toml.bak").rename(text)
-    assert len(ss.read_machine(text).healthy) == 3
-
-
 @pytest.mark.parametrize("name", ["../actuator7.healthy", "/etc/passwd", "sub/actuator7.healthy", "passwd"])
 def test_a_text_names_no_summaries_elsewhere(pair, tmp_path, name):
     text, _ = pair

@@ -22,6 +22,8 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.charge_pressure import LowDrifts
+from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
@@ -38,8 +40,6 @@ from sealscope.storage.plain_values import convert_type, parse_json
 
 #: Ending of the file's name, and its first line.
 SUFFIX, _HEAD = ".healthy", b"sealscope healthy summaries 1\n"
-#: The same of files from before version 0.1, which are still read. Their key "lessons" is now "summaries".
-OLD_SUFFIX, _OLD_HEAD = ".lessons", b"sealscope lessons 1\n"
 #: Largest file and longest line [bytes]; most summaries in a file.
 MAX_SIZE, _MAX_LINE, _MAX_SUMMARIES = 50_000_000, 5_000_000, 5000
 #: Most commas, brackets and braces in a line: the first number plus the second times the number of bytes. The limit
@@ -217,6 +217,8 @@ _RMS = table_type(
     levels=_Array,
     duty=_Array,
 )
+#: Numbers in the summary of friction and drifts, and their standard errors.
+_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *LowDrifts._fields)
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
@@ -225,18 +227,7 @@ _SUMMARIES = {
     SIGNALS: (
         table_type(
             "allow",
-            friction_pressure=(_Number, None),
-            friction_error=(_Magnitude, None),
-            friction_beside_loads=(_Number, None),
-            friction_beside_loads_error=(_Magnitude, None),
-            drift_A=(_Number, None),
-            drift_A_error=(_Magnitude, None),
-            drift_B=(_Number, None),
-            drift_B_error=(_Magnitude, None),
-            low_A=(_Number, None),
-            low_A_error=(_Magnitude, None),
-            low_B=(_Number, None),
-            low_B_error=(_Magnitude, None),
+            **{name: (_Magnitude if name.endswith("_error") else _Number, None) for name in _SIGNAL_NUMBERS},
             **{name: (Annotated[_Array, AfterValidator(_check_octaves)], None) for name in PAIRS},
         ),
         None,
@@ -346,10 +337,7 @@ def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
     try:
         if n_marks > max_marks:
             raise ValueError(f"it must hold its numbers in arrays, got {n_marks} values")
-        tree = parse_json(line.data)
-        if isinstance(tree, dict) and "lessons" in tree:  # the key of files from before version 0.1
-            tree["summaries"] = tree.pop("lessons")
-        fields = convert_type(_RECORDING, tree).model_dump(exclude_unset=True)
+        fields = convert_type(_RECORDING, parse_json(line.data)).model_dump(exclude_unset=True)
     except ValueError as error:
         raise InputError(f"the summary of {file} is wrong: {error} ({place})") from None
     return SummarisedRecording(file, **{"start_s": None, **fields})  # an unknown start is not stored
@@ -408,7 +396,7 @@ def _iter_lines(path: Path) -> Iterator[Line]:
             file.seek(0)
             if size > MAX_SIZE:
                 raise InputError(f"{noun} must be at most {MAX_SIZE} bytes, got {size} ({path})")
-            if file.readline(len(_HEAD)) not in (_HEAD, _OLD_HEAD):
+            if file.readline(len(_HEAD)) != _HEAD:
                 raise InputError(f"{noun} must begin with {_HEAD.decode().strip()!r}, got something else ({path})")
             for _ in range(_MAX_SUMMARIES + 1):  # the last pass finds the end, unless there are too many lines
                 row = file.readline(_MAX_LINE)

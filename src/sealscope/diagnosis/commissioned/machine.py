@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Suffixes of files in a folder that are not recordings: Sealscope's own pages and settings, and notes.
 NO_RECORDINGS = frozenset(
-    {".toml", ".healthy", ".lessons", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
+    {".toml", ".healthy", ".html", ".htm", ".pdf", ".png", ".svg", ".md", ".jsonl", ".part", ".bak"}
 )
 #: Beginning of a file with a trend or a verdict, which users may have written into the folder of the recordings.
 _OWN_OUTPUT = re.compile(rb'\s*\{\s*"(verdict|file)":|file,time[, ]')

@@ -29,7 +29,6 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.healthy_file import (
-    OLD_SUFFIX,
     SUFFIX,
     Line,
     format_summary,
@@ -55,8 +54,6 @@ from sealscope.storage.toml_file import parse_toml, read_toml
 _FORMAT = 2
 #: Names in [machine] that are written anew with each change.
 _REWRITTEN = ("sealscope", "written", "summaries")
-#: Present names of keys from before version 0.1.
-_RENAMED = {"lesson": "summary", "lessons": "summaries"}
 #: Summaries that no machine's file refers to are kept as long as all summaries are smaller than this [bytes].
 _SPARE = 5_000_000
 #: Longest wait [s] for another process that writes, and the error after it.
@@ -81,7 +78,7 @@ def parse_moment(text: Any) -> float:
 
 
 #: Name of a file of summaries in the same folder.
-_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.(healthy|lessons)")
+_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.healthy")
 _Moment = Annotated[float, BeforeValidator(parse_moment)]
 
 
@@ -285,26 +282,15 @@ def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[
 
 def _read_checked(path: Path) -> dict[str, Any]:
     """Read the tables of a machine's file and check all but those of the rig; raise InputError if one is not valid."""
-    tree = _read_tree(path, str(path))
+    tree = read_toml(path, "a machine's file", str(path))
     _convert_tree(tree, str(path))
-    return tree
-
-
-def _read_tree(path: Path, place: str) -> dict[str, Any]:
-    """Read the tables of a machine's file, with present names for old keys; raise InputError with the path `place`."""
-    tree = read_toml(path, "a machine's file", place)
-    rows = tree.get("healthy")
-    for table in (tree.get("machine"), *(rows if isinstance(rows, list) else [])):
-        for old_name, name in _RENAMED.items():
-            if isinstance(table, dict) and old_name in table:
-                table[name] = table.pop(old_name)
     return tree
 
 
 def _read_if_valid(path: Path) -> dict[str, Any]:
     """Read the tables of a machine's file without checking them; an empty mapping if it cannot be read."""
     try:
-        return _read_tree(path, str(path))
+        return read_toml(path, "a machine's file", str(path))
     except InputError:
         return {}
 
@@ -323,14 +309,14 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return the path of the file with the healthy recordings' summaries that belongs to a machine's file.
 
     `path` is that of the machine's file, and `tree` holds its tables. The other file has the same name with the suffix
-    `.healthy` or, before version 0.1, `.lessons`. If neither exists, `summaries` of the table `[machine]` names it.
+    `.healthy`. If it does not exist, `summaries` of the table `[machine]` may name it.
     """
-    machine_table = tree.get("machine")
+    machine_table, same_name = tree.get("machine"), path.with_suffix(SUFFIX)
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
-    candidates = [path.with_suffix(SUFFIX), path.with_suffix(OLD_SUFFIX)]
-    if isinstance(name, str) and _FILE_NAME.fullmatch(name) is not None:
-        candidates.append(path.with_name(name))
-    return next((candidate for candidate in candidates if candidate.exists()), candidates[0])
+    if not same_name.exists() and isinstance(name, str) and _FILE_NAME.fullmatch(name):
+        named = path.with_name(name)
+        return named if named.exists() else same_name
+    return same_name
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
@@ -442,7 +428,7 @@ def read_machine(path: str | os.PathLike[str]) -> CommissionedMachine:
     sealscope.errors.InputError: a machine's file must be readable, got: No such file or directory (absent.toml)
     """
     place, target = os.fspath(path), _follow_links(path)
-    tree = _read_tree(target, place)
+    tree = read_toml(target, "a machine's file", place)
     tables = _convert_tree(tree, place)
     machine_table = tables["machine"]
     rig_tables = {name: table for name, table in tree.items() if name not in (*MACHINE_TABLES, "map")}

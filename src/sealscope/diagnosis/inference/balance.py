@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,7 +49,7 @@ from sealscope.recordings.corrections.gaps import flag_holes
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
-from sealscope.storage.plain_state import plain_array, require_part, restore_array
+from sealscope.storage.plain_state import SavedAttributes, plain_array, require_part, restore_array
 from sealscope.units import P_ATM
 
 if TYPE_CHECKING:
@@ -68,11 +68,13 @@ READ = ("u", "theta", "omega", *METERS, "x", "p_1", "p_2", "p_A", "p_B")
 HOLE = "hole"
 #: Name of p_A - p_B as recorded, among the samples of a recording in which pressures are clipped.
 CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
+#: Limit of a rest for a pump or piston that never counts as resting: no speed is below it.
+NEVER = -1.0
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
 
 
-class BlockStream:
+class BlockStream(SavedAttributes):
     """Division of a stream of samples into blocks, each reduced to Gram matrices of the volume balance.
 
     The blocks do not depend on how many samples arrive at a time.
@@ -96,6 +98,13 @@ class BlockStream:
     on_samples : callable, optional
         Called with the start time [s] and the samples of each block before the block is computed.
     """
+
+    SAVED = ("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits", "_weighting")
+    SAVED_TYPES: ClassVar = {
+        "_absolute_offsets": dict[str, float],
+        "left_signs": tuple[float, ...],
+        "_rest_limits": RestLimits,
+    }
 
     def __init__(
         self,
@@ -187,32 +196,16 @@ class BlockStream:
         minus gauge pressures, signs of the flows), and weighted sums over all blocks.
         """
         return {
+            **super().state(),
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
-            "begin": self._begin,
-            "first": self._first,
-            "done": self._n_closed,
-            "zeros": self._absolute_offsets,
-            "signs": list(self.left_signs),
-            "rests": None if self._rest_limits is None else list(self._rest_limits),
-            "weighting": self._weighting.state(),
         }
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore what `state` returned; raise InputError if the values do not fit the balances of this stream."""
+        super().load_state(state)
         samples = require_part(state, "samples", Mapping)
-        self.restart(float(require_part(state, "begin", (float, int))))
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
-        self._first = int(require_part(state, "first", int))
-        self._n_closed = int(require_part(state, "done", int))
         self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
-        absolute_offsets = require_part(state, "zeros", (Mapping, type(None)))
-        if absolute_offsets is not None:
-            absolute_offsets = {name: float(offset) for name, offset in absolute_offsets.items()}
-        self._absolute_offsets = absolute_offsets
-        self.left_signs = tuple(float(sign) for sign in require_part(state, "signs", Sequence))
-        rest_limits = require_part(state, "rests", (Sequence, type(None)))
-        self._rest_limits = None if rest_limits is None else RestLimits(*map(float, rest_limits))
-        self._weighting.load_state(require_part(state, "weighting", Mapping))
 
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
@@ -679,7 +672,7 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 
     If the flow is that of a meter (`q_pump`), it alone decides. Below the fraction `rest.moves` (`priors.toml`) of its
     mean in motion, the valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is
-    then minus infinity: the piston never counts as resting. In a balance with terms of its own at rest
+    then `NEVER`: the piston never counts as resting. In a balance with terms of its own at rest
     (`is_separate_at_rest`) the piston alone decides, with the same fraction of its mean speed, and short stops count.
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
     pump or of the meter.
@@ -687,10 +680,10 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
     signals = Signals(samples, rate)
     if is_separate_at_rest(balance):
         max_speed = max_rest_rate(signals.step("x"), rate, fraction=INFERENCE.rest.moves)
-        return RestLimits(pump=-math.inf, piston=max_speed, shortest=AVERAGING_TIME)
+        return RestLimits(pump=NEVER, piston=max_speed, shortest=AVERAGING_TIME)
     if flow_source(samples) == "q_pump":  # no angle or speed of the pump is recorded
         max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
-        return RestLimits(pump=max_flow, piston=-math.inf)
+        return RestLimits(pump=max_flow, piston=NEVER)
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 

@@ -39,7 +39,7 @@ from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LAG, LEAK, MOVING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import plain_array, require_part, restore_array
+from sealscope.storage.plain_state import SavedAttributes
 
 #: Maximum number of blocks of a fit; if there are more, neighbouring blocks are added up.
 MAX_BLOCKS = 240
@@ -331,12 +331,14 @@ class ColumnRoles:
         return min(INFERENCE.zero.pressure, float(np.mean(blocks.mean_pressure()))) * per_pascal[driver]
 
 
-class Weighting:
+class Weighting(SavedAttributes):
     """Huber's weights of the rows of successive blocks, which limit the effect of outliers.
 
     The weights follow from a fit to the rows and to weighted sums over earlier blocks. These sums are the state of the
     object.
     """
+
+    SAVED = ("_count", "_earlier_sums")
 
     def __init__(self, columns: Sequence[ColumnRoles]) -> None:
         self._columns = columns
@@ -347,21 +349,6 @@ class Weighting:
     def has_blocks(self) -> bool:
         """True if the rows of at least one block have been weighted."""
         return self._count > 0
-
-    def state(self) -> dict[str, Any]:
-        """Return the number of earlier blocks and the weighted sums over their rows, as plain values for JSON."""
-        return {"count": self._count, "known": [plain_array(sums) for sums in self._earlier_sums]}
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the sums over earlier blocks from a saved `state`; raise InputError if its shapes do not fit."""
-        self._count = int(require_part(state, "count", int))
-        restored = [restore_array(sums, "known") for sums in require_part(state, "known", list)]
-        shapes = [sums.shape for sums in self._earlier_sums]
-        if [sums.shape for sums in restored] != shapes:
-            raise InputError(
-                f"saved state's known must have the shapes {shapes}, got {[sums.shape for sums in restored]}"
-            )
-        self._earlier_sums = restored
 
     def compute_gram_matrices(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
         """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.

@@ -39,7 +39,13 @@ from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import require_part, restore_array, restore_attributes, save_attributes
+from sealscope.storage.plain_state import (
+    SavedAttributes,
+    require_part,
+    restore_array,
+    restore_attributes,
+    save_attributes,
+)
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -127,7 +133,7 @@ def _estimate_leak(
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
 
 
-class LiveBalance:
+class LiveBalance(SavedAttributes):
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
     `names` are the channels of the samples; InputError is raised if they allow no balance. The estimates do not depend
@@ -140,6 +146,7 @@ class LiveBalance:
     min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, whatever its law
     block_seconds = BLOCK_SECONDS
     has_begun = True
+    SAVED = ("litres", "_precision", "_moving", "_waiting", "_rate", "_signals")
 
     def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
         """Set up the balance; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
@@ -190,7 +197,7 @@ class LiveBalance:
                 self._rate = run.rate
                 new_stream = self._make_stream()
                 if stream is not None:  # keep offsets, signs and weights of the equations, drop samples at the old rate
-                    new_stream.load_state({**stream.state(), "samples": {}, "first": 0, "done": 0})
+                    new_stream.load_state(stream.state())
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
         yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
@@ -339,7 +346,7 @@ class LiveBalance:
     def state(self) -> dict[str, Any]:
         """Return the learned coefficients and stored blocks as plain values for JSON, which `load_state` restores."""
         return {
-            **save_attributes(self, _SAVED),
+            **super().state(),
             "known": [save_attributes(model, _MODEL) for model in self._models],
             "stored": None if self._stored is None else save_attributes(self._stored, _BLOCK),
             "stream": None if self._stream is None else self._stream.state(),
@@ -347,7 +354,7 @@ class LiveBalance:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore, to the last bit, the values that `state` saved; raise InputError for another rig or channels."""
-        restore_attributes(self, _SAVED, state)
+        super().load_state(state)
         saved_models = require_part(state, "known", list)
         if len(saved_models) != len(self._models):
             raise InputError(f"saved state's known must have {len(self._models)} equations, got {len(saved_models)}")
@@ -362,7 +369,6 @@ class LiveBalance:
             self._stream.load_state(stream)
 
 
-_SAVED = ("litres", "_precision", "_moving", "_waiting", "_rate", "_signals")
 _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__dataclass_fields__)
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.storage.plain_state import restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -64,8 +64,11 @@ class SampleRun(NamedTuple):
 
 
 @dataclass
-class SampleJoiner:
+class SampleJoiner(SavedAttributes):
     """Divide the samples of an actuator into runs without a gap."""
+
+    SAVED: ClassVar = ("is_final", "names", "rate", "newest", "changed", "counters")
+    SAVED_TYPES: ClassVar = {"names": tuple[str, ...], "counters": dict[str, int]}
 
     ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
     late_s: float = 60.0  # greatest age of a late or repeated sample [s]; an older one means a clock set back
@@ -145,18 +148,11 @@ class SampleJoiner:
                 self.count("late or repeated samples", n_samples)
                 indices = indices[n_samples:]
 
-    def state(self) -> dict[str, Any]:
-        """Return channels, newest time, counters and flags as plain values for JSON, which `load_state` restores."""
-        return save_attributes(self, _SAVED)
-
     def load_state(self, state: Any) -> None:
         """Restore the values saved by `state`; raise InputError if the channels are not one of the sets `ways`."""
-        restore_attributes(self, _SAVED, state, {"names": tuple[str, ...], "counters": dict[str, int]})
+        super().load_state(state)
         if self.names not in ((), *self.ways):
             raise InputError(f"saved state's names must be {format_ways(self.ways)}, got {', '.join(self.names)}")
-
-
-_SAVED = ("is_final", "names", "rate", "newest", "changed", "counters")
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:

@@ -10,25 +10,25 @@ from __future__ import annotations
 
 import math
 from functools import lru_cache
-from typing import Any
 
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.live.rise import STEP
 from sealscope.diagnosis.live.signals import WINDOW
 from sealscope.diagnosis.priors.live import LIVE
-from sealscope.storage.plain_state import restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes
 
 _MIN_WINDOWS: int = LIVE.step.windows
 _LOG_WINDOW = math.log(WINDOW)
-_SAVED = ("_count", "_surprisal", "_highest", "_blocks")
 
 
-class StepNull:
+class StepNull(SavedAttributes):
     """Largest evidence of a step in each window of a healthy machine, and the threshold of the alarm that follows.
 
     In a window, P(max M > A) <= `WINDOW` / A if the random walk is right, so that the surprisal of a window is
     u = log max M - log `WINDOW`, or 0 if that is negative.
     """
+
+    SAVED = ("_count", "_surprisal", "_highest", "_blocks")
 
     def __init__(self) -> None:
         self._count, self._surprisal = 0, 0.0  # number of windows, and sum of their surprisals
@@ -58,14 +58,6 @@ class StepNull:
         fewer windows.
         """
         return _find_threshold(self._count, self._surprisal, probability)
-
-    def state(self) -> dict[str, Any]:
-        """Return the sums over windows as plain values for JSON, which `load_state` restores."""
-        return save_attributes(self, _SAVED)
-
-    def load_state(self, state: Any) -> None:
-        """Restore the sums that `state` returned; raise InputError if they are not valid."""
-        restore_attributes(self, _SAVED, state)
 
 
 @lru_cache(maxsize=1024)

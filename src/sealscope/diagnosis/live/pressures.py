@@ -30,7 +30,7 @@ from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
 from sealscope.recordings.motion import describe_hold, find_holds, is_moving
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.storage.plain_state import require_part, restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes, require_part, restore_attributes, save_attributes
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -55,7 +55,7 @@ _SCORES = slice(_GRAM.stop, None)
 _MAX_SD: float = PRESSURE.response["G"][1]
 
 
-class PressureEstimator:
+class PressureEstimator(SavedAttributes):
     """Estimate changes of the leakage conductance from the response of the pressures to the command, block by block."""
 
     method = "pressures"  # name of the way of watching
@@ -68,6 +68,7 @@ class PressureEstimator:
     min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
+    SAVED = ("litres", "_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
 
     def __init__(self, rig: Rig, litres: bool | None = None) -> None:
         """Set up the estimator; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
@@ -246,7 +247,7 @@ class PressureEstimator:
 
     def state(self) -> dict[str, Any]:
         """Return the fit and the stored blocks as plain values for JSON, for `load_state`; the rig is not saved."""
-        state = save_attributes(self, _SAVED)
+        state = super().state()
         if (follower := self._follower) is None:
             return state | {"follower": None}
         machine = {"rate": follower.machine.rate, "law": follower.machine.law, "sense": follower.sense}
@@ -254,7 +255,7 @@ class PressureEstimator:
 
     def load_state(self, state: Mapping[str, Any]) -> None:
         """Restore, to the last bit, the values that `state` saved; raise InputError if one is missing or not valid."""
-        restore_attributes(self, _SAVED, state)
+        super().load_state(state)
         if (saved := require_part(state, "follower", (Mapping, type(None)))) is None:
             return
         rate, sense = (float(require_part(saved, name, (float, int))) for name in ("rate", "sense"))
@@ -266,7 +267,6 @@ class PressureEstimator:
         restore_attributes(self._follower, _FOLLOWER_ATTRIBUTES, saved)
 
 
-_SAVED = ("litres", "_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
 _FOLLOWER_ATTRIBUTES = ("theta", "covariance", "states", "variance", "last")
 
 

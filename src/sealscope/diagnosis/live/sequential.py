@@ -36,7 +36,7 @@ from sealscope.diagnosis.live.rise import STEP, LiveRise
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes
 
 _PRIORS = LIVE.step
 #: q of the module's docstring: variances of the walk in a block, over that of the first block's estimate; shape (q, 1).
@@ -63,11 +63,9 @@ _FOLLOWED, _A, _B, _T, _LOG_PRIOR = range(5)
 _N_ROWS = _LOG_PRIOR + 1
 #: Columns of the onsets: n of the innovations in T, number of the block, time, and begin of the block [s].
 _N, _BLOCK, _TIME, _BLOCK_BEGIN = range(4)
-_SAVED = tuple(f"_{name}" for name in ("level", "level_variance", "squares", "log_weights", "log_variances", "sums",
-                                       "onsets", "unit", "count", "blocks", "end"))  # fmt: skip
 
 
-class StepDetector:
+class StepDetector(SavedAttributes):
     """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
     The module's docstring gives the formulas, whose symbols are used here. Attributes, of which arrays have a row for
@@ -83,6 +81,11 @@ class StepDetector:
     - `_blocks`: number of blocks,
     - `_end`: end of the last block [s], minus infinity after `forget`.
     """
+
+    SAVED = (
+        *("_level", "_level_variance", "_squares", "_log_weights", "_log_variances", "_sums", "_onsets"),
+        *("_unit", "_count", "_blocks", "_end"),
+    )
 
     def __init__(self) -> None:
         self._unit, self._count, self._blocks = 0.0, 0.0, 0
@@ -288,13 +291,9 @@ class StepDetector:
         walk = 3  # index of this walk, 0.1, in `WALKS`
         return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
-    def state(self) -> dict[str, Any]:
-        """Return the evidence of the detector as plain values for JSON, which `load_state` restores."""
-        return save_attributes(self, _SAVED)
-
     def load_state(self, state: Any) -> None:
         """Restore the evidence from a result of the method `state`; raise InputError if it does not fit the onsets."""
-        restore_attributes(self, _SAVED, state)
+        super().load_state(state)
         if self._sums.shape[2] != len(self._onsets):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
 

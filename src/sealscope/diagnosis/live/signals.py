@@ -7,7 +7,6 @@ the same as for the blocks of a recording (`inference.changes`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -38,7 +37,7 @@ from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.recordings.recording import Array
-from sealscope.storage.plain_state import restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes
 
 #: Number of blocks in the window.
 WINDOW: int = LIVE.explanation.window
@@ -56,8 +55,10 @@ _GRAM = slice(_FEATURES.stop, None)
 _GROUP_SIZES = (1, 2, 4)
 
 
-class SignalWindow:
+class SignalWindow(SavedAttributes):
     """Features (duty, noise, mains hum, mean pressures) of the last blocks of a machine, and tests for changes."""
+
+    SAVED = ("_rows", "_means")
 
     def __init__(self) -> None:
         self._rows = np.empty((0, 0))  # features of the last blocks, one block in a row
@@ -127,14 +128,6 @@ class SignalWindow:
             if values is not None:  # None if a group moves in one direction only
                 return pattern_tests(time[-n_groups * size :].reshape(n_groups, size).mean(axis=1), values)
         return ()
-
-    def state(self) -> dict[str, Any]:
-        """Return the features of the last blocks as plain values for JSON, which `load_state` restores."""
-        return save_attributes(self, ("_rows", "_means"))
-
-    def load_state(self, state: Any) -> None:
-        """Restore the features that `state` returned; raise InputError if they are not valid."""
-        restore_attributes(self, ("_rows", "_means"), state)
 
 
 def append_row(rows: Array, row: Array) -> Array:

@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Version of the format of the saved state.
-STATE_VERSION = 17
+STATE_VERSION = 18
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])

@@ -18,7 +18,7 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import read_by_map
 from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.errors import SealscopeError
+from sealscope.errors import SealscopeError, escape_text
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import (
     UNREADABLE_FILE,
@@ -163,9 +163,9 @@ class WatchedFolder:
         try:
             return read_by_map(path, self._channel_map, self._rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
-            return None, _printable(str(error)) or type(error).__name__
+            return None, escape_text(str(error)) or type(error).__name__
         except Exception as error:
-            return None, f"{_printable(path.name)}: {describe_error(error)}"
+            return None, f"{escape_text(path.name)}: {describe_error(error)}"
 
     def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
@@ -178,12 +178,12 @@ class WatchedFolder:
         path, now = file.path, time.time()
         start = file_seconds(samples, path)
         if max(start, file.modified_s) > now + _AHEAD_S:
-            _log.warning("%s: %s is dated in the future", self.actuator, _printable(path.name))
+            _log.warning("%s: %s is dated in the future", self.actuator, escape_text(path.name))
         if start >= self._newest_s or self._newest_s > now + _AHEAD_S or _is_midnight_before(start, self._newest_s):
             return ""
         # [:19]: without the time zone
         dates = (datetime.fromtimestamp(t, UTC).isoformat(" ", "seconds")[:19] for t in (start, self._newest_s))
-        return "{} must not be older than the recordings before, got {} after {}".format(_printable(path.name), *dates)
+        return "{} must not be older than the recordings before, got {} after {}".format(escape_text(path.name), *dates)
 
     def _judge_block(self, block: SourceBlock, recording: Recording, path: Path) -> SourceBlock:
         """Add a recording's samples to a block, and the verdict on the recording if its machine is commissioned.
@@ -202,7 +202,7 @@ class WatchedFolder:
         try:
             machine = load_watched(self._rig).machine  # read anew, as the file may have changed
         except (SealscopeError, OSError) as error:
-            raise PartAway(_printable(str(error))) from None
+            raise PartAway(escape_text(str(error))) from None
         if _is_midnight_before(start, self._newest_s):
             start = max(start, self._end_s + _GAP_S)
         finite_t = recording.t[np.isfinite(recording.t)]
@@ -211,10 +211,10 @@ class WatchedFolder:
         verdict = None
         if machine is not None:
             try:
-                verdict = judge_recording(machine, recording, _printable(path.name), shift, limit_lpm=self._limit_lpm)
+                verdict = judge_recording(machine, recording, escape_text(path.name), shift, limit_lpm=self._limit_lpm)
             except Exception as error:
                 reason = describe_error(error)
-                _log.warning("%s: %s is not judged as a whole: %s", self.actuator, _printable(path.name), reason)
+                _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
         channels, units = dict(corrected_samples.channels), dict(corrected_samples.units)
         if "T_oil" not in channels and (celsius := oil_temperature(corrected_samples)) is not None:
@@ -237,14 +237,14 @@ class WatchedFolder:
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):
                     if path.name not in self._outside_links:  # logged once: files outside the folder are not read
-                        _log.warning("%s: %s is a link out of the folder", self.actuator, _printable(path.name))
+                        _log.warning("%s: %s is a link out of the folder", self.actuator, escape_text(path.name))
                     self._outside_links.add(path.name)
                     continue
                 status = path.stat()
             except (OSError, RuntimeError):  # deleted meanwhile, or a loop of links
                 continue
             if S_ISREG(status.st_mode):
-                identity = f"{_printable(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
+                identity = f"{escape_text(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
                 yield _FoundFile(status.st_mtime, path, identity)
 
 
@@ -276,11 +276,6 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
         if once and (all(succeeded) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
-
-
-def _printable(name: str) -> str:
-    """Escape the unprintable characters of a name, for logs and the database."""
-    return "".join(letter if letter.isprintable() else letter.encode("unicode_escape").decode() for letter in name)
 
 
 def _is_midnight_before(start: float, t: float) -> bool:

@@ -6,27 +6,25 @@ seconds. So the monitor also judges the last minutes of a commissioned machine's
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from hashlib import blake2b
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.monitor.sources.source_block import count_bytes
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import restore_attributes, save_attributes
+from sealscope.storage.plain_state import SavedAttributes
 
 _PRIORS = LIVE.recording
 _MIN_DURATION_S, _ = _PRIORS.lengths
 #: Largest recording [bytes]: 180 s of eight channels at 2.5 kHz.
 _MAX_BYTES = 32_000_000
-_SAVED = ("first", "follows")
 
 
 @dataclass
-class StreamRecorder:
+class StreamRecorder(SavedAttributes):
     """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s`.
 
     A recording also ends at `_MAX_BYTES`, and before a gap, a clock set back, or a change of channels, units or rate.
@@ -42,6 +40,7 @@ class StreamRecorder:
         True if the collected blocks follow a recording that ended at its full length or at `_MAX_BYTES`.
     """
 
+    SAVED: ClassVar = ("first", "follows")  # the blocks are stored elsewhere
     actuator: str
     duration_s: float
     first: int = 0
@@ -97,14 +96,6 @@ class StreamRecorder:
     def clear(self) -> None:
         """Forget the collected blocks, as after a repair."""
         self.first, self.follows, self.blocks = 0, False, []
-
-    def state(self) -> dict[str, Any]:
-        """Convert the attributes `first` and `follows` to plain values; the blocks are stored elsewhere."""
-        return save_attributes(self, _SAVED)
-
-    def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the attributes `first` and `follows` from the plain values that the method `state` made."""
-        restore_attributes(self, _SAVED, state)
 
     def refill(self, number: int, samples: Recording) -> None:
         """Collect the stored block with the running `number` again, if it belongs to the present recording."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.formats.timebase import interpolate_samples
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 
@@ -101,23 +102,7 @@ def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording
     channels = {}
     for name, values in recording.channels.items():
         known = np.isfinite(values[rows])
-        channels[name] = _interpolate(even_times, t[known], values[rows][known], is_slow=name in SLOW)
+        max_interval = np.inf if name in SLOW else MAX_INTERVAL
+        channels[name] = interpolate_samples(even_times, t[known], values[rows][known], max_interval)
     note = f"uneven sampling brought to {recording.rate:g} Hz by straight lines"
     return replace(recording, t=even_times, channels=channels, history=(*recording.history, note))
-
-
-def _interpolate(even_times: Array, t: Array, values: Array, *, is_slow: bool) -> Array:
-    """Interpolate samples (n,) at times `t` (n,) linearly to the times `even_times` (m,), with NaN beyond the ends.
-
-    Unless the channel `is_slow`, times within intervals over `MAX_INTERVAL` times the median interval get NaN, too.
-    With fewer than two samples, all values are NaN.
-    """
-    if t.size < 2:
-        return np.full(even_times.size, np.nan)
-    result = np.interp(even_times, t, values, left=np.nan, right=np.nan)
-    if not is_slow:
-        steps = np.diff(t)
-        next_sample = np.clip(np.searchsorted(t, even_times), 1, t.size - 1)
-        is_long = steps > MAX_INTERVAL * float(np.median(steps))
-        result[is_long[next_sample - 1] & (even_times > t[next_sample - 1]) & (even_times < t[next_sample])] = np.nan
-    return result

@@ -55,6 +55,8 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
     samples. If the probability of as many errors as spikes, or more, is below `spike.tail`, the signal itself leaps,
     and the result is empty. It is also empty for fewer than 50 finite samples.
     """
+    from scipy.special import pdtrc
+
     known = np.flatnonzero(np.isfinite(values))
     if known.size < _MIN_SAMPLES:
         return np.empty(0, dtype=np.intp)
@@ -73,13 +75,6 @@ def find_spikes(values: Array) -> NDArray[np.intp]:
         nearby_jumps = np.r_[jumps[max(k - _NEIGHBOURS, 0) : k], jumps[k + 1 : k + 1 + _NEIGHBOURS]]
         if jumps[k] > _PRIORS.times * max(slopes[k], nearby_jumps.max(initial=0.0)):
             rows.append(known[k + 1])
-    # more leaps than the errors of a logger explain
-    is_signal = _probability_of_at_least(len(rows), _PRIORS.share * known.size) < _PRIORS.tail
+    # more leaps than the errors of a logger explain; pdtrc: Poisson probability of more events than its first argument
+    is_signal = bool(rows) and pdtrc(len(rows) - 1, _PRIORS.share * known.size) < _PRIORS.tail
     return np.array([] if is_signal else rows, dtype=np.intp)
-
-
-def _probability_of_at_least(count: int, mean: float) -> float:
-    """Compute the probability of `count` or more events if their number has a Poisson distribution with this `mean`."""
-    from scipy.special import pdtrc
-
-    return float(pdtrc(count - 1, mean)) if count > 0 else 1.0  # probability of more than count - 1

@@ -53,14 +53,6 @@ class Request:
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
 
-    @property
-    def infers_rate(self) -> bool:
-        """True if the sampling rate must be computed from the times, even if a file that Sealscope wrote states it.
-
-        A map may choose another time column; in a data frame, i.e. without a `file`, rows may have been removed.
-        """
-        return bool(self.map) or not self.file
-
 
 @dataclass
 class ColumnMap:

@@ -32,6 +32,7 @@ from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.formats.timebase import (
     TimeState,
+    interpolate_samples,
     is_falling,
     iso_moment,
     nominal_rate,
@@ -217,7 +218,8 @@ def convert_columns(
     if label is None:
         assert choice.rate is not None
         t, rate = np.arange(count) / choice.rate, choice.rate
-    elif description is not None and not request.infers_rate:
+    elif description is not None and request.file and not request.map:
+        # a map may choose another time column; in a data frame, i.e. without a file, rows may have been removed
         t, rate = time, description["rate"]
     else:
         t, rate, start, time_notes = time_base(time, label.unit, label.whole, choice.rate, state)
@@ -453,12 +455,8 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
     if rate > base_rate:
         note = f"at {rate:g} Hz: averaged over each interval of {base_rate:g} Hz"
         return _average(values, times, t, 1.0 / base_rate), note
-    result = np.interp(t, times, values, left=np.nan, right=np.nan)
-    next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
-    interval = times[next_sample] - times[next_sample - 1]
-    is_long = interval > _MAX_INTERVAL * float(np.median(np.diff(times)))
-    result[is_long & (times[next_sample] != t)] = np.nan
-    return result, f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
+    note = f"at {rate:g} Hz: interpolated linearly to {base_rate:g} Hz"
+    return interpolate_samples(t, times, values, _MAX_INTERVAL), note
 
 
 def _average(values: Array, times: Array, t: Array, step: float) -> Array:

@@ -280,6 +280,21 @@ def nominal_rate(t: Array) -> float:
     return _shortest_decimal(1.0 / float(np.median(steps)), _MIN_SLACK)
 
 
+def interpolate_samples(t: Array, times: Array, values: Array, max_interval: float) -> Array:
+    """Interpolate `values` (m,) at increasing `times` (m,) [s] linearly to the times `t` (n,) [s].
+
+    The result is NaN beyond the ends, within intervals over `max_interval` times the median interval, and throughout
+    for fewer than two samples.
+    """
+    if times.size < 2:
+        return np.full(t.size, np.nan)
+    result, intervals = np.interp(t, times, values, left=np.nan, right=np.nan), np.diff(times)
+    next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
+    is_long = intervals > max_interval * float(np.median(intervals))
+    result[is_long[next_sample - 1] & (t > times[next_sample - 1]) & (t < times[next_sample])] = np.nan
+    return result
+
+
 def _shortest_decimal(value: float, slack: float) -> float:
     """Find the decimal number with the fewest digits that differs from `value` by at most the fraction `slack`."""
     decimals = (float(f"{value:.{digits}g}") for digits in range(1, 16))
