@@ -25,14 +25,15 @@ from sealscope.simulation.simulate import simulate_experiment
 
 PLANS = ("bench-detectors", "bench-closed-loop-development", "bench-single-rod-development", "bench-valve")
 VIEWS: dict[str, tuple[str, ...] | None] = {"all": None, "command": ("u", "p_A", "p_B")}
-LEAKS = ("piston leak", "piston or pump leak", "internal or external leak")
+OUTSIDE = ("piston or external leak", "piston, pump or external leak")
+LEAKS = ("piston leak", "piston or pump leak", *OUTSIDE)
 #: Fault -> causes that name it. The empty fault is a healthy machine.
 FAULTS: dict[str, tuple[str | None, ...]] = {
     "": (None,),
     "leak": LEAKS,
-    "pump leak x3": ("pump leak", "piston or pump leak", "internal or external leak"),
-    "rod seal A 0.01 L/min": ("external leak", "internal or external leak"),
-    "rod seal B 0.01 L/min": ("external leak", "internal or external leak"),
+    "pump leak x3": ("pump leak", "piston or pump leak", "piston, pump or external leak"),
+    "rod seal A 0.01 L/min": ("external leak", *OUTSIDE),
+    "rod seal B 0.01 L/min": ("external leak", *OUTSIDE),
     "friction +20 %": ("friction change",),
     "air 1 %": ("air in the oil",),
     "sensor p_A offset 5 psi": ("sensor fault",),

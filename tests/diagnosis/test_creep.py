@@ -66,7 +66,7 @@ def flow_lpm(recording: Recording, conductance: float) -> float:
 def test_a_worn_piston_shows_in_the_creep_of_the_held_load(boom: CommissionedMachine) -> None:
     recording = record_boom(20, WORN)
     diagnosis = boom.diagnose(recording)
-    assert (diagnosis.verdict, diagnosis.cause) == ("leak", "internal or external leak")
+    assert (diagnosis.verdict, diagnosis.cause) == ("leak", "piston or external leak")
     assert diagnosis.leak_interval_lpm is not None
     low, high = diagnosis.leak_interval_lpm
     assert low < flow_lpm(recording, WORN) < high < 1.5 * flow_lpm(recording, WORN)

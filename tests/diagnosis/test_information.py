@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, information, solve
+from sealscope.diagnosis.inference.equations.terms import LEAK, Equation, Term
 from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, block_gram_matrices
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows
-from sealscope.diagnosis.inference.terms import LEAK, Equation, Term
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 FIELDS = tuple(Blocks.__dataclass_fields__)

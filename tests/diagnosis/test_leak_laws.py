@@ -7,10 +7,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.inference.equations.terms import ORIFICE
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.onset import Information, step_test
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
-from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment

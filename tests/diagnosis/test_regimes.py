@@ -10,7 +10,8 @@ import pytest
 
 from sealscope.diagnosis.inference.balance import max_rest_rate, recorded_blocks
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.terms import AVERAGING_TIME, TURNING, find_rests
+from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, find_rests
+from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.detector import _healthy_sign_log_odds as healthy_sign_log_odds

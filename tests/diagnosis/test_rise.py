@@ -15,7 +15,7 @@ from sealscope.diagnosis.inference.comparison.levels import rise
 from sealscope.diagnosis.inference.comparison.population import Population
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
-from sealscope.diagnosis.inference.terms import LAG, LEAK, Equation, Term
+from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
 

@@ -13,8 +13,8 @@ from sealscope.control.drive import Drive
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.balance import BlockStream, derive_drive_signals, recorded_blocks
 from sealscope.diagnosis.inference.blocks import estimate_offset, information
+from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.onset import StepTest, step_test
-from sealscope.diagnosis.inference.terms import equations
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS

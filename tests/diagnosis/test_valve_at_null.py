@@ -12,7 +12,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.inference.balance import BlockStream, bridged_samples
-from sealscope.diagnosis.inference.terms import equations, is_separate_at_rest
+from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig, load_rig

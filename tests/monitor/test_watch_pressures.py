@@ -63,7 +63,7 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     low_lpm, high_lpm = estimates[-1].leak_interval_lpm
     assert low_lpm <= LEAK <= high_lpm
     assert estimates[-1].leak_lpm == pytest.approx(LEAK, rel=0.3)
-    assert watch.leak.cause == "internal or external leak"
+    assert watch.leak.cause == "piston, pump or external leak"
     healthy = [estimate for estimate in estimates if estimate.status == "watched" and estimate.t < OPENS]
     assert len(healthy) > 20
     assert all(estimate.leak_interval_lpm[0] == 0.0 for estimate in healthy)

@@ -152,5 +152,5 @@ def test_the_repair_limit_counts_from_the_healthy_level(make_diagnosis):
 
 
 def test_where_the_sum_alone_is_known_the_outside_is_looked_at_first(make_diagnosis):
-    action = make_diagnosis(cause="internal or external leak", machine=MACHINE, quality=()).next_check
+    action = make_diagnosis(cause="piston, pump or external leak", machine=MACHINE, quality=()).next_check
     assert action.index("outside") < action.index("piston seal") < action.index("pump's case drain")

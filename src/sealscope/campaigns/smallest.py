@@ -20,7 +20,7 @@ import numpy as np
 
 from sealscope.campaigns.held import PlannedHold, has_shut_off, plan_hold
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
-from sealscope.diagnosis.inference.terms import PUMP
+from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.machine import healthy_leakage

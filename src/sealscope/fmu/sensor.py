@@ -34,10 +34,10 @@ from numba import carray
 
 from sealscope.compiled import large_law, law, record_dtype, record_view
 from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, MIN_ABSOLUTE_PRESSURE
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, WITHIN_95
 from sealscope.diagnosis.inference.rows.row_weights import SUPPORT, Workspace, median, weigh_rows, workspace_shapes
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING, SPAN, STRIDE, stride_samples, test_function
-from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, MIN_ABSOLUTE_PRESSURE
 from sealscope.diagnosis.live.balance import (
     BLOCK_SECONDS,
     LEARNED,

@@ -13,9 +13,10 @@ class HydraulicCircuit(NamedTuple):
 
     Other modules read the properties below instead of comparing circuits. `valve_controlled` chooses the laws of
     `physics/rig.py` and `physics/standstill.py`, the longest step of `physics/solvers/limits.py` (as `valved`), and the
-    drawing of `reporting/schematic.py`; `pump_feeds_chambers` the volume balance (`diagnosis/inference/terms.py`:
-    `equations`) and the controller's model of the drive (`control/drive.py`: `drive_of`). A circuit that is only
-    diagnosed needs no more than an entry in `CIRCUITS`, and its `value` among those of the parameter.
+    drawing of `reporting/schematic.py`; `pump_feeds_chambers` the volume balance (`equations` of
+    `diagnosis/inference/equations/balances.py`) and the controller's model of the drive (`control/drive.py`:
+    `drive_of`). A circuit that is only diagnosed needs no more than an entry in `CIRCUITS`, and its `value` among those
+    of the parameter.
 
     Attributes
     ----------

@@ -198,7 +198,8 @@ NAMES = {
     "inference/balance.py",
     "inference/blocks.py",
     "inference/comparison/coefficients.py",
-    "inference/terms.py",
+    "inference/equations/balances.py",
+    "inference/equations/terms.py",
     "live/explanation.py",
     "live/watch.py",
 }
@@ -245,7 +246,7 @@ def test_scores_are_finite_for_any_chance() -> None:
 
 @pytest.mark.parametrize(
     ("likelihood_ratio", "cause"),
-    [(1.0, "internal or external leak"), (1e-3, "piston or pump leak")],
+    [(1.0, "piston, pump or external leak"), (1e-3, "piston or pump leak")],
 )
 def test_the_outside_is_named_unless_the_data_exclude_it(likelihood_ratio: float, cause: str) -> None:
     """Rivals that describe the residual as well as the leak, and a thousand times worse."""
@@ -260,8 +261,8 @@ def test_the_outside_is_named_unless_the_data_exclude_it(likelihood_ratio: float
     ("ratio", "verdict", "cause"),
     [
         (0.1, "leak", "piston or pump leak"),
-        (3.0, "leak", "internal or external leak"),
-        (30.0, "leak", "internal or external leak"),
+        (3.0, "leak", "piston, pump or external leak"),
+        (30.0, "leak", "piston, pump or external leak"),
         (1e3, "no leak", "external leak"),
     ],
 )

@@ -23,8 +23,9 @@ from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTIO
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
+from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
+from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
-from sealscope.diagnosis.inference.terms import AIR, BIAS, TURNING, circulation, equations, locked
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.rms_change.blocks import JUDGED

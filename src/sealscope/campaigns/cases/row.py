@@ -23,7 +23,8 @@ STROKE = "stroke"
 #: Names of ambiguous causes, for detectors whose channels cannot distinguish several causes, with these causes.
 _AMBIGUOUS_CAUSES = {
     "piston or pump leak": (PISTON_LEAK, "pump leak"),
-    "internal or external leak": (PISTON_LEAK, "pump leak", "external leak"),
+    "piston or external leak": (PISTON_LEAK, "external leak"),
+    "piston, pump or external leak": (PISTON_LEAK, "pump leak", "external leak"),
     **joint_causes(),
 }
 #: By detector, the pair of its score, None for `cannot tell`, and the onset [s] that it estimates, None for no onset.

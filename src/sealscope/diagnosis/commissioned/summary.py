@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.terms import equations
+from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED

@@ -12,7 +12,8 @@ from sealscope.diagnosis.commissioned.machine_file import read_machine
 from sealscope.diagnosis.commissioned.summary import fit_columns
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.terms import PUMP, equations
+from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE

@@ -23,7 +23,7 @@ bound and the most probable other explanation. No other module states a verdict,
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -48,6 +48,12 @@ from sealscope.diagnosis.verdict.evidence import (
     Evidence,
     Verdict,
 )
+
+#: Cause of a leak -> the cause that also names the outside.
+_WITH_OUTSIDE: Mapping[Cause, Cause] = {
+    "piston leak": "piston or external leak",
+    "piston or pump leak": "piston, pump or external leak",
+}
 
 
 def decide(
@@ -132,15 +138,16 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a leak that the test `alarm` detected, such as "piston or pump leak".
 
-    It is "internal or external leak" if this test does not exclude that oil leaves the circuit, or if the data alone
-    cannot tell (`Case.resembles_external`), else the detector's cause. A "piston or pump leak" becomes a "piston leak"
-    if a separate test makes a pump leak improbable.
+    The detector's cause names the parts that its data cannot tell apart. The pump is not named if a separate test makes
+    a pump leak improbable. The outside is named, too, if this test does not exclude that oil leaves the circuit, or if
+    the data alone cannot tell (`Case.resembles_external`).
     """
-    if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure or case.resembles_external(alarm):
-        return "internal or external leak"
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST
-    return "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
+    cause: Cause = "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
+    if case.external_probability(alarm) > 1.0 - DECISION.explanation.sure or case.resembles_external(alarm):
+        return _WITH_OUTSIDE.get(cause, cause)
+    return cause
 
 
 def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:

@@ -13,6 +13,17 @@ from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
+from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest, shut_at_rest, with_rests
+from sealscope.diagnosis.inference.equations.signals import (
+    AVERAGING_TIME,
+    HALF_DIFFERENCE,
+    MIN_ABSOLUTE_PRESSURE,
+    MIN_REST,
+    RestLimits,
+    Signals,
+    find_rests,
+)
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
@@ -25,23 +36,6 @@ from sealscope.diagnosis.inference.rows.weak_form import (
     strides_in,
     weak_form_rows,
     weights_near_holes,
-)
-from sealscope.diagnosis.inference.terms import (
-    AVERAGING_TIME,
-    CYLINDER,
-    HALF_DIFFERENCE,
-    MIN_ABSOLUTE_PRESSURE,
-    MIN_REST,
-    MOVING_BIAS,
-    START,
-    Equation,
-    RestLimits,
-    Signals,
-    equations,
-    find_rests,
-    is_separate_at_rest,
-    shut_at_rest,
-    with_rests,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import METERS, flow_source
@@ -82,7 +76,7 @@ class BlockStream(SavedAttributes):
     Parameters
     ----------
     balances : sequence of Equation
-        Balances of the machine (`terms.equations`).
+        Balances of the machine (`balances.equations`).
     rate : float
         Sampling rate [Hz].
     block_s : float

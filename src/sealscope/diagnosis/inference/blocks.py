@@ -26,6 +26,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
@@ -35,7 +36,6 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     block_gram_matrices,
 )
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
-from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
@@ -218,7 +218,7 @@ class ColumnRoles:
         self.left = len(self.names)
         self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
         self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
-        # true for a balance that `terms.shut_at_rest` made
+        # true for a balance that `balances.shut_at_rest` made
         is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
         self.hold_leak = self.names.index(HOLDING) if is_shut else None
         self.leak = self.names.index(LEAK)

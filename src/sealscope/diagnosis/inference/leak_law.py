@@ -22,6 +22,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
+from sealscope.diagnosis.inference.equations.terms import ORIFICE
 from sealscope.diagnosis.inference.onset import (
     Estimate,
     Information,
@@ -31,7 +32,6 @@ from sealscope.diagnosis.inference.onset import (
     step_sizes,
     step_test,
 )
-from sealscope.diagnosis.inference.terms import ORIFICE
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

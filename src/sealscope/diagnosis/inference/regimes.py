@@ -29,7 +29,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
-from sealscope.diagnosis.inference.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
+from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -42,11 +42,11 @@ MIN_STATE_BLOCKS = 2
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `terms.with_rests` adds.
+    `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `balances.with_rests` adds.
 
     - Open valves: the columns `STATES` are dropped from the Gram matrices.
     - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
-      (`BIAS`), as in `terms.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
+      (`BIAS`), as in `balances.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
       load, remains if some hold lasts for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set
       to zero. If all holds are short and the pump is off at other times, the machine is a press whose pump builds up
       the pressure through open valves. If its valves are certainly shut at rest (`is_certain`), its holds count as
@@ -87,7 +87,7 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
     """Return True if pump or piston rest under pressure at times.
 
-    The columns (`roles`) must include those of `terms.with_rests`.
+    The columns (`roles`) must include those of `balances.with_rests`.
     """
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
@@ -105,7 +105,7 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while the pump rests (`rest_log_odds`).
 
-    `roles`: roles of the columns of `blocks`, among them those of `terms.with_rests`. All coefficients are estimated
+    `roles`: roles of the columns of `blocks`, among them those of `balances.with_rests`. All coefficients are estimated
     from blocks with motion; then leakage and flow offset at rest are estimated from the other blocks, given all other
     coefficients. A single regression could make both leakage and compliance zero at rest, since the rate at which the
     pressures relax shows only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the

@@ -17,10 +17,11 @@ from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
+from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.terms import PUMP, Equation
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.rows.weak_form import stride_samples
-from sealscope.diagnosis.inference.terms import PUMP, Equation, equations
 from sealscope.diagnosis.live.coefficients import (
     STANDSTILL,
     TINY,

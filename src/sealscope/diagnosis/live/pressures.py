@@ -61,7 +61,7 @@ class PressureEstimator(SavedAttributes):
     method = "pressures"  # name of the way of watching
     data = RESPONSE  # kind of data (`Observable.data`) from which the conductance is estimated
     states_level = False  # True if the level of the conductance is stated
-    cause: Cause = "internal or external leak"
+    cause: Cause = "piston, pump or external leak"
     size_error = conductance_scale_error()  # relative standard error of changes of the conductance
     # flow of a leak through an orifice over that of a laminar leak with the same estimated conductance
     orifice_factor: float = PRESSURE.conductance.orifice

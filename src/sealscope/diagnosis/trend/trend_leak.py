@@ -88,7 +88,7 @@ def _measure_leak(
     rise = _normal_rise(wear, chance)
     return LeakMeasure(
         provider=str(points[0].basis),
-        cause="internal or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
+        cause="piston, pump or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
         rise=rise,
         step_rise=None if rise is None else LeakRise(rise),
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),

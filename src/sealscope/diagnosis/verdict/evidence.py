@@ -15,7 +15,8 @@ LEAK, NO_LEAK, CANNOT_TELL = get_args(Verdict)
 Cause = Literal[
     "piston leak",
     "piston or pump leak",
-    "internal or external leak",
+    "piston or external leak",
+    "piston, pump or external leak",
     "pump leak",
     "external leak",
     "friction change",
@@ -27,7 +28,12 @@ Cause = Literal[
 Figure = Literal["onset_s", "leak_lpm"]
 #: The causes for which the verdict is `leak`. Piston and pump are hydraulically in parallel, and often no channel
 #: separates their leaks. Without a recorded position, an external leak looks the same, too.
-LEAKS: tuple[Cause, ...] = ("piston leak", "piston or pump leak", "internal or external leak")
+LEAKS: tuple[Cause, ...] = (
+    "piston leak",
+    "piston or pump leak",
+    "piston or external leak",
+    "piston, pump or external leak",
+)
 #: Tests of the leakage: for a rise within the recording, and for a rise over healthy recordings.
 WITHIN, AGAINST = "within the recording", "against the baseline"
 #: Smallest p-value that is stated, as smaller ones cannot be trusted.

@@ -2,7 +2,7 @@
 
 A flow meter beside the command of a valve has no sign where it is in the valve's supply line: the flow is positive, and
 the spool chooses the chamber. Its channel is then `q_supply`, since while the piston rests this flow is not the
-cylinder's but passes the valve (`diagnosis.inference.terms`).
+cylinder's but passes the valve (`diagnosis.inference.equations.balances`).
 
 If a speed is never negative while the piston moves both ways, either it has no sign, or the pump turns one way and a
 valve chooses the side. In both cases the flow into chamber A is about a v + c (p_A - p_B), with the piston speed v;

@@ -32,9 +32,9 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     stack_equations,
 )
 from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.equations.signals import find_rests
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
-from sealscope.diagnosis.inference.terms import find_rests
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording

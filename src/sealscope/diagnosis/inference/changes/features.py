@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
+from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
-from sealscope.diagnosis.inference.terms import AVERAGING_TIME
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording

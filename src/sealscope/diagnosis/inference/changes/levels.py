@@ -34,8 +34,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, step_test
-from sealscope.diagnosis.inference.terms import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording

@@ -28,7 +28,7 @@ from scipy.linalg import qr
 
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
-from sealscope.diagnosis.inference.terms import AVERAGING_TIME, MIN_REST
+from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, MIN_REST
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once

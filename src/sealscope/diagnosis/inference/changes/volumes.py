@@ -23,10 +23,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
 from sealscope.diagnosis.inference.differences import size_penalty
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
-from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_tests
-from sealscope.diagnosis.inference.terms import (
+from sealscope.diagnosis.inference.equations.terms import (
     AIR,
     BIAS,
     HOLDING,
@@ -38,6 +35,9 @@ from sealscope.diagnosis.inference.terms import (
     Equation,
     Term,
 )
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_tests
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.comparison.rise import TINY
-from sealscope.diagnosis.inference.terms import LAG, LEAK
+from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
 
 

@@ -11,7 +11,7 @@ from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.comparison.coefficients import residual_products
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import TINY
-from sealscope.diagnosis.inference.terms import AIR, ORIFICE
+from sealscope.diagnosis.inference.equations.terms import AIR, ORIFICE
 
 
 class LawFit(NamedTuple):

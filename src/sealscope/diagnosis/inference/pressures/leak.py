@@ -54,7 +54,7 @@ class ResponseLeak(LeakMeasure):
 
     provider = PRESSURE_RESPONSE
     #: Without a position, external leakage has the same effect.
-    cause: Cause = "internal or external leak"
+    cause: Cause = "piston, pump or external leak"
     size_deviation = conductance_scale_error()
 
     def __init__(

@@ -77,7 +77,7 @@ class BalanceLeak(LeakMeasure):
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        - "internal or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
+        - "piston or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
           too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
           `held_oil.rare` (`priors.toml`), as it does beside a chamber that is open to the tank.
         - "piston leak" if a servo valve drives the cylinder, if a flow meter measures the flow behind the pump, or if
@@ -87,7 +87,7 @@ class BalanceLeak(LeakMeasure):
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
-            return "internal or external leak"
+            return "piston or external leak"
         hold_rise = self._rises.get(True)
         is_unusual = hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare  # for a healthy machine
         is_measured_in_holds = hold_rise is not None and self.rise is hold_rise and (self.balance.shut or is_unusual)
@@ -95,7 +95,7 @@ class BalanceLeak(LeakMeasure):
         chambers = self.balance.chambers
         if is_measured_in_holds and chambers is not None:
             is_external = chambers.piston_leak.probability < 1.0 - INFERENCE.held_oil.rare
-            return "internal or external leak" if is_external else "piston leak"
+            return "piston or external leak" if is_external else "piston leak"
         is_behind_pump = has_servo_valve or flow_source(self.balance.recording.channels) in METERS
         return "piston leak" if is_behind_pump or is_measured_in_holds else "piston or pump leak"
 

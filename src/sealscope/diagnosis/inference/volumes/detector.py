@@ -25,10 +25,11 @@ from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
+from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.regimes import add_pump_columns
-from sealscope.diagnosis.inference.terms import CYLINDER, HOLDING, TURNING, circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
@@ -270,8 +271,8 @@ class VolumeBalance:
                 return Observed(self.name, lack=f"finds the recording too short, {recording.duration:.3g} s")
             needed = f"; it needs {self.rig.circuit.needed_channels}" if has_position else ""
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration) + needed)
-        # without a flow (`terms.locked`), creep shows the leakage only if no loop controls the position: the command is
-        # recorded, or the load creeps in the healthy recordings as well
+        # without a flow (`balances.locked`), creep shows the leakage only if no loop controls the position: the command
+        # is recorded, or the load creeps in the healthy recordings as well
         is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
         if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))

@@ -31,6 +31,8 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, PUMP, Equation
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
@@ -46,16 +48,6 @@ from sealscope.diagnosis.inference.onset import (
 )
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
-from sealscope.diagnosis.inference.terms import (
-    CYLINDER,
-    LAG,
-    LOCKED,
-    MIN_ABSOLUTE_PRESSURE,
-    PUMP,
-    Equation,
-    Signals,
-    find_rests,
-)
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST

@@ -24,8 +24,8 @@ from sealscope.diagnosis.inference.comparison.oil import predict_thinning
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
+from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

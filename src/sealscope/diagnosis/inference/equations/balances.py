@@ -1,0 +1,327 @@
+"""The volume balances of a machine, by its circuit and the channels that are recorded.
+
+A balance consists of terms (`terms`). There is one of a cylinder whose pump or flow meter gives the flow; one for each
+chamber behind a servo valve; and one of a pump, or of a held load, while the piston stands still.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container, Iterable
+from functools import partial
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
+from sealscope.diagnosis.inference.equations.terms import (
+    BIAS,
+    BIAS_TERM,
+    CYLINDER,
+    HOLDING,
+    LAG_TERM,
+    LEAKS,
+    LINES_TERM,
+    LOADED_NULL_FLOW,
+    LOCKED,
+    MOVING_BIAS,
+    NULL_FLOW,
+    PRESSURES,
+    PUMP_TERM,
+    SPEED_LOSS_TERM,
+    START,
+    START_TERM,
+    TURNING,
+    Coefficient,
+    Equation,
+    Term,
+    chamber_terms,
+    compensated_leak_term,
+    conductance_term,
+    external_leak_term,
+    free_air_term,
+    metering_edge_terms,
+    motion_term,
+    sensor_term,
+)
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.channels import METERS, flow_source
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+_CYLINDER = (
+    *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *chamber_terms("A"),
+    *chamber_terms("B"),
+    LAG_TERM,
+    SPEED_LOSS_TERM,
+    BIAS_TERM,
+    LINES_TERM,
+    PUMP_TERM,
+    external_leak_term("A"),
+    external_leak_term("B", weight=-1.0),
+    compensated_leak_term("A"),
+    compensated_leak_term("B"),
+    *LEAKS,
+)
+
+
+def _masked(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Term, ...]:
+    """Multiply the increments of terms by a `mask` (n - 1,) that is computed from the signals."""
+
+    def masked(s: Signals, increments: Callable[[Signals], Array]) -> Array:
+        """Compute the masked increments of one term."""
+        return np.asarray(mask(s) * increments(s))
+
+    return tuple(term._replace(increments=partial(masked, increments=term.increments)) for term in terms)
+
+
+def _separate_at_rest(equation: Equation, null_flow: Callable[[Signals], Array]) -> Equation:
+    """Give a balance behind a valve terms of its own while the piston rests, of whose coefficients nothing is known.
+
+    While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
+    return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
+    hardly changes the flow. Therefore the terms of the leak, the last ones, count only while the piston moves, and
+    before them the balance gets two terms at rest: `null_flow` dt, and (p_A - p_B) dt.
+    """
+    left = equation.left
+    at_rest = (
+        sensor_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_flow(s) * s.dt, drift="bias"),
+        conductance_term(
+            LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
+        ),
+    )
+    moving_leaks = _masked(LEAKS, lambda s: s.moving(left))
+    return equation._replace(terms=(*equation.terms[: -len(LEAKS)], *at_rest, *moving_leaks))
+
+
+def is_separate_at_rest(equation: Equation) -> bool:
+    """Return True if a balance has terms of its own while the piston rests (`_separate_at_rest`)."""
+    return any(term.name == NULL_FLOW for term in equation.terms)
+
+
+def _supply_volume(s: Signals) -> Array:
+    """Compute the volume [m^3] through a meter in a valve's supply line in each interval, positive into chamber A."""
+    return np.asarray(s.mean("q_supply") * s.dt)
+
+
+def _supply_equation(rig: Rig) -> Equation:
+    """Make the volume balance of a cylinder behind a valve whose supply line has a flow meter.
+
+    The meter sees only the chamber that the supply feeds, A if the flow is positive, so that compression and external
+    leaks of the other chamber do not count.
+    """
+
+    def fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
+        """Let terms of the chamber `side` count only while the supply feeds it and the piston moves."""
+        sign = 1.0 if side == "A" else -1.0
+        return _masked(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
+
+    def direction(s: Signals) -> Array:
+        """Compute the sign of the flow in each interval; a meter without a sign has a zero in its direction."""
+        return np.sign(s.mean("q_supply"))
+
+    terms = (
+        *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+        *fed("A", chamber_terms("A")),
+        *fed("B", chamber_terms("B")),
+        LAG_TERM,
+        BIAS_TERM._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
+        *fed("A", (external_leak_term("A"),)),
+        *fed("B", (external_leak_term("B", weight=-1.0),)),
+        free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float)),
+        *LEAKS,
+    )
+    equation = Equation(CYLINDER, _supply_volume, terms, area_ratio=rig.cylinder.A_B / rig.cylinder.A_A)
+    return _separate_at_rest(equation, direction)
+
+
+def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation:
+    """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
+
+    The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
+    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B
+    change its sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap.
+    """
+    is_A = side == "A"
+    area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
+    sign = 1.0 if is_A else -1.0  # a positive command connects A to the supply and B to the return
+    return_pressure = rig.supply.p_return
+    terms = (
+        *metering_edge_terms(f"P to {side}", "p_1", f"p_{side}", sign, channels, return_pressure),
+        *metering_edge_terms(f"{side} to T", f"p_{side}", "p_2", -sign, channels, return_pressure),
+        *chamber_terms(side),
+        BIAS_TERM,
+        # each chamber's balance has the same terms of air and external leaks; those of the other chamber are zero
+        free_air_term(rig, weight_A=lambda s: float(is_A)),
+        external_leak_term("A", weight=float(is_A)),
+        external_leak_term("B", weight=-float(not is_A)),
+        *LEAKS,
+    )
+    equation = Equation(
+        f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0
+    )
+    return _separate_at_rest(equation, lambda s: np.ones_like(s.time_step))
+
+
+def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
+    """Return the volume balances of a machine that can be computed from the recorded `channels`; empty if none can.
+
+    Where a valve meters the flow into the chambers, and x, u and p_1 are recorded, there is one balance for each
+    chamber. If neither p_2 nor a flow meter is recorded, the return has the pressure of the rig, `supply.p_return`.
+    Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its speed, a
+    flow meter or, without these, the command.
+    """
+    has_return = "p_2" in channels or not channels & {*METERS}
+    if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
+        if not channels.issuperset(PRESSURES):
+            return ()
+        return tuple(_select_recorded_terms(_chamber_equation(side, rig, channels), channels) for side in "AB")
+    left, source = pump_volume(rig, channels), flow_source(channels)
+    if left is None or not {"x", *PRESSURES} <= channels:
+        return ()
+    if source == "q_supply":
+        return (_select_recorded_terms(_supply_equation(rig), channels),)
+    # a speed computed from an angle has no offset, so that a constant residual flow is external leakage
+    bias = BIAS_TERM._replace(cause="external leak", drift="outside") if "theta" in channels else BIAS_TERM
+    terms = [bias if term is BIAS_TERM else term for term in _CYLINDER]
+    if source == "u":
+        terms.insert(0, START_TERM)
+    if source == "q_pump":  # a meter is downstream of the filling loss
+        terms.remove(SPEED_LOSS_TERM)
+    # the air is half in either chamber; on a single rod it is in the one that carries the load
+    single_rod = rig.cylinder.single_rod
+    air = free_air_term(rig, weight_A=lambda s: interval_means(s.carried_by_A) if single_rod else 0.5)
+    area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
+    equation = Equation(CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio)
+    balance = _insert_before_leaks(equation, air)
+    return (_select_recorded_terms(balance, channels | {START}),)  # START is derived from the command
+
+
+#: Leaks in a balance without a piston in motion: to the outside, and past piston and pump.
+_STANDSTILL_LEAKS = (external_leak_term("A"), external_leak_term("B", weight=-1.0), *LEAKS)
+#: Terms of such a balance of both chambers: their compliances, and the leaks.
+_STANDSTILL = (*(chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
+
+
+def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
+    """Return the volume balance of a pump while the piston displaces no net volume.
+
+    The balance holds over whole cycles or at standstill, so the position need not be known. The offset of the flow,
+    which cannot be separated from leakage under a steady load, is assumed to be zero. Return None if the pump does not
+    feed the chambers, or if its delivery or a chamber's pressure is not recorded.
+    """
+    left = pump_volume(rig, channels)
+    if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(PRESSURES):
+        return None
+    return Equation("circulation", left, (START_TERM, *_STANDSTILL))
+
+
+def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
+    """Return the volume balance of a load that is held by shut valves; None if circuit or channels do not allow it.
+
+    The left side is the volume that must have leaked from A to B to let the piston move: -dx times the piston's area
+    on the loaded side, where x is assumed to grow as A fills. Leaks of seal, valve and line cannot be separated.
+
+    The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
+    have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is
+    recorded, any circuit is accepted, although a control loop may then hold the load and replace the leaking oil.
+    """
+    if not {"x", *PRESSURES} <= channels:
+        return None
+    has_flow = flow_source(channels) is not None  # a command, or a flow of the pump
+    if has_flow and not (rig.circuit.holds_load and "u" in channels):
+        return None
+    areas = {"A": rig.cylinder.A_A, "B": rig.cylinder.A_B}
+
+    def loaded_side(s: Signals) -> str:
+        """Return the side, "A" or "B", that on average carries the load."""
+        return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
+
+    compliance = Term(
+        "compliance of the loaded side",
+        "m^3/Pa",
+        lambda s: s.step(f"p_{loaded_side(s)}"),
+        "air in the oil",
+        drift="compliance",
+        needs=PRESSURES,
+    )
+    return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
+
+
+def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
+    """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
+
+    The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
+    command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
+    that does not feed the chambers. An error of a flow meter's scale shows as an error of the piston areas.
+    """
+    displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
+    if source == "theta":
+        return lambda s: displacement * s.step("theta")
+    if source == "q_pump":
+        return lambda s: s.mean("q_pump") * s.dt
+    if source == "q_supply":
+        return _supply_volume
+    if source == "omega" or (source == "u" and rig.circuit.pump_feeds_chambers):
+        return lambda s: displacement * s.mean("omega") * s.dt
+    return None
+
+
+def with_rests(equation: Equation) -> Equation:
+    """Add three terms to a pump's volume balance that are zero in some states of the machine (`STATES`).
+
+    The new terms are inserted before those of the leak. Their increments, 0 in all other states, are
+
+    - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
+    - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
+    - dt while pump and piston move (`MOVING_BIAS`).
+    """
+    left = equation.left
+    in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
+    return _insert_before_leaks(equation, *_pump_leakage_terms(left), in_motion)
+
+
+def shut_at_rest(equation: Equation) -> Equation:
+    """Adapt a pump's volume balance to valves that cut the pump off from the cylinder while the pump rests.
+
+    Two terms are added for the pump's leakage: while it moves the piston, and while it only holds the load. The
+    constant flow (`BIAS`) counts only while pump and piston move.
+    """
+    left = equation.left
+    shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
+    return shut._replace(
+        terms=tuple(
+            term._replace(increments=lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
+            for term in shut.terms
+        )
+    )
+
+
+def _pump_leakage_terms(
+    pump_volume: Callable[[Signals], Array], drift: Coefficient | Literal[""] = ""
+) -> tuple[Term, Term]:
+    """Make two terms of a pump's leakage: while it moves the piston, and while it turns to hold the load.
+
+    The increments of a term are (p_A - p_B) dt in its state of the machine, and 0 at other times. `pump_volume`
+    computes the volume [m^3] that the pump delivers in each interval; `drift`: entry of `priors.toml` with the prior on
+    the drift of both coefficients, or "" for terms that are not part of every fit.
+    """
+    # no further channels are needed: the balance requires both pressures anyway
+    make_term = partial(conductance_term, cause="pump leak", needs=(), drift=drift)
+    return (
+        make_term(TURNING, lambda s: s.moving(pump_volume) * s.pressure_difference * s.dt),
+        make_term(HOLDING, lambda s: s.holding(pump_volume) * s.pressure_difference * s.dt),
+    )
+
+
+def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
+    """Return a volume balance with additional terms before the leak's terms, which stay last."""
+    first_leak = len(equation.terms) - len(LEAKS)
+    return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
+
+
+def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:
+    """Return a volume balance without the terms that need a channel outside of `channels`."""
+    return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))

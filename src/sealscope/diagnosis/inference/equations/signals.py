@@ -1,0 +1,198 @@
+"""Samples of recorded channels, and what the terms of a volume balance derive from them: speeds, loads and rests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import cache, cached_property
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
+
+#: Minimum absolute pressure in the terms of air [Pa].
+MIN_ABSOLUTE_PRESSURE: float = INFERENCE.pressure.least
+#: Half the time of the central difference for speed and direction [s]: a few encoder counts at slow motion.
+HALF_DIFFERENCE = 0.025
+#: Averaging time of the speeds from which rests (standstills) are found, and minimum length of a rest [s].
+AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
+
+
+class RestLimits(NamedTuple):
+    """Speeds below which a machine counts as resting: flow of the `pump` [m^3/s] and speed of the `piston` [m/s].
+
+    `shortest`: minimum length of a rest [s].
+    """
+
+    pump: float
+    piston: float
+    shortest: float = MIN_REST
+
+
+class Signals:
+    """Samples (n,) of recorded channels by name, in SI units, and signals derived from them.
+
+    - `rate`: sampling rate [Hz];
+    - `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure;
+    - `offset`: sensor offset [Pa] that is subtracted from p_A - p_B;
+    - `rest_limits`: speeds below which the machine rests, None to find no rests.
+
+    `step(name)` gives the differences of neighbouring samples, and `mean(name)` their means, (n - 1,) each.
+    """
+
+    def __init__(
+        self,
+        channels: Mapping[str, Array],
+        rate: float,
+        to_absolute: Mapping[str, float] | None = None,
+        offset: float = 0.0,
+        rest_limits: RestLimits | None = None,
+    ) -> None:
+        self._channels, self.rate, self._to_absolute, self._offset = channels, rate, to_absolute or {}, offset
+        self._rest_limits = rest_limits
+        self._states: tuple[Array, Array] | None = None
+        self.step = cache(lambda name: np.asarray(np.diff(channels[name])))
+        self.mean = cache(lambda name: interval_means(channels[name]))
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._channels
+
+    def __getitem__(self, name: str) -> Array:
+        return self._channels[name]
+
+    @property
+    def dt(self) -> float:
+        """Sampling interval [s]."""
+        return 1.0 / self.rate
+
+    @property
+    def time_step(self) -> Array:
+        """Sampling interval dt [s], repeated for each interval, shape (n - 1,)."""
+        return np.full(len(next(iter(self._channels.values()))) - 1, self.dt)
+
+    @cached_property
+    def pressure_difference(self) -> Array:
+        """p_A - p_B [Pa] in the middle of each sampling interval, without the sensor offset, shape (n - 1,)."""
+        return self.mean("p_A") - self.mean("p_B") - self._offset
+
+    @property
+    def pressure_root(self) -> Array:
+        """sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure difference dp = p_A - p_B, shape (n - 1,)."""
+        return signed_root(self.pressure_difference)
+
+    @cached_property
+    def port_difference(self) -> Array:
+        """p_1 - p_2 [Pa] of the two ports of pump or valve, in the middle of each sampling interval, shape (n - 1,)."""
+        return self.mean("p_1") - self.mean("p_2")
+
+    @cached_property
+    def absolute(self) -> Mapping[str, Array]:
+        """Absolute pressure [Pa] at each sample, at least `MIN_ABSOLUTE_PRESSURE`, by the names "p_A" and "p_B"."""
+        return {
+            name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)
+            for name in ("p_A", "p_B")
+        }
+
+    @cached_property
+    def speed(self) -> Array:
+        """Speed of the piston [m/s] at each sample, by a central difference of x; x stays constant beyond the ends."""
+        half_width = max(1, round(HALF_DIFFERENCE * self.rate))  # [samples]
+        return central_difference(self._channels["x"], half_width) * (0.5 * self.rate / half_width)
+
+    @cached_property
+    def carried_by_A(self) -> Array:
+        """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
+        return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
+
+    def directed_step(self, outward: bool, by_A: bool) -> Array:
+        """Compute the increments (n - 1,) of x [m] in a given direction while a given side carries the load, else 0.
+
+        `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true if A carries the
+        load (`carried_by_A`), false if B does. If direction or loaded side change within an interval, half of its
+        increment counts.
+        """
+        is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
+        return interval_means(is_counted.astype(float)) * self.step("x")
+
+    def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
+
+        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. Without `rest_limits` all
+        intervals count as motion.
+        """
+        return self._find_states(pump_volume)[0]
+
+    def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
+        """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
+
+        `pump_volume`: as in `moving`. Without `rest_limits` the result is 0 everywhere.
+        """
+        return self._find_states(pump_volume)[1]
+
+    def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
+        """Compute the results of `moving` and `holding`, and store them for later calls.
+
+        Later calls return the stored results: all terms of a balance have the same `pump_volume`.
+        """
+        limits = self._rest_limits
+        if limits is None:
+            return np.ones_like(self.time_step), np.zeros_like(self.time_step)
+        if self._states is None:
+            pump_rests = find_rests(pump_volume(self), self.rate, limits.pump, limits.shortest)
+            piston_rests = find_rests(self.step("x"), self.rate, limits.piston, limits.shortest)
+            is_moving, is_holding = ~pump_rests & ~piston_rests, ~pump_rests & piston_rests
+            self._states = is_moving.astype(float), is_holding.astype(float)
+        return self._states
+
+
+def find_rests(increments: Array, rate: float, limit: float, shortest: float = MIN_REST) -> NDArray[np.bool_]:
+    """Flag the sampling intervals at rest, i.e. with a speed of at most `limit` for a time of at least `shortest` [s].
+
+    `increments` (n,): increments of the pump's volume [m^3] or of the position [m], NaN (not at rest) where missing;
+    `rate`: sampling rate [Hz]; `limit` in m^3/s or m/s. The speed is averaged over `AVERAGING_TIME`. A recording
+    shorter than this time and `shortest` together has no rest.
+    """
+    window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(shortest * rate))  # [samples]
+    if len(increments) < window + min_length:
+        return np.zeros(len(increments), dtype=bool)
+    is_known = np.isfinite(increments)
+    sums = np.concatenate([[0], np.cumsum(np.where(is_known, increments, 0.0))])
+    n_missing = np.concatenate([[0], np.cumsum(~is_known)])
+    # a window of samples is flagged by its first sample if it is slow on average and no sample is missing
+    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate
+    is_slow &= n_missing[window:] == n_missing[:-window]
+    n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
+    is_rest_start = n_moving[min_length:] == n_moving[:-min_length]  # no moving sample among the next `min_length`
+    return _extend_flags(is_rest_start, min_length)
+
+
+def central_difference(values: Array, half_width: int) -> Array:
+    """Compute the difference (n,) of the values `half_width` samples after and before each of n samples.
+
+    It is not divided by the time. Beyond the ends the first and last values are repeated.
+    """
+    padded = np.pad(values, half_width, mode="edge")
+    return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
+
+
+def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+    """Flag each flagged sample of `starts` (n,) and the next `length` - 1 samples, shape (n + length - 1,)."""
+    changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
+    changes[: len(starts)] += starts
+    changes[length:] -= starts
+    return np.cumsum(changes)[:-1] > 0
+
+
+def interval_means(values: Array) -> Array:
+    """Compute the means of neighbouring samples (n,), shape (n - 1,)."""
+    means = values[1:] + values[:-1]
+    means *= 0.5
+    return means
+
+
+def signed_root(values: Array) -> Array:
+    """Compute sign(v) sqrt(abs(v)) of each value v."""
+    return np.asarray(np.sign(values) * np.sqrt(np.abs(values)))

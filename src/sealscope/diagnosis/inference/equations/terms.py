@@ -1,0 +1,280 @@
+"""The terms of a machine's volume balance, computed from recorded channels.
+
+A balance states where the volume of oil goes that the pump delivers: into motion of the piston, compression, air and
+leakage. It is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
+
+    D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
+
+with the pump's displacement D [m^3/rad] and angle theta, the leakage conductance G [m^3/(s Pa)] and a coefficient c_j
+for each term; f_j and g_j are functions of the recorded channels. A term computes its increment f_j dg_j over each
+sampling interval dt, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance. Its
+left side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges.
+G is the same in both chambers.
+
+The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
+
+Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of edges).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Container
+from functools import partial
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.equations.signals import Signals, interval_means, signed_root
+from sealscope.diagnosis.verdict.evidence import Cause
+from sealscope.recordings.recording import Array
+
+if TYPE_CHECKING:
+    from sealscope.parameters import Rig
+
+#: Kinds of coefficients: each has priors on its drift and on its differences between recordings.
+Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "pump", "outside", "edge"]
+
+
+class Term(NamedTuple):
+    """A term of a volume balance: an unknown coefficient times a function of recorded channels.
+
+    - `name`: name of the term, for example "compliance A"; `unit`: unit of the coefficient, m^3 over that of the
+      increments;
+    - `increments`: computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,);
+    - `cause`: cause of a sudden change of the coefficient, for example "external leak";
+    - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if it is zero unless `cause` is
+      present;
+    - `needs`: channels from which the increments are computed;
+    - `driver`: "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". In the
+      first two cases offsets of pressure sensors change the increments.
+    """
+
+    name: str
+    unit: str
+    increments: Callable[[Signals], Array]
+    cause: Cause
+    drift: Coefficient | Literal[""] = ""
+    needs: tuple[str, ...] = ()
+    driver: Literal["", "pressure", "root"] = ""
+
+    @property
+    def nuisance(self) -> bool:
+        """True if the coefficient is fitted in every recording, since it is unknown even in a healthy machine."""
+        return bool(self.drift) and not self.compared
+
+    @property
+    def compared(self) -> bool:
+        """True if the coefficient is fitted only to compare recordings: within one, the motion varies too little."""
+        return self.drift == "speed"
+
+
+class Equation(NamedTuple):
+    """A volume balance of a machine: its left side equals the sum of its terms.
+
+    Parameters
+    ----------
+    name : str
+        Name of the balance, for example "cylinder".
+    left : callable
+        Computes the increments of the left side [m^3] from `Signals`, shape (n - 1,).
+    terms : tuple of Term
+        The terms, those of the leak last.
+    healthy : float
+        Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
+    by_command : bool
+        True if no channel gives the pump's flow. A speed is then computed from the command u
+        (`balance.derive_drive_signals`).
+    flow_sign : float
+        1 if a flow into A is positive on the left side, -1 if it is negative.
+    area_ratio : float
+        Area of the piston on side B over that on side A; 1 in a balance of one chamber.
+    """
+
+    name: str
+    left: Callable[[Signals], Array]
+    terms: tuple[Term, ...]
+    healthy: float = float("inf")
+    by_command: bool = False
+    flow_sign: float = 1.0
+    area_ratio: float = 1.0
+
+
+#: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
+LEAK, ORIFICE = "leak", "leak through an orifice"
+#: Free air in both chambers together, instead of one term for each chamber.
+AIR = "free air"
+#: The pump's leakage, driven by the pressures at its ports.
+PUMP = "pump leak"
+#: The pump's leakage driven by p_A - p_B, if a valve cuts the pump off at rest: while the pump moves the piston, and
+#: while it turns only to hold the load.
+TURNING, HOLDING = "pump leak while it turns", "pump leak while it holds"
+#: Constant flow, for example by an offset of a flow sensor; an offset of the pressure sensors changes it, too.
+BIAS = "bias"
+#: Suffix for an external leak that a check valve compensates.
+MADE_UP = ", made up"
+#: A delay between position and flow.
+LAG = "lag"
+#: Loss of the pump that grows with speed: incomplete filling, and slip that depends on no recorded pressure.
+SPEED_LOSS = "loss over speed"
+#: The constant flow while pump and piston move.
+MOVING_BIAS = "bias in motion"
+#: All terms that are zero in some states of the machine.
+STATES = TURNING, HOLDING, MOVING_BIAS
+#: Flow from the supply past a valve at its null, while the piston rests: constant part, and part over p_A - p_B.
+NULL_FLOW, LOADED_NULL_FLOW = "flow past the valve at rest", "flow past the valve at rest, under load"
+#: Names of two balances: of a pump-controlled cylinder with a recorded position, and of a load held by valves.
+CYLINDER, LOCKED = "cylinder", "locked"
+#: Name of a derived signal: the decay, with the drive's time constant, of the speed loop's unknown initial state.
+START = "start"
+
+PRESSURES = ("p_A", "p_B")
+sensor_term = partial(Term, cause="sensor fault")
+
+
+def conductance_term(
+    name: str,
+    increments: Callable[[Signals], Array],
+    cause: Cause,
+    needs: tuple[str, ...] = PRESSURES,
+    drift: Coefficient | Literal[""] = "",
+) -> Term:
+    """Make the term of an unknown conductance; `increments` computes the driving pressure times dt [Pa s]."""
+    return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
+
+
+_LEAK_CAUSE: Cause = "piston or pump leak"
+LEAKS = (
+    conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, _LEAK_CAUSE, drift="leak"),
+    Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, _LEAK_CAUSE, needs=PRESSURES, driver="root"),
+)
+
+
+def motion_term(outward: bool, by_A: bool) -> Term:
+    """Make the term of the piston's motion `outward` (to B) or inward, while side A (`by_A`) or B carries the load."""
+    name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
+    return sensor_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
+
+
+def chamber_terms(side: str) -> tuple[Term, ...]:
+    """Make the four terms of one chamber, `side` "A" or "B": two of its compliance, and two of the air in its oil.
+
+    With the chamber's absolute pressure p, the position x, and changes d over a sampling interval, the increments are
+    dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, d ln p for dissolving air.
+    """
+    p, name = f"p_{side}", f"compliance {side}"
+    compliance_term = partial(Term, cause="air in the oil", drift="compliance")
+    air_term = partial(Term, cause="air in the oil", drift="air")
+    return (
+        compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),
+        compliance_term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), needs=(p, "x")),
+        air_term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute[p]), needs=(p,)),
+        air_term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute[p])), needs=(p,)),
+    )
+
+
+def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
+    """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
+
+    d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
+    the current position, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0
+    to 1) of chamber A in the balance.
+    """
+    from sealscope.physics.cylinder import mid_stroke_volumes
+
+    cylinder = rig.cylinder
+    mid_volumes = dict(zip("AB", mid_stroke_volumes(cylinder), strict=True))
+    # change of each volume with the position
+    areas = {"A": cylinder.A_A, "B": -cylinder.A_B} if cylinder.volumes == "position" else {"A": 0.0, "B": 0.0}
+
+    def expansion(s: Signals, side: str) -> Array:
+        """Compute V d(1/p) [m^3/Pa] of the chamber `side` in each interval, with the volume V at the mean position."""
+        # at least a tenth of the volume at mid-stroke: x of an unknown origin may exceed the stroke
+        volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
+        return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
+
+    def weighted_expansion(s: Signals) -> Array:
+        """Compute the increments of the term [m^3/Pa], shape (n - 1,)."""
+        weight = weight_A(s)
+        return np.asarray(weight * expansion(s, "A") - (1.0 - weight) * expansion(s, "B"))
+
+    return Term(AIR, "Pa", weighted_expansion, "air in the oil", needs=("x", *PRESSURES))
+
+
+def external_leak_term(side: str, weight: float = 1.0) -> Term:
+    """Make the term of an external leak from `side` "A" or "B", with the increments `weight` max(p, 0) dt [Pa s].
+
+    p is the gauge pressure of the side. `weight`: factor of this flow in the volume balance, 1 for a leak from A, -1
+    for a leak from B, and 0 in a balance of the other chamber alone.
+    """
+    p = f"p_{side}"
+    return conductance_term(
+        f"external leak {side}", lambda s: weight * np.maximum(s.mean(p), 0.0) * s.dt, "external leak", needs=(p,)
+    )
+
+
+def compensated_leak_term(side: str) -> Term:
+    """Make the term of an external leak from one side in a circuit whose check valve refills the low-pressure side.
+
+    The leak counts only while its side has the higher pressure: max(p, 0) dt [Pa s] for A, -max(p, 0) dt for B.
+    """
+
+    def lost_volume(s: Signals) -> Array:
+        """Compute the increments of the term [Pa s], shape (n - 1,)."""
+        weight = interval_means(s.carried_by_A) - float(side == "B")  # 1 or 0 for side A, 0 or -1 for side B
+        return np.asarray(weight * np.maximum(s.mean(f"p_{side}"), 0.0) * s.dt)
+
+    return conductance_term(f"external leak {side}{MADE_UP}", lost_volume, cause="external leak")
+
+
+START_TERM = sensor_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
+BIAS_TERM = sensor_term(BIAS, "m^3/s", lambda s: s.time_step, drift="bias")
+SPEED_LOSS_TERM = sensor_term(
+    SPEED_LOSS, "m s", lambda s: interval_means(np.abs(s.speed)) * s.step("x"), drift="speed", needs=("x",)
+)
+PUMP_TERM = conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", needs=("p_1", "p_2"))
+#: The pressure drop of the lines acts on the pump's leakage only. With this term the leak's coefficient remains the
+#: conductance of pump and piston together.
+LINES_TERM = conductance_term(
+    "pump leak by the lines",
+    lambda s: (s.port_difference - s.pressure_difference) * s.dt,
+    "pump leak",
+    needs=("p_1", "p_2", *PRESSURES),
+    drift="pump",
+)
+#: The increments are changes of the piston's speed.
+LAG_TERM = sensor_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
+
+
+def metering_edge_terms(
+    edge: str, upstream: str, downstream: str, sign: float, channels: Container[str], return_pressure: float
+) -> tuple[Term, ...]:
+    """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
+
+    `edge`: name of the edge, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of
+    the command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure
+    [Pa] in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
+
+        flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain (dead band of u),
+
+    delayed by the lag of the spool. Up to their signs, the unknown coefficients are gain, gain times lag, and overlap.
+    """
+    recorded = tuple(name for name in (upstream, downstream) if name in channels)
+
+    def pressure(s: Signals, name: str) -> Array | float:
+        """Return the pressure [Pa] on one side of the edge in the middle of each interval."""
+        return s.mean(name) if name in recorded else return_pressure
+
+    def pressure_root(s: Signals) -> Array:
+        """Compute sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure drop dp over the edge, shape (n - 1,)."""
+        return signed_root(np.asarray(pressure(s, upstream) - pressure(s, downstream)))
+
+    def proportional_flow(s: Signals) -> Array:
+        """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s], 0 unless u opens the edge."""
+        return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * pressure_root(s) * s.dt)
+
+    edge_term = partial(sensor_term, drift="edge", needs=("u", *recorded))
+    return (
+        edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_flow),
+        edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
+        edge_term(f"overlap {edge}", "m^3/(s Pa^0.5)", lambda s: (sign * s.mean("u") > 0.0) * pressure_root(s) * s.dt),
+    )
