@@ -68,7 +68,7 @@ class Case:
 
     @property
     def rarest_observable(self) -> Observable:
-        """The test result (observable) of the judging detector that is least probable in a healthy recording."""
+        """The test result (observable) of the judging detector with the smallest p-value, as the detector states it."""
         return min(self.judge.observables, key=lambda observable: observable.chance)
 
     @cached_property
@@ -97,11 +97,11 @@ class Case:
         return probability_of(self.explanations, causes=["external leak"], data_kind=self._data_kind(alarm))
 
     def resembles_external(self, alarm: LeakTest) -> bool:
-        """Return True if the data cannot tell a leak that raised an `alarm` from a leak out of the circuit.
+        """Return True if the rise over healthy recordings alone does not exclude that the leak is an external one.
 
-        The priors, by which a large leak to the outside would have been seen, do not count here: of both descriptions
-        of the rise over healthy recordings, that of an external leak has a likelihood of at least 1 - `sure` of both
-        (`[explanation]` of `priors.toml`).
+        That is so if L_external / (L_external + L_leak) > 1 - `sure` (`[explanation]` of `priors.toml`), with the
+        likelihoods L of both descriptions. Priors, such as that a large external leak would have been seen, do not
+        count. The result is False for an `alarm` by other data, or if rivals are not weighed.
         """
         if not self.weigh_rivals or self._data_kind(alarm) != RISE:
             return False

@@ -37,8 +37,9 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
     The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
-    cannot be found stays as it is. If a valve's command is recorded beside a flow q_pump without a sign, the result has
-    the channel q_supply in its place. Also returns a finding for each channel that was changed.
+    cannot be found stays as it is. If a position, and a command that moves both ways, are recorded beside a flow q_pump
+    without a sign, the result has the channel q_supply in its place. Also returns a finding for each channel that was
+    changed.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     for name, quantity in _NAMES.items():

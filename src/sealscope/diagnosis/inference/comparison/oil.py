@@ -22,9 +22,9 @@ class OilHypothesis(NamedTuple):
 
     - `thinning` (n + 1,): predicted logarithm of the leakage, relative to the mean over the n healthy recordings;
     - `variances` (n + 1,): variance of the error of each prediction, without the error of its slope;
-    - `log_probability`: log prior probability of the hypothesis;
+    - `log_probability`: log probability of the hypothesis, given the resistances to the motion;
     - `slope_deviation`: relative standard deviation of the slope of `thinning` in temperature or pressure drop;
-    - `session_deviation`: standard deviation of the logarithm between sessions, 0 if the oil is known.
+    - `session_deviation`: standard deviation of the logarithm of one session about the mean, 0 if the oil is known.
     """
 
     thinning: Array
@@ -84,9 +84,11 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     judged drop. What swells or wears a seal changes its friction, too, so that in the second case the friction has the
     density of the first hypothesis: a judged friction that is as usual makes this case less probable.
 
-    A drop below its standard error is replaced by this error. A recording without a drop gets the mean drop, and the
-    error of unknown oil: `unknown_deviation`, the standard deviation of the logarithm of the leakage. The list is empty
-    if the judged recording has no drop, or none of the healthy ones has.
+    A drop predicts the thinning -`oil.per_drop` r (log drop - mean of the healthy ones), with the reliability r, the
+    variance of true drops over that of measured ones. A drop below its standard error is replaced by this error. A
+    recording without a drop gets the mean drop, and the error of unknown oil: `unknown_deviation`, the standard
+    deviation of the logarithm of the leakage. The list is empty if the judged recording has no drop, or none of the
+    healthy ones has.
     """
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
     friction, friction_error, drop, drop_error, speed = np.array(

@@ -77,17 +77,17 @@ def _masked(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Te
     return tuple(term._replace(increments=partial(masked, increments=term.increments)) for term in terms)
 
 
-def _separate_at_rest(equation: Equation, null_flow: Callable[[Signals], Array]) -> Equation:
-    """Give a balance behind a valve terms of its own while the piston rests, of whose coefficients nothing is known.
+def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array]) -> Equation:
+    """Add terms to a balance behind a valve that count only while the piston rests; nothing is known of their size.
 
     While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
     hardly changes the flow. Therefore the terms of the leak, the last ones, count only while the piston moves, and
-    before them the balance gets two terms at rest: `null_flow` dt, and (p_A - p_B) dt.
+    before them the balance gets two terms at rest: `null_sign` dt, the sign of the flow, and (p_A - p_B) dt.
     """
     left = equation.left
     at_rest = (
-        sensor_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_flow(s) * s.dt, drift="bias"),
+        sensor_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_sign(s) * s.dt, drift="bias"),
         conductance_term(
             LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
         ),
@@ -119,9 +119,10 @@ def _supply_equation(rig: Rig) -> Equation:
         return _masked(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
 
     def direction(s: Signals) -> Array:
-        """Compute the sign of the flow in each interval; a meter without a sign has a zero in its direction."""
+        """Compute the sign of the flow in each interval, which the offset of a meter without a direction takes."""
         return np.sign(s.mean("q_supply"))
 
+    air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
     terms = (
         *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
         *fed("A", chamber_terms("A")),
@@ -130,7 +131,7 @@ def _supply_equation(rig: Rig) -> Equation:
         BIAS_TERM._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
         *fed("A", (external_leak_term("A"),)),
         *fed("B", (external_leak_term("B", weight=-1.0),)),
-        free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float)),
+        *_masked((air,), lambda s: s.moving(_supply_volume)),
         *LEAKS,
     )
     equation = Equation(CYLINDER, _supply_volume, terms, area_ratio=rig.cylinder.A_B / rig.cylinder.A_A)
@@ -168,10 +169,10 @@ def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation
 def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded `channels`; empty if none can.
 
-    Where a valve meters the flow into the chambers, and x, u and p_1 are recorded, there is one balance for each
-    chamber. If neither p_2 nor a flow meter is recorded, the return has the pressure of the rig, `supply.p_return`.
-    Otherwise there is one balance of the cylinder, in which the pump's flow is computed from its angle, its speed, a
-    flow meter or, without these, the command.
+    The position and both chamber pressures are always needed. Where a valve meters the flow into the chambers, and u
+    and p_1 are recorded, there is one balance for each chamber. If neither p_2 nor a flow meter is recorded, the return
+    has the pressure of the rig, `supply.p_return`. Otherwise there is one balance of the cylinder, in which the pump's
+    flow is computed from its angle, its speed, a flow meter or, without these, the command.
     """
     has_return = "p_2" in channels or not channels & {*METERS}
     if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
@@ -207,6 +208,8 @@ _STANDSTILL = (*(chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
+
+    Its signals must contain `START` (`balance.derive_drive_signals`).
 
     The balance holds over whole cycles or at standstill, so the position need not be known. The offset of the flow,
     which cannot be separated from leakage under a steady load, is assumed to be zero. Return None if the pump does not

@@ -22,9 +22,9 @@ AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
 
 
 class RestLimits(NamedTuple):
-    """Speeds below which a machine counts as resting: flow of the `pump` [m^3/s] and speed of the `piston` [m/s].
+    """Largest speeds of a machine at rest: flow of the `pump` [m^3/s] and speed of the `piston` [m/s].
 
-    `shortest`: minimum length of a rest [s].
+    With a negative limit, pump or piston never rests. `shortest`: minimum length of a rest [s].
     """
 
     pump: float
@@ -120,8 +120,8 @@ class Signals:
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
 
-        `pump_volume` computes the volume [m^3] that the pump delivers in each interval. Without `rest_limits` all
-        intervals count as motion.
+        `pump_volume` computes the left side of the volume balance [m^3] in each interval, for example the volume that
+        the pump delivers; that of the first call counts for all. Without `rest_limits` all intervals count as motion.
         """
         return self._find_states(pump_volume)[0]
 
@@ -133,10 +133,7 @@ class Signals:
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Compute the results of `moving` and `holding`, and store them for later calls.
-
-        Later calls return the stored results: all terms of a balance have the same `pump_volume`.
-        """
+        """Compute the results of `moving` and `holding` in the first call, and return the same ones in later calls."""
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)

@@ -42,11 +42,11 @@ class Term(NamedTuple):
       increments;
     - `increments`: computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,);
     - `cause`: cause of a sudden change of the coefficient, for example "external leak";
-    - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if it is zero unless `cause` is
-      present;
+    - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless
+      `cause` is present;
     - `needs`: channels from which the increments are computed;
-    - `driver`: "pressure" if a pressure drives the flow, "root" if the square root of a pressure does, else "". In the
-      first two cases offsets of pressure sensors change the increments.
+    - `driver`: "pressure" or "root" if an offset of a pressure sensor changes the increments like that of a leak in
+      proportion to a pressure or to its square root; "" if such an offset is neglected.
     """
 
     name: str
@@ -118,9 +118,9 @@ LAG = "lag"
 SPEED_LOSS = "loss over speed"
 #: The constant flow while pump and piston move.
 MOVING_BIAS = "bias in motion"
-#: All terms that are zero in some states of the machine.
+#: The terms that `balances.with_rests` adds, each zero in some states of the machine.
 STATES = TURNING, HOLDING, MOVING_BIAS
-#: Flow from the supply past a valve at its null, while the piston rests: constant part, and part over p_A - p_B.
+#: Flow from the supply past a valve while the piston rests: a constant part, and one in proportion to p_A - p_B.
 NULL_FLOW, LOADED_NULL_FLOW = "flow past the valve at rest", "flow past the valve at rest, under load"
 #: Names of two balances: of a pump-controlled cylinder with a recorded position, and of a load held by valves.
 CYLINDER, LOCKED = "cylinder", "locked"
@@ -176,8 +176,8 @@ def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Ter
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
     d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
-    the current position, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0
-    to 1) of chamber A in the balance.
+    the current position, counted from mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A`
+    computes w, the weight (0 to 1) of chamber A in the balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -254,7 +254,7 @@ def metering_edge_terms(
     the command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure
     [Pa] in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
 
-        flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain (dead band of u),
+        flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain times dead band of u,
 
     delayed by the lag of the spool. Up to their signs, the unknown coefficients are gain, gain times lag, and overlap.
     """
@@ -268,13 +268,17 @@ def metering_edge_terms(
         """Compute sign(dp) sqrt(abs(dp)) [Pa^0.5] of the pressure drop dp over the edge, shape (n - 1,)."""
         return signed_root(np.asarray(pressure(s, upstream) - pressure(s, downstream)))
 
-    def proportional_flow(s: Signals) -> Array:
+    def proportional_increments(s: Signals) -> Array:
         """Compute the increments abs(u) sign(dp) sqrt(abs(dp)) dt [V Pa^0.5 s], 0 unless u opens the edge."""
         return np.asarray(np.maximum(sign * s.mean("u"), 0.0) * pressure_root(s) * s.dt)
 
+    def late_increments(s: Signals) -> Array:
+        """Compute the changes of abs(u) sign(dp) sqrt(abs(dp)) in each interval [V Pa^0.5], for gain times lag."""
+        return np.asarray(np.gradient(proportional_increments(s)) * s.rate)
+
     edge_term = partial(sensor_term, drift="edge", needs=("u", *recorded))
     return (
-        edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_flow),
-        edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", lambda s: np.gradient(proportional_flow(s))),  # gain times lag
+        edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_increments),
+        edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", late_increments),
         edge_term(f"overlap {edge}", "m^3/(s Pa^0.5)", lambda s: (sign * s.mean("u") > 0.0) * pressure_root(s) * s.dt),
     )
