@@ -64,6 +64,8 @@ def test_a_meter_without_a_sign_beside_a_command_is_in_the_supply_line() -> None
     assert "q_supply" in part and "q_pump" not in part
     (balance,) = equations(rig(), frozenset(part.channels))
     assert is_separate_at_rest(balance)
+    in_line = inspect_recording(supplied(0, null=0.0)).part
+    assert "q_pump" in in_line  # a valve that shuts, and one area: the meter may as well be in a line of the cylinder
     one_way = replace(supplied(0), channels={**supplied(0).channels, "u": np.abs(supplied(0)["u"])})
     assert "q_pump" in inspect_recording(one_way).part  # such a command chooses no chamber
 

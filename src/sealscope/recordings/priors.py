@@ -77,6 +77,9 @@ class UnsignedPriors(PriorTable):
     - `changes` [1/s]: usual number of reversals per second.
     - `least`: smallest ratio of the motion in the less used direction to that in the other.
     - `correlation`: smallest correlation of the magnitude with the absolute piston speed or command.
+    - `unlike`: smallest logarithm of the ratio of the flows per speed in both directions that two areas show.
+    - `passes`: smallest flow at rest, over the mean flow in motion, of a valve in whose supply line the meter is.
+    - `rests`: largest speed at rest, over the mean speed in motion.
     """
 
     noise: float
@@ -86,6 +89,9 @@ class UnsignedPriors(PriorTable):
     changes: float
     least: float
     correlation: float
+    unlike: float
+    passes: float
+    rests: float
 
 
 class HumPriors(PriorTable):

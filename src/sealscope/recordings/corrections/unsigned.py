@@ -1,7 +1,7 @@
 """Speeds and flows without a sign: an encoder or a flow meter that counts pulses does not measure the direction.
 
-A flow meter beside the command of a valve has no sign where it is in the valve's supply line: the flow is positive, and
-the spool chooses the chamber. Its channel is then `q_supply`, since while the piston rests this flow is not the
+A flow meter in the supply line of a valve has no sign either: the flow is positive, and the spool chooses the chamber.
+Its channel is then `q_supply`, since it sees the fed chamber alone, and while the piston rests its flow is not the
 cylinder's but passes the valve (`diagnosis.inference.equations.balances`).
 
 If a speed is never negative while the piston moves both ways, either it has no sign, or the pump turns one way and a
@@ -37,9 +37,9 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
     The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
-    cannot be found stays as it is. If a position, and a command that moves both ways, are recorded beside a flow q_pump
-    without a sign, the result has the channel q_supply in its place. Also returns a finding for each channel that was
-    changed.
+    cannot be found stays as it is. If a flow q_pump without a sign is that in a valve's supply line
+    (`_is_in_supply_line`), the result has the channel q_supply in its place. Also returns a finding for each channel
+    that was changed.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -53,11 +53,35 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
-        if name == "q_pump" and "x" in recording and "u" in recording and _moves_both_ways(recording["u"]):
+        if name == "q_pump" and "x" in recording and "u" in recording and _is_in_supply_line(recording, sign):
             channels["q_supply"], units["q_supply"] = channels.pop(name), units.pop(name)
             text += ", and it counts as the flow in the valve's supply line (q_supply)"
         findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
     return (replace(recording, channels=channels, units=units) if findings else recording), findings
+
+
+def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
+    """Test whether a flow meter without a sign is in the supply line of a valve, and not in a line of the cylinder.
+
+    The valve's command must move both ways. In the supply line, the flow over the piston's speed is the area of the fed
+    chamber, which differs between the directions behind a single rod by the fraction `unsigned.unlike` (`priors.toml`)
+    or more. Behind a double rod, oil that passes the valve while the piston rests tells the supply line: at least the
+    fraction `unsigned.passes` of the mean flow in motion. `sign` (n,): signs of the flow into chamber A.
+    """
+    magnitude, speed = np.abs(recording["q_pump"]), _piston_speed(recording["x"], recording.rate)
+    known = np.isfinite(magnitude)
+    magnitude, speed, sign = magnitude[known], speed[known], sign[known]
+    if not _moves_both_ways(recording["u"]) or not _moves_both_ways(speed):
+        return False
+    gains = [
+        float(magnitude[moves] @ np.abs(speed[moves])) / float(speed[moves] @ speed[moves])
+        for moves in ((speed > 0.0) & (sign > 0.0), (speed < 0.0) & (sign < 0.0))
+    ]
+    if min(gains) > 0.0 and abs(float(np.log(gains[0] / gains[1]))) > _PRIORS.unlike:
+        return True
+    is_moving = np.abs(speed) > _PRIORS.rests * float(speed @ speed) / float(np.abs(speed).sum())
+    flow_at_rest = float(magnitude[~is_moving].mean()) if not is_moving.all() else 0.0
+    return flow_at_rest > _PRIORS.passes * float(magnitude[is_moving].mean())
 
 
 def _has_one_sign(values: Array) -> bool:

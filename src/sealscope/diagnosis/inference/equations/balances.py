@@ -110,7 +110,8 @@ def _supply_equation(rig: Rig) -> Equation:
     """Make the volume balance of a cylinder behind a valve whose supply line has a flow meter.
 
     The meter sees only the chamber that the supply feeds, A if the flow is positive, so that compression and external
-    leaks of the other chamber do not count.
+    leaks of the other chamber do not count. An accumulator between meter and valve takes up oil with the pressure of
+    the supply, if that is recorded.
     """
 
     def fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
@@ -132,6 +133,14 @@ def _supply_equation(rig: Rig) -> Equation:
         *fed("A", (external_leak_term("A"),)),
         *fed("B", (external_leak_term("B", weight=-1.0),)),
         *_masked((air,), lambda s: s.moving(_supply_volume)),
+        Term(
+            "compliance of the supply",
+            "m^3/Pa",
+            lambda s: direction(s) * s.step("p_1"),
+            "sensor fault",
+            drift="compliance",
+            needs=("p_1",),
+        ),
         *LEAKS,
     )
     equation = Equation(CYLINDER, _supply_volume, terms, area_ratio=rig.cylinder.A_B / rig.cylinder.A_A)
