@@ -52,9 +52,9 @@ BUDGETS = {
     "parameters": (415, ("scipy", "numba")),
     "inspect run.nc": (485, ("scipy", "numba")),
     "convert run.csv run2.nc": (530, ("scipy", "numba", "pandas")),
-    "diagnose run.csv": (1010, (*SLOW, "sealscope.campaigns", "sealscope.simulation.experiment")),
-    "trend . --every 1d": (1100, (*SLOW, "sealscope.campaigns")),
-    "report run.nc -o page.html": (1040, (*SLOW, "sealscope.campaigns", "sealscope.simulation.experiment")),
+    "diagnose run.csv": (1015, (*SLOW, "sealscope.campaigns", "sealscope.simulation.experiment")),
+    "trend . --every 1d": (1105, (*SLOW, "sealscope.campaigns")),
+    "report run.nc -o page.html": (1045, (*SLOW, "sealscope.campaigns", "sealscope.simulation.experiment")),
 }
 NEVER = ("sealscope.thesis", "sealscope.monitor", "sealscope.fmu", "pint", "xarray", "sklearn", "matplotlib", "dask")
 COUNT = """

@@ -263,7 +263,7 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
 @pytest.mark.slow
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:
     points = [simulated.points[row] for row in simulated.rows]
-    assert simulated.wear is not None and simulated.decision.cause == "piston or pump leak"
+    assert simulated.wear is not None and simulated.decision.cause == "piston, pump or external leak"
     names = {observable.name for observable in trend_leak._rival_changes(points, simulated.wear)}
     assert {"external leak A", "external leak B", "free air"} <= names
 

@@ -12,6 +12,8 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.inference.balance import BlockStream, bridged_samples
+from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.comparison.coefficients import estimate_leak_excess
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
@@ -20,6 +22,7 @@ from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.units import LITRE_PER_MINUTE
 
 AREA, COMPLIANCE, RATE = 2.0e-3, 2.0e-13, 100.0
+SERVO = frozenset({"x", "u", "p_1", "p_2", "p_A", "p_B"})
 
 
 @cache
@@ -119,3 +122,25 @@ def test_a_return_that_nobody_logs_has_the_pressure_of_the_rig() -> None:
     balances = [VolumeBalance(load_rig("servo-valve")).balance(each) for each in (recording, without_return)]
     values = [balance.conductance[0] for balance in balances if balance is not None]
     assert len(values) == 2 and values[1] == pytest.approx(values[0], rel=0.1)
+
+
+def test_an_overlap_of_a_healthy_valve_is_no_leak_of_its_piston() -> None:
+    """Where friction makes p_A - p_B, both look alike: the healthy leak is that of a seal, so that friction may change.
+
+    Each row of the balance is a stroke. What the valve passes by its underlap varies a little, as friction does.
+    """
+    roles = ColumnRoles(equations(load_rig("servo-valve"), SERVO)[0])
+    leak, overlap, left = roles.leak, roles.names.index("overlap P to A"), roles.left
+    random = np.random.default_rng(0)
+
+    def record(friction: float) -> np.ndarray:
+        """Compute the Gram matrix of strokes under a `friction` [Pa], with an underlap of the valve and no leak."""
+        sense, varied = random.choice([-1.0, 1.0], 400), 1.0 + 0.02 * random.standard_normal(400)
+        rows = np.zeros((400, left + 1))
+        rows[:, leak], rows[:, overlap] = friction * sense * varied, 3e3 * sense
+        rows[:, left] = -6e-6 * sense * varied + 1e-8 * random.standard_normal(400)
+        return rows.T @ rows / 1e-14
+
+    healthy = np.sum([record(1e5) for _ in range(5)], axis=0)
+    (excess,), _ = estimate_leak_excess(record(3e5)[None], healthy[None], [roles], np.ones(1))
+    assert excess * 3e5 < 0.1 * 6e-6  # a free leak would be the underlap's, and fall short of friction's growth

@@ -112,12 +112,15 @@ def residual_products(
     roles of their columns. Returns the products (m,) of the residual with each column, and in place of the left side,
     the last column, with itself; the indices of the c columns whose coefficients may differ between recordings; and the
     precisions (c,) of the priors on these differences. Columns that may differ without limit (infinite
-    `between_deviation`) are not fitted. `has_leak`: true if the coefficient of the leak is among the c coefficients,
-    with the prior of the pump's leakage, `between.pump` (`priors.toml`).
+    `between_deviation`) are not fitted. The leak of healthy recordings has the prior of a healthy piston behind a servo
+    valve, whose overlap looks like a leak where friction makes p_A - p_B. `has_leak`: true if the coefficient of the
+    leak is among the c coefficients, with the prior of the pump's leakage, `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
-    coefficients = np.zeros(len(gram))
-    coefficients[compared] = -solve(reference[np.ix_(compared, compared)], reference[compared, roles.left])
+    coefficients, matrix = np.zeros(len(gram)), reference[np.ix_(compared, compared)].copy()
+    leak = compared.index(roles.leak)
+    matrix[leak, leak] += roles.healthy_conductance**-2  # precision of the prior; 0 if the healthy leakage is unknown
+    coefficients[compared] = -solve(matrix, reference[compared, roles.left])
     nuisance = [k for k in compared if has_leak or k != roles.leak]
     prior = roles.difference_precisions(nuisance, coefficients[nuisance], coefficients[roles.names.index(LEAK)])
     coefficients[roles.left] = 1.0  # residual = left side - sum of the fitted terms
