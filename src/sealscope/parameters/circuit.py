@@ -97,7 +97,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
     holds_load=True,
     flow_size="area",
     watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
-    needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1, p_2 of supply and return for motion",
+    needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1 of the supply for motion",
 )
 #: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As these two circuits cover
 #: all values of their parameter, a circuit that another parameter chooses must stand before them.

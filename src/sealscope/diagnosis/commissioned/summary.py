@@ -178,9 +178,11 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
         description["pressure_bar"] = _round_to_4_digits(float(np.mean(np.abs(part["p_A"] - part["p_B"]))) / BAR)
     if (oil := oil_temperature(recording)) is not None:
         description["oil_degC"] = _round_to_4_digits(oil)
-    recorded = [name for name in part.channels if name in recording]  # not q_supply in place of a q_pump without a sign
-    description["noise"] = {name: noise for name in recorded if (noise := _estimate_noise(recording[name])) > 0.0}
-    log_units = {name: unit for name in recorded if (unit := recording.unit_in_log(name))}
+    # name in the log of each channel; q_supply may stand for a q_pump without a sign
+    logged = {name: name if name in recording else "q_pump" for name in part.channels}
+    noises = {name: _estimate_noise(recording[log_name]) for name, log_name in logged.items()}
+    description["noise"] = {name: noise for name, noise in noises.items() if noise > 0.0}
+    log_units = {name: unit for name, log_name in logged.items() if (unit := recording.unit_in_log(log_name))}
     if log_units:
         description["log_units"] = log_units
     findings = inspection.findings
