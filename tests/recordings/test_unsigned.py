@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.recordings.corrections.unsigned import _most_likely_signs, restore_speed_sign
+from sealscope.recordings.corrections.unsigned import _is_in_supply_line, _most_likely_signs, restore_speed_sign
 from sealscope.recordings.recording import Recording
 
 RPM = 2.0 * np.pi / 60.0
@@ -69,3 +69,12 @@ def test_signs_are_those_of_the_most_likely_path() -> None:
         paths = 1.0 - 2.0 * ((np.arange(2**8)[:, None] >> np.arange(8)) & 1)
         value = 0.5 * paths @ odds - (paths[:, 1:] != paths[:, :-1]) @ cost
         assert np.array_equal(_most_likely_signs(odds, cost), paths[np.argmax(value)])
+
+
+def test_a_meter_whose_flow_has_the_wrong_sense_throughout_is_no_error() -> None:
+    """Its position moves against the flow: no direction has motion of the flow's sign, which tells no supply line."""
+    recording, _ = held_lift(0.0, noise=0.5)
+    opposite = -np.sign(np.gradient(recording["x"]))
+    metered = {**recording.only(["x"]).channels, "u": opposite, "q_pump": np.abs(np.gradient(recording["x"]))}
+    meter = Recording(recording.t, metered, {"x": "m", "u": "V", "q_pump": "m^3/s"}, recording.rate)
+    assert not _is_in_supply_line(meter, opposite)

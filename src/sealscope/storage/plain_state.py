@@ -113,7 +113,7 @@ def restore_attributes(
     """Set the attributes of `owner` called `names` to the values that `save_attributes` saved in `state`.
 
     - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
-      `owner` is a named tuple, its arrays are filled in place. The same holds for each array of a list.
+      `owner` is a named tuple, its arrays are filled in place. The rule on shapes holds for each array of a list.
     - An attribute with a method `load_state` restores itself.
     - A saved None leaves an attribute unchanged if its present value is a float or None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
@@ -153,7 +153,7 @@ def _restore_like(present: NDArray[Any], saved: Any, name: str) -> NDArray[Any]:
 
 
 class SavedAttributes:
-    """An object whose attributes `SAVED` are saved as plain values for JSON, and restored to the last bit.
+    """An object whose attributes `SAVED` are saved as plain values for JSON, and restored to the last bit if finite.
 
     `SAVED_TYPES`: by name, the types of saved attributes whose first value has another type, such as None.
     """

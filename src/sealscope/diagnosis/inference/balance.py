@@ -21,6 +21,7 @@ from sealscope.diagnosis.inference.equations.signals import (
     MIN_REST,
     RestLimits,
     Signals,
+    extend_flags,
     find_rests,
 )
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
@@ -325,18 +326,12 @@ class BlockStream(SavedAttributes):
         row_weights = np.where(is_whole, hole_weights, 0.0)
         is_counted = row_weights > 0.0
         if self._drops_rests:
-            is_far = ~_extend_both_ways(signals.moving(self._balances[0].left) > 0.0, SPAN * self._stride)
+            reach = SPAN * self._stride  # length of a test function, on either side of motion [samples]
+            is_moving = signals.moving(self._balances[0].left) > 0.0
+            is_far = ~extend_flags(is_moving, 2 * reach + 1)[reach:-reach]
             time_far = np.asarray(is_far[without_margins] * signals.dt)
             is_counted &= weak_form_rows([time_far], self._rate).values[:, 0] == 0.0
         return rows, row_weights, is_counted, mean_flow, pressures
-
-
-def _extend_both_ways(flags: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
-    """Flag also the `length` samples before and after each flagged one of `flags` (n,)."""
-    counts = np.concatenate([[0], np.cumsum(flags)])
-    index = np.arange(len(flags))
-    ends = counts[np.minimum(index + length + 1, len(flags))]
-    return np.asarray(ends > counts[np.maximum(index - length, 0)])
 
 
 def _z_score(products: Array) -> float:

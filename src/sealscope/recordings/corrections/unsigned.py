@@ -53,7 +53,7 @@ def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
-        if name == "q_pump" and "x" in recording and "u" in recording and _is_in_supply_line(recording, sign):
+        if name == "q_pump" and {"x", "u"} <= channels.keys() and _is_in_supply_line(recording, sign):
             channels["q_supply"], units["q_supply"] = channels.pop(name), units.pop(name)
             text += ", and it counts as the flow in the valve's supply line (q_supply)"
         findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
@@ -64,8 +64,8 @@ def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     """Test whether a flow meter without a sign is in the supply line of a valve, and not in a line of the cylinder.
 
     The valve's command must move both ways. In the supply line, the flow over the piston's speed is the area of the fed
-    chamber, which differs between the directions behind a single rod by the fraction `unsigned.unlike` (`priors.toml`)
-    or more. Behind a double rod, oil that passes the valve while the piston rests tells the supply line: at least the
+    chamber, whose logarithm differs between the directions behind a single rod by `unsigned.unlike` (`priors.toml`) or
+    more. Behind a double rod, oil that passes the valve while the piston rests tells the supply line: at least the
     fraction `unsigned.passes` of the mean flow in motion. `sign` (n,): signs of the flow into chamber A.
     """
     magnitude, speed = np.abs(recording["q_pump"]), _piston_speed(recording["x"], recording.rate)
@@ -73,9 +73,11 @@ def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     magnitude, speed, sign = magnitude[known], speed[known], sign[known]
     if not _moves_both_ways(recording["u"]) or not _moves_both_ways(speed):
         return False
+    directions = ((speed > 0.0) & (sign > 0.0), (speed < 0.0) & (sign < 0.0))
+    # flow over speed in each direction [unit of the flow per m/s]; 0 without motion that has the flow's sign
     gains = [
-        float(magnitude[moves] @ np.abs(speed[moves])) / float(speed[moves] @ speed[moves])
-        for moves in ((speed > 0.0) & (sign > 0.0), (speed < 0.0) & (sign < 0.0))
+        float(magnitude[moves] @ np.abs(speed[moves])) / max(float(speed[moves] @ speed[moves]), np.finfo(float).tiny)
+        for moves in directions
     ]
     if min(gains) > 0.0 and abs(float(np.log(gains[0] / gains[1]))) > _PRIORS.unlike:
         return True

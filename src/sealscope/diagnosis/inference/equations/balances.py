@@ -50,6 +50,7 @@ from sealscope.recordings.recording import Array
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Terms of the balance of a cylinder whose flow is that of a pump, or of a meter in one of its lines.
 _CYLINDER = (
     *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
     *chamber_terms("A"),
@@ -218,9 +219,8 @@ _STANDSTILL = (*(chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
 
-    Its signals must contain `START` (`balance.derive_drive_signals`).
-
-    The balance holds over whole cycles or at standstill, so the position need not be known. The offset of the flow,
+    The balance holds over whole cycles or at standstill, so the position need not be known. Its signals must contain
+    `START` (`balance.derive_drive_signals`). The offset of the flow,
     which cannot be separated from leakage under a steady load, is assumed to be zero. Return None if the pump does not
     feed the chambers, or if its delivery or a chamber's pressure is not recorded.
     """

@@ -161,9 +161,9 @@ def find_rests(increments: Array, rate: float, limit: float, shortest: float = M
     # a window of samples is flagged by its first sample if it is slow on average and no sample is missing
     is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate
     is_slow &= n_missing[window:] == n_missing[:-window]
-    n_moving = np.concatenate([[0], np.cumsum(~_extend_flags(is_slow, window))])
+    n_moving = np.concatenate([[0], np.cumsum(~extend_flags(is_slow, window))])
     is_rest_start = n_moving[min_length:] == n_moving[:-min_length]  # no moving sample among the next `min_length`
-    return _extend_flags(is_rest_start, min_length)
+    return extend_flags(is_rest_start, min_length)
 
 
 def central_difference(values: Array, half_width: int) -> Array:
@@ -175,7 +175,7 @@ def central_difference(values: Array, half_width: int) -> Array:
     return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
 
 
-def _extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
+def extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
     """Flag each flagged sample of `starts` (n,) and the next `length` - 1 samples, shape (n + length - 1,)."""
     changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
     changes[: len(starts)] += starts
