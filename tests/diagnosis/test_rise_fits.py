@@ -1,0 +1,85 @@
+"""Size of a leak that the comparison with healthy recordings shows, if it began or grew within the recording."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.inference.equations.terms import ORIFICE
+from sealscope.diagnosis.inference.leak_law import RiseFits, find_leak_step, fit_rise
+from sealscope.diagnosis.inference.onset import Estimate, Information
+from sealscope.recordings.recording import Array
+
+K, BLOCK_S, PRESSURE = 60, 2.0, 5e6
+TIME = BLOCK_S * (np.arange(K) + 0.5)
+ONSET, END = 60.0, BLOCK_S * K
+#: A press tells most in the first half of a recording, a plain machine as much in each block.
+PRESS, PLAIN = np.where(TIME < ONSET, 25.0, 1.0), np.ones(K)
+#: A leak that grows from nothing, and one that is older than the recording, with a mean flow of 1 since the onset.
+GROWING, OLDER = 2.0 * np.clip((TIME - ONSET) / (END - ONSET), 0.0, None), np.ones(K)
+
+
+class ConstantPressure(SimpleNamespace):
+    """Blocks of a machine with a constant p_A - p_B, whose leak and orifice have the same conductance."""
+
+    pressure_weights = np.ones(K)
+    gram = np.tile([[1.0, PRESSURE**-0.5], [PRESSURE**-0.5, 1.0 / PRESSURE]], (K, 1, 1, 1))
+
+    def __len__(self) -> int:
+        return K
+
+    def mean_pressure(self) -> Array:
+        return np.full(K, PRESSURE)
+
+    def mean_root(self) -> Array:
+        return np.full(K, PRESSURE**0.5)
+
+
+def fit(course: Array, weights: Array, seed: int) -> RiseFits:
+    """Fit a leak whose flow is `course`, over a healthy level of 3, with `weights` as the information of each block."""
+    blocks: Any = ConstantPressure()
+    columns: Any = [SimpleNamespace(leak=0, names=("leak", ORIFICE))]
+    unit, deviation = 1.0 / PRESSURE, 0.05  # conductance of a flow of 1; error of the rise
+    precision = weights / weights.mean() / (0.15 * unit) ** 2
+    random = np.random.default_rng(seed)
+    estimates = unit * (3.0 + course) + random.standard_normal(K) / np.sqrt(precision)
+    scale = 0.3 * unit
+    leak = Information(TIME, np.diag(precision), precision * estimates, slope=scale, walk=scale)
+    rise = float(weights @ course / weights.sum()) + deviation * random.standard_normal()
+    laws = [(PRESSURE, float(np.log(prior))) for prior in (0.5, 0.25, 0.25)]
+    test = find_leak_step(blocks, columns, leak)
+    return fit_rise(blocks, columns, leak, weights, test, Estimate(rise * unit, deviation * unit), laws, max_flow=50.0)
+
+
+@pytest.mark.parametrize("weights", [PRESS, PLAIN])
+@pytest.mark.parametrize("course", [GROWING, (TIME > ONSET).astype(float), OLDER])
+def test_the_interval_contains_the_mean_flow_since_the_onset(course: Array, weights: Array) -> None:
+    """A press whose leak grew to 2 L/min was stated with the mean of its informative half, in which nothing leaks."""
+    flows = [fit(course, weights, seed).flow for seed in range(24)]
+    assert sum(abs(flow.value - 1.0) < 1.96 * flow.deviation for flow in flows) >= 20
+    assert np.median([flow.deviation for flow in flows]) < 0.3
+
+
+@pytest.mark.parametrize("course", [GROWING, (TIME > ONSET).astype(float), OLDER])
+def test_the_bound_is_above_the_mean_flow_over_the_recording(course: Array) -> None:
+    bounds = [fit(0.5 * course, PRESS, seed).bound for seed in range(24)]
+    assert sum(bound > 0.5 * course.mean() for bound in bounds) >= 21
+
+
+def test_the_course_tells_an_older_leak_from_one_that_began_within() -> None:
+    def older(course: Array) -> float:
+        """Compute the probability of a leak that is older than the recording."""
+        fits = fit(course, PLAIN, seed=1)
+        return float(fits.probabilities[np.isneginf(fits.onsets)].sum())
+
+    assert older(OLDER) > 0.9
+    assert older(GROWING) < 0.1
+
+
+def test_a_leak_larger_than_the_flow_of_the_pump_is_excluded() -> None:
+    fits = fit(OLDER, PLAIN, seed=1)
+    is_possible = np.isfinite(fits.log_weights)
+    assert (np.abs(fits.flows[is_possible]) <= 50.0).all()
