@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.recordings.corrections.unsigned import _is_in_supply_line, _most_likely_signs, restore_speed_sign
+from sealscope.recordings.corrections.unsigned import _is_in_supply_line, _most_likely_signs, restore_signs
 from sealscope.recordings.recording import Recording
 
 RPM = 2.0 * np.pi / 60.0
@@ -32,7 +32,7 @@ def held_lift(hold_speed: float, noise: float) -> tuple[Recording, np.ndarray]:
 @pytest.mark.parametrize("hold_speed", [2.0, 5.0, 20.0])
 def test_a_pump_that_holds_a_load_turns_one_way(hold_speed: float) -> None:
     recording, speed = held_lift(hold_speed, noise=0.5)
-    restored, (finding,) = restore_speed_sign(recording)
+    restored, (finding,) = restore_signs(recording)
     in_hold = np.abs(speed - hold_speed * RPM) < 1e-9
     assert finding.code == "unsigned_speed"
     assert np.mean(restored["omega"][in_hold]) == pytest.approx(hold_speed * RPM, rel=0.03)
@@ -43,10 +43,10 @@ def test_noise_at_rest_has_no_mean_and_a_slow_flow_keeps_its_own() -> None:
     """The magnitude of noise has a mean of 0.8 standard deviations, which would pass for a pump that turns."""
     resting, speed = held_lift(0.0, noise=2.0)
     assert np.abs(resting["omega"][np.abs(speed) < 1e-9]).mean() > 1.5 * RPM
-    restored, _ = restore_speed_sign(resting)
+    restored, _ = restore_signs(resting)
     rest = restored["omega"][np.abs(speed) < 1e-9]
     assert abs(rest.mean()) < 0.2 * RPM and rest.std() == pytest.approx(2.0 * RPM, rel=0.1)
-    again, _ = restore_speed_sign(resting)
+    again, _ = restore_signs(resting)
     assert np.array_equal(restored["omega"], again["omega"])
     assert np.abs(restored["omega"]) == pytest.approx(np.abs(resting["omega"]))
 
@@ -55,7 +55,7 @@ def test_a_pump_that_turns_one_way_keeps_the_signed_noise_of_its_sensor() -> Non
     recording, speed = held_lift(0.0, noise=2.0)
     signed_noise = np.random.default_rng(5).standard_normal(len(recording)) * 2.0 * RPM
     one_way = replace(recording, channels={**recording.channels, "omega": np.abs(speed) + signed_noise})
-    restored, _ = restore_speed_sign(one_way)
+    restored, _ = restore_signs(one_way)
     rest = np.abs(speed) < 1e-9
     assert abs(restored["omega"][rest].mean()) < 0.05 * RPM
     assert np.mean(restored["omega"][~rest] * speed[~rest] > 0.0) > 0.98

@@ -138,7 +138,7 @@ class _Actuator:
             if is_stream and self.last is not None:  # the blocks of the stream tell more
                 self.verdict = None
             return []
-        if verdict.clears:
+        if verdict.excludes_leak:
             if is_stream and alarm is not None and not verdict.excludes(alarm.leak_lpm):
                 self.verdict = None
                 return []
@@ -262,16 +262,17 @@ class WatchedActuators:
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
         """Restore an actuator from its last checkpoint in the database and the samples since then, or create it."""
         name = settings.name
-        machine = load_watched(settings.rig)
-        is_recorded = machine.machine is not None and settings.folder is None and settings.recording_s > 0.0
+        watched = load_watched(settings.rig)
+        is_cut_into_recordings = watched.machine is not None and settings.folder is None and settings.recording_s > 0.0
+        stream_share = 1.0 - STREAM_SHARE if is_cut_into_recordings else 1.0  # the recordings take the rest
         fresh = watch(
-            machine.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * (1.0 - STREAM_SHARE if is_recorded else 1.0),
+            watched.rig,
+            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * stream_share,
             learn_hours=settings.learn_hours,
-            healthy=machine.healthy,
+            healthy=watched.healthy,
         )
         n_stored = self.store.last_number(self.store.tables.blocks, name)
-        recorder = StreamRecorder(name, settings.recording_s) if is_recorded else None
+        recorder = StreamRecorder(name, settings.recording_s) if is_cut_into_recordings else None
         actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
         checkpoint = self.store.checkpoint(name)
         if checkpoint is None or self._load_checkpoint(actuator, checkpoint):  # a new checkpoint is needed

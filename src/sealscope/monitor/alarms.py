@@ -227,8 +227,8 @@ class AlarmJudge:
         unknown size counts as above the threshold. A recording of a stream (`is_stream`) raises an alarm only if the
         attribute `evidence`, collected from the stream's recordings, reaches 1/alpha, where alpha is the probability of
         a false alarm that these recordings are allowed. The verdict `no leak`, or a leak below the warning threshold,
-        ends the alarm and resets `evidence`. `baseline`: version of the healthy baseline; `settings`: thresholds and
-        the allowed rate of false alarms.
+        ends an active alarm, and only then resets `evidence`. `baseline`: version of the healthy baseline; `settings`:
+        thresholds and the allowed rate of false alarms.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for
         none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
@@ -237,7 +237,7 @@ class AlarmJudge:
         is_active = alarm is not None and alarm.active
         is_above = verdict.leaks and (lpm is None or lpm >= settings.warning_lpm)
         if not is_above:
-            if alarm is None or not is_active or not (verdict.clears or verdict.leaks):
+            if alarm is None or not is_active or not (verdict.excludes_leak or verdict.leaks):
                 return None
             end_state: AlarmState = "new" if alarm.state == "new" else "closed"
             end_s, self.evidence = verdict.end_s, 0.0
@@ -245,7 +245,7 @@ class AlarmJudge:
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
         by_chance = verdict.by_chance_per_1000_h
         if is_stream:
-            by_chance = 1.0 / (verdict.allowed_chance(1.0) * self.evidence)
+            by_chance = 1.0 / (verdict.allowed_chance(1.0) * self.evidence)  # rate at which the evidence just suffices
         findings: dict[str, Any] = {
             "level": level,
             "updated_s": verdict.end_s,
@@ -269,7 +269,9 @@ class AlarmJudge:
             return None
         onset_s = verdict.start_s if verdict.onset_s is None else verdict.onset_s
         # a leak present from the first sample on began after the last recording without a leak
-        min_onset_s = verdict.start_s if earlier is None or not earlier.clears else min(earlier.end_s, verdict.start_s)
+        min_onset_s = (
+            verdict.start_s if earlier is None or not earlier.excludes_leak else min(earlier.end_s, verdict.start_s)
+        )
         interval = verdict.onset_interval_s or (min_onset_s, onset_s)
         findings |= {"raised_s": verdict.end_s, "onset_s": onset_s, "onset_interval_s": interval}
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"

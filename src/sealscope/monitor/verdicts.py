@@ -105,7 +105,7 @@ class RecordingVerdict:
         return bool(self.verdict == LEAK)
 
     @property
-    def clears(self) -> bool:
+    def excludes_leak(self) -> bool:
         """True if the verdict is "no leak"."""
         return bool(self.verdict == NO_LEAK)
 
@@ -119,7 +119,7 @@ class RecordingVerdict:
 
         The verdicts `leak` and `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
         """
-        return self.leaks or self.clears or self.mark != ""
+        return self.leaks or self.excludes_leak or self.mark != ""
 
     def allowed_chance(self, false_alarms_per_1000_h: float) -> float:
         """Compute the probability of a false alarm that a rate allows for one recording of this length."""

@@ -170,10 +170,10 @@ def flow_basis(diagnosis: Diagnosis) -> str | None:
 def machine_text(machine: AssumedMachine) -> str:
     """Format the piston area and pump displacement on which flows [L/min] are based, and the origin of both.
 
-    If a flow meter measures the pump's flow, the text names only this meter.
+    If a meter measures the flow to the cylinder or to its valve, the text names only this meter.
     """
     if machine.flow_meter:
-        key = "meter"
+        key = "meter"  # of `messages.toml`
     elif machine.stated_by == "recording":
         key = "recording"
     elif machine.stated:

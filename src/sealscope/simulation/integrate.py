@@ -502,12 +502,12 @@ class StepErrorCheck:
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
         self._tolerance = tolerance
-        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # for samples of the recording
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # solver outputs per sample
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
         # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
         self._squares = np.zeros((LEVELS, 4))  # sums of the squared details over all windows so far
-        self._samples = 0
+        self._samples = 0  # of `_squares`
         self.pressure_error = self.detail_error = 0.0
 
     def add_window(self, coarse: Array, fine: Array) -> float:

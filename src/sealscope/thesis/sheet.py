@@ -116,7 +116,7 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 digest of its two files.
 
     Raises UnreadableFile if a file cannot be read, and InputError if a column is missing, if a value is not a positive
-    number (only the closing may be 0), or if the rows are not the tests of `APPENDIX_C`.
+    number (only the throttles' closed fraction may be 0), or if the rows are not the tests of `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()

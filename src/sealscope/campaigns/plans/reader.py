@@ -77,11 +77,11 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
         plan = _complete_simulated_plan(plan)
     elif not any(recordings.use == "judge" for recordings in plan.sets):
         raise InputError(f"recordings.sets must have one to judge, got none ({place})")
-    _call_for_entry("campaign.assume", place, lambda: plan.assumed)
+    _check_entry("campaign.assume", place, lambda: plan.assumed)
     for name in plan.detectors:
-        _call_for_entry("campaign.detectors", place, partial(check_detector, name, plan.views))
+        _check_entry("campaign.detectors", place, partial(check_detector, name, plan.views))
     if {DIAGNOSE, WATCH} & {parse_detector_name(name).base for name in plan.detectors}:
-        _call_for_entry("campaign.false_alarm", place, partial(check_probability, plan.false_alarm))
+        _check_entry("campaign.false_alarm", place, partial(check_probability, plan.false_alarm))
     if len(set(plan.detectors)) < len(plan.detectors):
         raise InputError(f"campaign.detectors must be named once each ({place})")
     return plan
@@ -115,7 +115,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
     return read_model(entries, plan_class, place, lambda entry: full_names.get(entry, f"campaign.{entry}"))
 
 
-def _call_for_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
+def _check_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
     """Call `function` for an entry of a plan; add `entry`, such as "campaign.rig", and `place` to an InputError."""
     try:
         return function()
@@ -134,10 +134,10 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
     plan = replace(plan, rig_name=_path_in_plan_folder(plan.rig_name, place), profile=profile, onset_s=onset)
-    _call_for_entry("campaign.rig", place, lambda: load_rig(plan.rig_name))
-    _call_for_entry("campaign.set", place, lambda: plan.rig)
+    _check_entry("campaign.rig", place, lambda: load_rig(plan.rig_name))
+    _check_entry("campaign.set", place, lambda: plan.rig)
     if profile:
-        _call_for_entry("campaign.profile", place, partial(load_profile, profile))
+        _check_entry("campaign.profile", place, partial(load_profile, profile))
     if not 0.0 < onset < plan.duration_s:
         rule = f"must be within the duration, 0 s to {plan.duration_s:g} s"
         raise InputError(f"campaign.onset {rule}, got {onset:g} ({place})")
@@ -157,7 +157,7 @@ def _check_factors(plan: SimulatedPlan) -> None:
         if len({repr(level) for level in levels}) < len(levels):
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
         for level in levels:
-            _call_for_entry(f"factors.{name}", plan.place, partial(_check_level, plan, name, level))
+            _check_entry(f"factors.{name}", plan.place, partial(_check_level, plan, name, level))
     cells = math.prod(map(len, plan.factors.values()))
     if cells > MAX_CELLS:
         raise InputError(f"factors: their levels must make at most {MAX_CELLS} cells, got {cells} ({plan.place})")
@@ -202,7 +202,7 @@ def _check_records(plan: SimulatedPlan) -> None:
     for number, (content, group) in enumerate(zip(contents, plan.records, strict=True), 1):
         if group.fault:
             parse_group_fault = partial(parse_plan_fault, group.fault, plan.onset_s)
-            _call_for_entry(f"records[{number}].fault", plan.place, parse_group_fault)
+            _check_entry(f"records[{number}].fault", plan.place, parse_group_fault)
         if content in contents[: number - 1]:
             rule = "records must differ from the others in use, leak, law or fault"
             raise InputError(f"records[{number}].{rule} ({plan.place})")

@@ -215,7 +215,7 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     backup = target.with_suffix(".toml.bak")
     present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
-        tree = _read_if_valid(path)
+        tree = _read_if_readable(path)
         present_lines |= {line.checksum: line for line in read_lines(_summaries_path(path, tree))}
         named_checksums += _named_summaries(tree)
     lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
@@ -287,7 +287,7 @@ def _read_checked(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _read_if_valid(path: Path) -> dict[str, Any]:
+def _read_if_readable(path: Path) -> dict[str, Any]:
     """Read the tables of a machine's file without checking them; an empty mapping if it cannot be read."""
     try:
         return read_toml(path, "a machine's file", str(path))

@@ -158,18 +158,20 @@ class Case:
     def has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
-        An older leak explains the rise over healthy recordings and, by its law, some changes with the pressure. One
-        that began within the recording explains a step (a sudden increase) and the rise that this step causes. The
-        result is True without measured leakage or healthy recordings, or if the times in which valves hold the load
-        show when the rise began (`rise_onset` is not None).
+        Log Bayes factors are compared. That of a leak that began within the recording is the factor of a step (a sudden
+        increase) plus that of the rise over healthy recordings by this step. That of an older leak, which was there
+        from the first sample on, is the larger of two: the factor of a rise of any size, and the factor of a leak whose
+        size follows from how its flow bends over the pressure. The result is True without measured leakage or healthy
+        recordings, or if the times in which valves hold the load show when the rise began (`rise_onset` is not None).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
         rise = leak.step_rise
         step_gain = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
-        older_gain = older_leak_gain(step_gain, rise) + rise.older_log_ratio
-        return step_gain + rise.step_log_ratio > max(older_gain, log_bayes_factor(rise.rise.chance))
+        within_gain = step_gain + rise.step_log_ratio
+        bending_gain = older_leak_gain(step_gain, rise) + rise.older_log_ratio
+        return within_gain > max(log_bayes_factor(rise.rise.chance), bending_gain)
 
     def leak_flow(self, alarm: LeakTest) -> Estimate | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.

@@ -216,14 +216,14 @@ class ColumnRoles:
     def __init__(self, equation: Equation) -> None:
         self.names = tuple(term.name for term in equation.terms)
         self.left = len(self.names)
-        self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.nuisance)
-        self.compared = tuple(k for k, term in enumerate(equation.terms) if term.nuisance or term.compared)
+        self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.is_fitted)
+        self.compared = tuple(k for k, term in enumerate(equation.terms) if term.is_fitted or term.is_compared)
         # true for a balance that `balances.shut_at_rest` made
         is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
         self.hold_leak = self.names.index(HOLDING) if is_shut else None
         self.leak = self.names.index(LEAK)
         drift_priors = vars(INFERENCE.drift)
-        self.drift_rate = np.array([drift_priors[term.drift] if term.nuisance else 0.0 for term in equation.terms])
+        self.drift_rate = np.array([drift_priors[term.drift] if term.is_fitted else 0.0 for term in equation.terms])
         between_priors = vars(INFERENCE.between)
         self.between_deviation = np.zeros(len(equation.terms))
         self.between_deviation[list(self.compared)] = [between_priors[equation.terms[k].drift] for k in self.compared]

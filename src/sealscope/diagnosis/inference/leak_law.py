@@ -18,15 +18,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
 from sealscope.diagnosis.inference.onset import (
+    BOUND_PROBABILITY,
     Estimate,
     Information,
     StepTest,
+    bound_steps,
     constant_log_ratio,
     step_shapes,
     step_sizes,
@@ -197,6 +200,18 @@ def growth_priors() -> list[tuple[float, float]]:
     return [(0.0, prior.steady), *((float(growth), probability) for growth in growths)]
 
 
+def _step_growths() -> list[tuple[float, float]]:
+    """List the relative growths of a leak that begins within a recording, with their prior probabilities.
+
+    They are those of `growth_priors`, and infinity for a leak that grows from nothing: it has the fraction
+    `growth.from_nothing` (`priors.toml`) of the probability of leaks that grow.
+    """
+    from_nothing: float = INFERENCE.growth.from_nothing
+    steady, *growing = growth_priors()
+    growths = [steady, *((growth, (1.0 - from_nothing) * probability) for growth, probability in growing)]
+    return [*growths, (math.inf, from_nothing * (1.0 - steady[1]))]
+
+
 def _onset_positions(leak: Information, test: StepTest) -> Array:
     """Return the onsets (o,) of `test`, counted in blocks from the start of the recording.
 
@@ -219,7 +234,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     weight_after = np.maximum(block_weights @ step_shapes(len(blocks), positions), _TINY)
     shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
     log_weights, flows, standard_errors = [], [], []  # lists of arrays (o,), for each growth and exponent
-    for growth, probability in growth_priors():
+    for growth, probability in _step_growths():
         steps = step_shapes(len(blocks), positions, growth)  # (K, o)
         for exponent in EXPONENTS:
             likelihood, size, deviation = step_sizes(leak, onsets, shapes[exponent], growth)
@@ -232,61 +247,127 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     return mixture_flow(weights, np.ravel(flows), np.ravel(standard_errors))
 
 
-def estimate_rise_flow(
+class RiseFits(NamedTuple):
+    """Leak above healthy recordings under h hypotheses on its onset, growth and law.
+
+    `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
+    is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
+    mean flow after the onset and its standard error [m^3/s].
+    """
+
+    log_weights: Array
+    onsets: Array
+    parts: Array
+    flows: Array
+    deviations: Array
+
+    @property
+    def probabilities(self) -> Array:
+        """Probability of each hypothesis (h,)."""
+        weights = np.exp(self.log_weights - self.log_weights.max())
+        return np.asarray(weights / weights.sum())
+
+    @property
+    def flow(self) -> Estimate:
+        """Mean flow [m^3/s] of the leak after its onset, averaged over the hypotheses."""
+        return mixture_flow(self.probabilities, self.flows, self.deviations)
+
+    @property
+    def bound(self) -> float:
+        """95 % upper bound of the leak's mean flow over the recording [m^3/s], given that it is positive."""
+        return bound_steps(self.probabilities, self.parts * self.flows, self.parts * self.deviations, BOUND_PROBABILITY)
+
+
+def fit_rise(
+    blocks: Blocks,
+    columns: Sequence[ColumnRoles],
     leak: Information,
+    weights: Array,
     test: StepTest | None,
-    value: float,
-    deviation: float,
+    rise: Estimate,
     laws: Sequence[tuple[float, float]],
     max_flow: float,
-) -> Estimate:
-    """Estimate the mean flow [m^3/s] of a leak after its onset, from the leakage above that of healthy recordings.
+) -> RiseFits:
+    """Fit a leak to the rise over healthy recordings and to the changes of the leakage within the recording.
 
-    - `leak`: likelihood of the leak's coefficient in the blocks of the recording; `test`: test for a step of it, None
-      for a leak from the start;
-    - `value`, `deviation`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
-    - `laws`: for each law of `EXPONENTS` the mean flow for a rise of 1, and its log probability up to a constant;
-    - `max_flow`: mean flow of the pump [m^3/s]; onsets and laws with a larger leak are excluded.
+    - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
+      in the blocks; `test`: test for a step of it, None for a leak from the start; `weights` (K,): information of each
+      block in the comparison with healthy recordings;
+    - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
+    - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
+      a constant;
+    - `max_flow`: mean flow of the pump [m^3/s]; hypotheses with a larger leak are excluded.
 
-    For an onset and a law the flow is the mean rise times the law's flow per rise, divided by the fraction of the
-    recording's information after the onset. The result is the mean of these flows over the onsets, under the most
-    probable law; its standard error includes the differences to the other laws. If all are excluded, it is the flow
-    under the first law for a leak from the start.
+    A leak with the coefficient s, and a given onset, growth and law, changes the conductance of block k by s c_k. The
+    changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
+    leak (`step_sizes`). The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted
+    by the information of the blocks; f_0 is this mean for a leak of this law that is older than the recording. With a
+    flat prior on s, the log likelihood ratio to the older leak is
+
+        L + log(f_0 e / sqrt(d^2 + f^2 e^2)) - (r - f s')^2 / (2 (d^2 + f^2 e^2)).
+
+    All onsets together are as probable beforehand as an older leak, and a leak is positive. If all hypotheses are
+    excluded, the result is an older leak under the first law.
     """
-    log_weights, fractions = _weigh_rise_onsets(leak, test, value)
+    from scipy.special import log_ndtr
+
     unit_flows, law_log_weights = np.array(laws).T
-    flows = value * unit_flows / fractions[:, None]  # (onset, law)
-    log_weights = np.where(np.abs(flows) > max_flow, -np.inf, log_weights[:, None] + law_log_weights)
+    ones = np.ones(len(laws))
+    older = RiseFits(law_log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows)
+    fits = [older]
+    weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
+    if test is not None:
+        fits += [
+            _fit_rise_within(blocks, columns, leak, weights, test, rise, growth, law_log_weights + np.log(probability))
+            for growth, probability in _step_growths()
+        ]
+    fit = RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
+    log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
+    log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
     if not np.isfinite(log_weights).any():
-        return Estimate(value * float(unit_flows[0]), deviation * float(unit_flows[0]))
-    weights = np.exp(log_weights - log_weights.max())
-    law = int(weights.sum(axis=0).argmax())  # the most probable
-    flow = float(weights[:, law] @ flows[:, law] / weights[:, law].sum())
-    variances = (deviation * unit_flows / fractions[:, None]) ** 2 + (flows - flow) ** 2
-    return Estimate(flow, float(np.sqrt((weights * variances).sum() / weights.sum())))
+        return RiseFits(*(values[:1] for values in older))
+    return fit._replace(log_weights=log_weights)
 
 
-def _weigh_rise_onsets(leak: Information, test: StepTest | None, value: float) -> tuple[Array, Array]:
-    """Weigh the possible onsets of a leak whose coefficient has risen by `value` on average over the recording.
+def _fit_rise_within(
+    blocks: Blocks,
+    columns: Sequence[ColumnRoles],
+    leak: Information,
+    weights: Array,
+    test: StepTest,
+    rise: Estimate,
+    growth: float,
+    log_priors: Array,
+) -> RiseFits:
+    """Fit a leak that begins within the recording, with each law of `EXPONENTS` and each onset of `test` (`fit_rise`).
 
-    Returns the log weight of each onset, and the fraction of the recording's information after the onset, (o,) each.
-    The first onset is the recording's start, with log weight 0 and fraction 1. The others are the n onsets of `test`,
-    without those whose fraction is below `MIN_FRACTION`. A leak from such an onset on is a step by `value` / fraction.
-    The weight of the onset is the likelihood ratio of this step to no step, divided by n: together these onsets are as
-    probable beforehand as the start. `leak`: likelihood of the leak's coefficient in the blocks; `test`: test of this
-    coefficient for a step. Without a `test`, or if `value` is not positive, only the first onset remains.
+    `growth`: relative growth of the leak from its onset to the end (`step_shapes`); `log_priors`: log probability of
+    this growth with each law, up to a constant.
     """
-    if test is None or not value > 0.0:
-        return np.zeros(1), np.ones(1)
-    positions = _onset_positions(leak, test)
-    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
-    fraction_after = weights @ step_shapes(len(weights), positions) / max(float(weights.sum()), _TINY)
-    step = value / np.maximum(fraction_after, MIN_FRACTION)
-    precision = 1.0 / np.maximum(test.deviation, _TINY) ** 2
-    log_likelihood = precision * step * (test.size - 0.5 * step)  # normal, relative to no step
-    log_weights = log_likelihood - np.log(len(positions))
-    is_used = fraction_after > MIN_FRACTION
-    return np.append(0.0, log_weights[is_used]), np.append(1.0, fraction_after[is_used])
+    positions, fits = _onset_positions(leak, test), []
+    steps = step_shapes(len(blocks), positions, growth)  # (K, o)
+    block_weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
+    weight_after = np.maximum(block_weights @ step_shapes(len(blocks), positions), _TINY)
+    conductances, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
+    for exponent, log_prior in zip(EXPONENTS, log_priors - math.log(len(positions)), strict=True):
+        shape = conductances[exponent]
+        log_ratio, size, error = step_sizes(leak, np.arange(len(positions)), shape, growth)
+        fraction = np.maximum((weights * shape) @ steps, _TINY)
+        variance = rise.deviation**2 + (fraction * error) ** 2  # of the rise minus the fraction of the step
+        log_weights = (
+            log_prior
+            + log_ratio
+            + np.log(error * float(weights @ shape) / np.sqrt(variance))
+            - 0.5 * (rise.value - fraction * size) ** 2 / variance
+        )
+        # mean of both measurements of the size, weighted by their precisions
+        gain = fraction * error**2 / variance
+        combined = size + gain * (rise.value - fraction * size)
+        unit = (block_weights * unit_flows[exponent]) @ steps / weight_after  # mean flow of a unit step after its onset
+        # standard error of the mean, and what remains as the course and the law are simplified
+        deviation = np.hypot(error * rise.deviation / np.sqrt(variance), INFERENCE.growth.scatter * combined)
+        fits.append(RiseFits(log_weights, test.onsets, weight_after, combined * unit, deviation * unit))
+    return RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:

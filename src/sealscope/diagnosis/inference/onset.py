@@ -375,8 +375,8 @@ def step_sizes(
 
     The coefficient also has a level, a slope and a random walk, whose likeliest variance is used at each onset.
     `onsets` (o,): indices of the onsets in `StepTest.onsets`; `shape` (K,): change of the coefficient in each block by
-    a unit step; `growth`: relative growth of the step from its onset to the end of the recording. Returns log
-    likelihood, size and its standard error, (o,) each.
+    a unit step; `growth`: as in `step_shapes`. Returns the log likelihood ratio of the step to no step, its size, and
+    the standard error of the size, (o,) each.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None
@@ -389,6 +389,8 @@ def step_sizes(
         + whitening.walk_log_priors[:, None]
         - 0.5 * n * np.log(fit.residual_squares / n)
     )
+    without_step = 0.5 * np.log(fit.weight).sum(axis=1) + whitening.walk_log_priors - 0.5 * n * np.log(fit.total / n)
+    likelihoods -= without_step.max()
     likeliest_walk = likelihoods.argmax(axis=0), np.arange(len(onsets))  # index (walk, onset)
     sizes, variances = fit.moments / fit.energies, fit.residual_squares / n / fit.energies
     return likelihoods[likeliest_walk], sizes[likeliest_walk], np.sqrt(variances)[likeliest_walk]
@@ -443,12 +445,13 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     """Compute the mean of a unit step in each of `count` = K blocks, for each of o onsets, shape (K, o).
 
     `positions` (o,): onsets, counted in blocks from the start. From its onset within a block on, the step grows
-    linearly from 1 to 1 + `growth` at the end of the last block.
+    linearly from 1 to 1 + `growth` at the end of the last block. If `growth` is infinite, it grows from 0 to 1.
     """
     end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # end of each block minus onset, (K, o)
     steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
     grown_fraction = np.clip(middle_since_onset / np.maximum(count - positions, 1.0), 0.0, 1.0)
-    return np.asarray(steps * (1.0 + growth * grown_fraction))
+    growing = grown_fraction if np.isinf(growth) else 1.0 + growth * grown_fraction
+    return np.asarray(steps * growing)
 
 
 class _Whitening(NamedTuple):

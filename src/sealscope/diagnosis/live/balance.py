@@ -128,7 +128,8 @@ def _estimate_leak(
     `column_order` (n + 2,) the indices of the columns to use: n terms other than the leak (nuisances), the leak, the
     left side. With `updates_model`, the block is added to the sums in `model`, from which the nuisances' coefficients
     are computed. Returns (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from
-    g to keep the series of estimates continuous, and the variance V of g due to errors of the nuisances.
+    g to keep the series of estimates continuous while the nuisances' coefficients still change, and the variance V of g
+    due to errors of the nuisances. Shift and last coefficients in `model` are updated in any case.
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
@@ -399,7 +400,7 @@ def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = Fal
     for balance in equations(rig, frozenset(names)):
         if balance.by_command:
             continue
-        # fitted terms (`Term.nuisance`) have unknown coefficients in any machine, as the leak past the piston has
-        terms = [term for term in balance.terms if (term.nuisance or with_tested_terms) and term.name != PUMP]
+        # fitted terms (`Term.is_fitted`) have unknown coefficients in any machine, as the leak past the piston has
+        terms = [term for term in balance.terms if (term.is_fitted or with_tested_terms) and term.name != PUMP]
         balances.append(balance._replace(terms=tuple(terms)))
     return balances

@@ -280,7 +280,7 @@ class Watch:
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
-        """Learn a new baseline from now on, after a repair or an exchange of the machine."""
+        """Learn a new baseline from now on, after a repair or an exchange of the machine; withdraws the alarm."""
         self.baseline_version += 1
         self.baseline, self._learning = None, BaselineLearning()
         if self._estimator is not None:

@@ -115,6 +115,8 @@ class GrowthPriors(PriorTable):
 
     steady: float  # probability that it does not grow
     most: float  # largest increase of the leak's flow until the end of the recording, over the flow at the onset
+    scatter: float  # relative standard deviation of the flow of a leak that began within a recording, fitted to a rise
+    from_nothing: float  # of the leaks that grow, the fraction that grows from nothing
 
 
 class StepSize(PriorTable):

@@ -27,7 +27,7 @@ from sealscope.recordings.corrections.stale import (
     flag_stuck_rows,
     interpolate_stale_samples,
 )
-from sealscope.recordings.corrections.unsigned import restore_speed_sign
+from sealscope.recordings.corrections.unsigned import restore_signs
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
@@ -73,7 +73,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     stuck = {name: rows for name in chambers if (rows := flag_stuck_rows(part, name)).any()}
     unusable = tuple(name for name, rows in stuck.items() if np.mean(rows) > MAX_STUCK_FRACTION)
     part = set_missing(part, {name: rows for name, rows in stuck.items() if name not in unusable})
-    for correct in (remove_spikes, interpolate_stale_samples, _resample, restore_speed_sign):
+    for correct in (remove_spikes, interpolate_stale_samples, _resample, restore_signs):
         part, new_findings = correct(part)
         findings += new_findings
     part = interpolate_short_gaps(bridge(part, needed), needed)

@@ -33,7 +33,7 @@ _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 _NAMES = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 
 
-def restore_speed_sign(recording: Recording) -> tuple[Recording, list[Finding]]:
+def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
     The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign

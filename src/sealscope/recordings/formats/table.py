@@ -139,7 +139,8 @@ def build_fields(
     - `kind`: format of the file in words; `remarks`: entries in its header.
     - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
-    - `prepare`: function that reads all used columns together, before their values are needed.
+    - `prepare`: function that reads all used columns together, before their values are needed, and returns lines for
+      the history.
     - `size` [bytes]: size of a file that may be compressed, from which `check_size` limits the number of values.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
@@ -153,7 +154,7 @@ def build_fields(
         if (long_columns := _find_long_columns([member.label for member in series])) is None:
             raise
         channel_series, more_notes = _pivot_long_table(series, long_columns, prepare)
-        table = build_fields(channel_series, request, kind, remarks)
+        table = build_fields(channel_series, request, kind, remarks)  # their values are read already
         return table._replace(history=(*more_notes, *table.history))
     # the series to read; `_CLOCK_LABEL`, which may come after all series, is not one
     kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}

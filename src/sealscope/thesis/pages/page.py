@@ -104,15 +104,18 @@ def write_thesis_page(
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
 ) -> PageProduct:
-    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id."""
+    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id.
+
+    The last field of the entry is the text that the page's search looks through.
+    """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
     # (format, path) of the product's files, which are named by its id
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
-    numbers = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
+    value_names = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
     claim_texts = [f"{claim.id} {claim.claim}" for claim in product_claims]
-    text = " ".join([product.id, heading, product.notes, *numbers, *claim_texts])
+    text = " ".join([product.id, heading, product.notes, *value_names, *claim_texts])
     return PageProduct(product.id, heading, product, picture, links, product_claims, text.casefold())
 
 

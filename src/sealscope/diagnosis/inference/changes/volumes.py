@@ -214,7 +214,7 @@ def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     # well, which the test of the leak covers.
     if term.name.startswith("motion") or term.name in (SPEED_LOSS, HOLDING):
         return False
-    if AIR in roles.names and term.cause == "air in the oil" and term.nuisance:
+    if AIR in roles.names and term.cause == "air in the oil" and term.is_fitted:
         return False  # free air changes all these coefficients: the test of AIR (not a nuisance term) covers it
     # BIAS, a constant flow, is an external leak that no pressure drives; with an accumulator a pressure drives the leak
     return not (has_accumulator and term.name == BIAS)

@@ -38,7 +38,7 @@ class Mixture(NamedTuple):
         """Compute the value below which the mixture lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # scale by a typical deviation (very large ones count in part), so that the quantile is of the order of one
+        # scale by a typical deviation (each counts up to 1000 times the smallest): the quantile is then of order one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -57,7 +57,7 @@ class Mixture(NamedTuple):
                 start = find_root(sample_excess, low, high)
                 difference = sample_excess(start + SLOPE_STEP) - sample_excess(start - SLOPE_STEP)
                 root = find_near_root(excess, start, difference / (2.0 * SLOPE_STEP), low, high)
-        if root is None:
+        if root is None:  # without a change of sign, all parts have nearly the same quantile
             root = low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high)
         return scale * root
 

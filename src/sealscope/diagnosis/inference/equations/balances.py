@@ -38,10 +38,10 @@ from sealscope.diagnosis.inference.equations.terms import (
     compensated_leak_term,
     conductance_term,
     external_leak_term,
+    fitted_term,
     free_air_term,
     metering_edge_terms,
     motion_term,
-    sensor_term,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import METERS, flow_source
@@ -88,7 +88,7 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
     """
     left = equation.left
     at_rest = (
-        sensor_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_sign(s) * s.dt, drift="bias"),
+        fitted_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_sign(s) * s.dt, drift="bias"),
         conductance_term(
             LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
         ),

@@ -89,7 +89,7 @@ class Signals:
         return self.mean("p_1") - self.mean("p_2")
 
     @cached_property
-    def absolute(self) -> Mapping[str, Array]:
+    def absolute_pressure(self) -> Mapping[str, Array]:
         """Absolute pressure [Pa] at each sample, at least `MIN_ABSOLUTE_PRESSURE`, by the names "p_A" and "p_B"."""
         return {
             name: np.maximum(self._channels[name] + self._to_absolute.get(name, P_ATM), MIN_ABSOLUTE_PRESSURE)

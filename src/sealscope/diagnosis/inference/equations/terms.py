@@ -58,12 +58,12 @@ class Term(NamedTuple):
     driver: Literal["", "pressure", "root"] = ""
 
     @property
-    def nuisance(self) -> bool:
+    def is_fitted(self) -> bool:
         """True if the coefficient is fitted in every recording, since it is unknown even in a healthy machine."""
-        return bool(self.drift) and not self.compared
+        return bool(self.drift) and not self.is_compared
 
     @property
-    def compared(self) -> bool:
+    def is_compared(self) -> bool:
         """True if the coefficient is fitted only to compare recordings: within one, the motion varies too little."""
         return self.drift == "speed"
 
@@ -128,7 +128,7 @@ CYLINDER, LOCKED = "cylinder", "locked"
 START = "start"
 
 PRESSURES = ("p_A", "p_B")
-sensor_term = partial(Term, cause="sensor fault")
+fitted_term = partial(Term, cause="sensor fault")
 
 
 def conductance_term(
@@ -152,7 +152,7 @@ LEAKS = (
 def motion_term(outward: bool, by_A: bool) -> Term:
     """Make the term of the piston's motion `outward` (to B) or inward, while side A (`by_A`) or B carries the load."""
     name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
-    return sensor_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
+    return fitted_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
 
 
 def chamber_terms(side: str) -> tuple[Term, ...]:
@@ -167,8 +167,8 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
     return (
         compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),
         compliance_term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), needs=(p, "x")),
-        air_term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute[p]), needs=(p,)),
-        air_term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute[p])), needs=(p,)),
+        air_term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute_pressure[p]), needs=(p,)),
+        air_term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute_pressure[p])), needs=(p,)),
     )
 
 
@@ -190,7 +190,7 @@ def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Ter
         """Compute V d(1/p) [m^3/Pa] of the chamber `side` in each interval, with the volume V at the mean position."""
         # at least a tenth of the volume at mid-stroke: x of an unknown origin may exceed the stroke
         volumes = np.maximum(mid_volumes[side] + areas[side] * s.mean("x"), 0.1 * mid_volumes[side])
-        return np.asarray(volumes * np.diff(1.0 / s.absolute[f"p_{side}"]))
+        return np.asarray(volumes * np.diff(1.0 / s.absolute_pressure[f"p_{side}"]))
 
     def weighted_expansion(s: Signals) -> Array:
         """Compute the increments of the term [m^3/Pa], shape (n - 1,)."""
@@ -226,9 +226,9 @@ def compensated_leak_term(side: str) -> Term:
     return conductance_term(f"external leak {side}{MADE_UP}", lost_volume, cause="external leak")
 
 
-START_TERM = sensor_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
-BIAS_TERM = sensor_term(BIAS, "m^3/s", lambda s: s.time_step, drift="bias")
-SPEED_LOSS_TERM = sensor_term(
+START_TERM = fitted_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
+BIAS_TERM = fitted_term(BIAS, "m^3/s", lambda s: s.time_step, drift="bias")
+SPEED_LOSS_TERM = fitted_term(
     SPEED_LOSS, "m s", lambda s: interval_means(np.abs(s.speed)) * s.step("x"), drift="speed", needs=("x",)
 )
 PUMP_TERM = conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump leak", needs=("p_1", "p_2"))
@@ -242,7 +242,7 @@ LINES_TERM = conductance_term(
     drift="pump",
 )
 #: The increments are changes of the piston's speed.
-LAG_TERM = sensor_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
+LAG_TERM = fitted_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
 
 
 def metering_edge_terms(
@@ -276,7 +276,7 @@ def metering_edge_terms(
         """Compute the changes of abs(u) sign(dp) sqrt(abs(dp)) in each interval [V Pa^0.5], for gain times lag."""
         return np.asarray(np.gradient(proportional_increments(s)) * s.rate)
 
-    edge_term = partial(sensor_term, drift="edge", needs=("u", *recorded))
+    edge_term = partial(fitted_term, drift="edge", needs=("u", *recorded))
     return (
         edge_term(f"edge {edge}", "m^3/(s V Pa^0.5)", proportional_increments),
         edge_term(f"late edge {edge}", "m^3/(V Pa^0.5)", late_increments),

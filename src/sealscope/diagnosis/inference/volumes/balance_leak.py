@@ -16,10 +16,11 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
+    RiseFits,
     estimate_bend_flows,
     estimate_older_flow,
-    estimate_rise_flow,
     estimate_step_flow,
+    fit_rise,
     law_priors,
     mixture_flow,
     older_log_ratios,
@@ -184,17 +185,23 @@ class BalanceLeak(LeakMeasure):
         if self.rise is None:
             total = Interval(*(balance.mean_pressure() * conductance for conductance in balance.conductance))
             return self._add_law_uncertainty(Estimate(total.value, total.deviation))
-        motion_rise = self._motion_rise
+        return self._add_law_uncertainty(self._mix_with_holds(self._rise_fits.flow))
+
+    @cached_property
+    def _rise_fits(self) -> RiseFits:
+        """Fits of a leak to the rise over healthy recordings and to the course of the leakage (`fit_rise`)."""
+        balance, motion_rise = self.balance, self._motion_rise
         assert motion_rise is not None
-        flow = estimate_rise_flow(
-            balance.compared_leak,
+        return fit_rise(
+            balance.running_blocks,
+            balance.columns,
+            balance.leak,
+            balance.compared_leak.precision.sum(axis=0),
             self.step,
-            value=motion_rise.value,
-            deviation=motion_rise.normal_deviation,
+            rise=Estimate(motion_rise.value, motion_rise.normal_deviation),
             laws=self._rise_laws(),
             max_flow=balance.blocks.moving_flow,
         )
-        return self._add_law_uncertainty(self._mix_with_holds(flow))
 
     def _mix_with_holds(self, flow: Estimate) -> Estimate:
         """Combine the flow of a leak over the whole recording with its flow during holds, if the holds show a leak.
@@ -328,6 +335,8 @@ class BalanceLeak(LeakMeasure):
         if test is None:
             return np.inf
         bound = test.bound() * self.balance.mean_pressure() if self._hold_rise is None else self._hold_bound()
+        if self._motion_rise is not None and self._hold_rise is None:
+            bound = max(bound, self._rise_fits.bound)  # the leakage may have begun, or grown, within the recording
         return bound * (1.0 + UPPER_95 * float(np.hypot(self.balance.size.deviation, INFERENCE.size.law)))
 
     def _hold_bound(self) -> float:

@@ -35,7 +35,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
     """Yield the series of samples in a value of any type; nothing for one that contains none, or is nested too deeply.
 
     `name`: name of the value; `group`: names of the structs around it, with slashes between; `clock`: times of series
-    that state none, None if unknown; `depth`: number of structs around the value.
+    that state none, None if unknown; `depth`: number of structs and cell arrays around the value.
     """
     if depth > _MAX_DEPTH:
         return

@@ -152,30 +152,31 @@ class HeldChambers:
     def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
-        An open side has the probability `held_oil.open` (`priors.toml`), and is above the charge pressure in a few
-        readings only, each with the probability `held_oil.above`. If check valves keep both sides at their pressure, a
-        side that gains oil must drain to the tank. The charge pressure is then that of a tank line, whose gauge
-        pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
+        An open side has the probability `held_oil.open` (`priors.toml`). Only while it empties, it is above the charge
+        pressure by more than the back pressure `held_oil.tank` of its line: the fraction of a hold in which it is has
+        an exponential prior with the mean `held_oil.above`. If check valves keep both sides at their pressure, a side
+        that gains oil must drain to the tank. The charge pressure is then that of a tank line, whose gauge pressure has
+        a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
-            row = supplies.index(SideSupply.OPEN)
-            n_above = 0.5 * self.n_readings * float(np.concatenate([flags[row] for flags in self._above_charge]).mean())
-            return math.log(prior.open) + n_above * math.log(prior.above)
+            is_A = supplies[0] is SideSupply.OPEN
+            above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank) for hold in self.holds]
+            return math.log(prior.open) - sum(float(flags.mean()) for flags in above) / prior.above
         log_prior = math.log1p(-prior.open)
         if drains and supplies == BOTH:
             log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank) ** 2
         return log_prior
 
-    def _is_closed(self, hold: LockedHold, p: Array) -> NDArray[np.bool_]:
+    def _is_closed(self, hold: LockedHold, p: Array, back_pressure: float = 0.0) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
         The averaged absolute pressure `p` (n,) [Pa] then exceeds the charge pressure by a relative and an absolute
-        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`).
+        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`), and by `back_pressure` [Pa].
         """
         prior = INFERENCE.held_oil
         steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
-        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved)
+        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved + back_pressure)
 
     @cached_property
     def _above_charge(self) -> list[NDArray[np.bool_]]:
@@ -636,9 +637,9 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak begins after the last hold, so that no hold shows it.
+        """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it.
 
-        It is the probability of a beginning within the recording, times the fraction of the time after the last hold.
+        It is the probability that it begins within the recording, times the fraction of the time after the last hold.
         """
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
