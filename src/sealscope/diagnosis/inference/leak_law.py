@@ -9,9 +9,9 @@ growths by their prior, too.
 
 A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
 p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
-coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. A leak
-that began within the recording had a larger flow while it lasted: if a fraction s of the recording's information lies
-after the onset, the step is g / s.
+coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. Of a
+leak that began or grew within the recording the rise shows a part only, as the blocks after the onset have but a part
+of the information: rise and changes within the recording together tell its flow (`fit_rise`).
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
@@ -44,8 +45,6 @@ EXPONENTS = (1.0, 0.75, 0.5)
 N_GROWTHS = 6
 #: Probability of an onset, relative to the most probable one, below which it is omitted.
 NEGLIGIBLE = 1e-3
-#: Minimum fraction of a recording's information that must lie after an onset.
-MIN_FRACTION = 0.1
 _TINY = np.finfo(float).tiny
 
 
@@ -220,6 +219,46 @@ def _onset_positions(leak: Information, test: StepTest) -> Array:
     return test.positions - float(np.isfinite(leak.level))
 
 
+class _StepFit(NamedTuple):
+    """Steps of a leak with one law and one growth, fitted at each of o onsets.
+
+    - `law`: index of the law in `EXPONENTS`; `log_prior`: log probability of the growth;
+    - `conductance` (K,): change of the conductance in K blocks by a leak with the coefficient 1 that is older than the
+      recording; `course` (K, o): factor on it for each onset and this growth (`step_shapes`);
+    - `log_ratio`, `size`, `error` (o,): log likelihood ratio to no step, coefficient and its standard error;
+    - `unit_flow` (o,): mean flow after the onset [m^3/s] for a coefficient of 1.
+    """
+
+    law: int
+    log_prior: float
+    conductance: Array
+    course: Array
+    log_ratio: Array
+    size: Array
+    error: Array
+    unit_flow: Array
+
+
+def _fit_steps(
+    blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, positions: Array, onsets: NDArray[np.intp]
+) -> tuple[list[_StepFit], Array]:
+    """Fit a step of the leak with each growth of `_step_growths` and each law of `EXPONENTS`, at each of o onsets.
+
+    `positions` (o,): the onsets, counted in blocks; `onsets` (o,): their indices in the step test. Returns the fits,
+    and the fraction of the recording after each onset, (o,).
+    """
+    weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
+    part_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
+    conductances, flows, fits = apparent_conductances(blocks, columns), law_flows(blocks), list[_StepFit]()
+    for growth, probability in _step_growths():
+        steps = step_shapes(len(blocks), positions, growth)  # (K, o)
+        for law, exponent in enumerate(EXPONENTS):
+            sizes = step_sizes(leak, onsets, conductances[exponent], growth)
+            unit_flow = (weights * flows[exponent]) @ steps / part_after
+            fits.append(_StepFit(law, math.log(probability), conductances[exponent], steps, *sizes, unit_flow))
+    return fits, part_after
+
+
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
@@ -229,22 +268,11 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     coefficient in the blocks; `test`: step test of this coefficient, whose onsets are used except improbable ones.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
-    positions = _onset_positions(leak, test)[onsets]
-    block_weights = blocks.pressure_weights
-    weight_after = np.maximum(block_weights @ step_shapes(len(blocks), positions), _TINY)
-    shapes, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
-    log_weights, flows, standard_errors = [], [], []  # lists of arrays (o,), for each growth and exponent
-    for growth, probability in _step_growths():
-        steps = step_shapes(len(blocks), positions, growth)  # (K, o)
-        for exponent in EXPONENTS:
-            likelihood, size, deviation = step_sizes(leak, onsets, shapes[exponent], growth)
-            # mean flow of a step of 1 after its onset
-            unit = (block_weights * unit_flows[exponent]) @ steps / weight_after
-            log_weights.append(np.log(probability) + likelihood)
-            flows.append(size * unit)
-            standard_errors.append(deviation * unit)
-    weights = np.exp(np.ravel(log_weights) - np.max(log_weights))
-    return mixture_flow(weights, np.ravel(flows), np.ravel(standard_errors))
+    fits, _ = _fit_steps(blocks, columns, leak, _onset_positions(leak, test)[onsets], onsets)
+    log_weights = np.concatenate([fit.log_prior + fit.log_ratio for fit in fits])
+    flows = np.concatenate([fit.size * fit.unit_flow for fit in fits])
+    deviations = np.concatenate([fit.error * fit.unit_flow for fit in fits])
+    return mixture_flow(np.exp(log_weights - log_weights.max()), flows, deviations)
 
 
 class RiseFits(NamedTuple):
@@ -317,10 +345,12 @@ def fit_rise(
     fits = [older]
     weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
     if test is not None:
-        fits += [
-            _fit_rise_within(blocks, columns, leak, weights, test, rise, growth, law_log_weights + np.log(probability))
-            for growth, probability in _step_growths()
-        ]
+        positions = _onset_positions(leak, test)
+        step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
+        for step_fit in step_fits:
+            log_weights, flows, deviations = _combine_with_rise(step_fit, rise, weights)
+            log_weights += law_log_weights[step_fit.law] - math.log(len(positions))
+            fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations))
     fit = RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
     log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
@@ -329,45 +359,23 @@ def fit_rise(
     return fit._replace(log_weights=log_weights)
 
 
-def _fit_rise_within(
-    blocks: Blocks,
-    columns: Sequence[ColumnRoles],
-    leak: Information,
-    weights: Array,
-    test: StepTest,
-    rise: Estimate,
-    growth: float,
-    log_priors: Array,
-) -> RiseFits:
-    """Fit a leak that begins within the recording, with each law of `EXPONENTS` and each onset of `test` (`fit_rise`).
+def _combine_with_rise(fit: _StepFit, rise: Estimate, weights: Array) -> tuple[Array, Array, Array]:
+    """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
-    `growth`: relative growth of the leak from its onset to the end (`step_shapes`); `log_priors`: log probability of
-    this growth with each law, up to a constant.
+    `weights` (K,): information of the blocks, with the sum 1. Returns the log weight of each onset, without the priors
+    of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,) each.
     """
-    positions, fits = _onset_positions(leak, test), []
-    steps = step_shapes(len(blocks), positions, growth)  # (K, o)
-    block_weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
-    weight_after = np.maximum(block_weights @ step_shapes(len(blocks), positions), _TINY)
-    conductances, unit_flows = apparent_conductances(blocks, columns), law_flows(blocks)
-    for exponent, log_prior in zip(EXPONENTS, log_priors - math.log(len(positions)), strict=True):
-        shape = conductances[exponent]
-        log_ratio, size, error = step_sizes(leak, np.arange(len(positions)), shape, growth)
-        fraction = np.maximum((weights * shape) @ steps, _TINY)
-        variance = rise.deviation**2 + (fraction * error) ** 2  # of the rise minus the fraction of the step
-        log_weights = (
-            log_prior
-            + log_ratio
-            + np.log(error * float(weights @ shape) / np.sqrt(variance))
-            - 0.5 * (rise.value - fraction * size) ** 2 / variance
-        )
-        # mean of both measurements of the size, weighted by their precisions
-        gain = fraction * error**2 / variance
-        combined = size + gain * (rise.value - fraction * size)
-        unit = (block_weights * unit_flows[exponent]) @ steps / weight_after  # mean flow of a unit step after its onset
-        # standard error of the mean, and what remains as the course and the law are simplified
-        deviation = np.hypot(error * rise.deviation / np.sqrt(variance), INFERENCE.growth.scatter * combined)
-        fits.append(RiseFits(log_weights, test.onsets, weight_after, combined * unit, deviation * unit))
-    return RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
+    fraction = np.maximum((weights * fit.conductance) @ fit.course, _TINY)
+    variance = rise.deviation**2 + (fraction * fit.error) ** 2  # of the rise minus the fraction of the step
+    excess = rise.value - fraction * fit.size
+    log_weights = (
+        fit.log_prior + fit.log_ratio + np.log(float(weights @ fit.conductance) * fit.error / np.sqrt(variance))
+    )
+    log_weights -= 0.5 * excess**2 / variance
+    size = fit.size + fraction * fit.error**2 / variance * excess  # mean of both, weighted by their precisions
+    # its standard error, and what remains as the course and the law are simplified
+    deviation = np.hypot(fit.error * rise.deviation / np.sqrt(variance), INFERENCE.growth.scatter * size)
+    return log_weights, size * fit.unit_flow, deviation * fit.unit_flow
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:
