@@ -79,6 +79,16 @@ def test_the_course_tells_an_older_leak_from_one_that_began_within() -> None:
     assert older(GROWING) < 0.1
 
 
+def test_a_step_is_measured_by_the_rise_as_well() -> None:
+    """Given an onset within, the rise over healthy recordings makes the size more precise than the step alone."""
+    step = (TIME > ONSET).astype(float)
+    flows = [fit(step, PLAIN, seed).flow_within for seed in range(24)]
+    assert all(flow is not None for flow in flows)
+    errors = np.array([flow.value - 1.0 for flow in flows if flow is not None])
+    assert np.sqrt((errors**2).mean()) < 0.15
+    assert fit(OLDER, PRESS, seed=1)._replace(onsets=np.array([-np.inf])).flow_within is None
+
+
 def test_a_leak_larger_than_the_flow_of_the_pump_is_excluded() -> None:
     fits = fit(OLDER, PLAIN, seed=1)
     is_possible = np.isfinite(fits.log_weights)

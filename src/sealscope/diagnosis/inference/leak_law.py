@@ -301,6 +301,12 @@ class RiseFits(NamedTuple):
         return mixture_flow(self.probabilities, self.flows, self.deviations)
 
     @property
+    def flow_within(self) -> Estimate | None:
+        """The same flow, given that the leak began within the recording; None if this is excluded."""
+        log_weights = np.where(np.isneginf(self.onsets), -np.inf, self.log_weights)
+        return self._replace(log_weights=log_weights).flow if np.isfinite(log_weights).any() else None
+
+    @property
     def bound(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s], given that it is positive."""
         return bound_steps(self.probabilities, self.parts * self.flows, self.parts * self.deviations, BOUND_PROBABILITY)

@@ -109,13 +109,16 @@ class BalanceLeak(LeakMeasure):
     def step_flow(self) -> Estimate:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        The flow is averaged over the laws, growths and onsets of the leak, and combined with the flow in holds
-        (`_mix_with_holds`). Without a step test it is 0 with an infinite standard error.
+        The flow is averaged over the laws, growths and onsets of the leak. The rise over healthy recordings counts, if
+        there is one (`fit_rise`), and so does the flow in holds (`_mix_with_holds`). Without a step test the flow is 0
+        with an infinite standard error.
         """
         balance, test = self.balance, self.balance.test
         if test is None:
             return UNKNOWN_FLOW
-        flow = estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
+        flow = None if self._motion_rise is None else self._rise_fits.flow_within
+        if flow is None:
+            flow = estimate_step_flow(balance.running_blocks, balance.columns, balance.leak, test)
         return self._add_law_uncertainty(self._mix_with_holds(flow))
 
     @property
