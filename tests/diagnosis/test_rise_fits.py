@@ -38,8 +38,11 @@ class ConstantPressure(SimpleNamespace):
         return np.full(K, PRESSURE**0.5)
 
 
-def fit(course: Array, weights: Array, seed: int) -> RiseFits:
-    """Fit a leak whose flow is `course`, over a healthy level of 3, with `weights` as the information of each block."""
+def fit(course: Array, weights: Array, seed: int, shift: float = 0.0) -> RiseFits:
+    """Fit a leak whose flow is `course`, over a healthy level of 3, with `weights` as the information of each block.
+
+    `shift` is an error of the rise that the healthy recordings do not predict.
+    """
     blocks: Any = ConstantPressure()
     columns: Any = [SimpleNamespace(leak=0, names=("leak", ORIFICE))]
     unit, deviation = 1.0 / PRESSURE, 0.05  # conductance of a flow of 1; error of the rise
@@ -48,7 +51,7 @@ def fit(course: Array, weights: Array, seed: int) -> RiseFits:
     estimates = unit * (3.0 + course) + random.standard_normal(K) / np.sqrt(precision)
     scale = 0.3 * unit
     leak = Information(TIME, np.diag(precision), precision * estimates, slope=scale, walk=scale)
-    rise = float(weights @ course / weights.sum()) + deviation * random.standard_normal()
+    rise = float(weights @ course / weights.sum()) + deviation * random.standard_normal() + shift
     laws = [(PRESSURE, float(np.log(prior))) for prior in (0.5, 0.25, 0.25)]
     test = find_leak_step(blocks, columns, leak)
     return fit_rise(blocks, columns, leak, weights, test, Estimate(rise * unit, deviation * unit), laws, max_flow=50.0)
@@ -87,6 +90,13 @@ def test_a_step_is_measured_by_the_rise_as_well() -> None:
     errors = np.array([flow.value - 1.0 for flow in flows if flow is not None])
     assert np.sqrt((errors**2).mean()) < 0.15
     assert fit(OLDER, PRESS, seed=1)._replace(onsets=np.array([-np.inf])).flow_within is None
+
+
+def test_a_clear_step_outweighs_a_rise_that_contradicts_it() -> None:
+    """A day like none of the healthy ones: the rise is of the other sign, and the step alone tells the size."""
+    flow = fit((TIME > ONSET).astype(float), PLAIN, seed=1, shift=-2.0).flow_within
+    assert flow is not None
+    assert flow.value == pytest.approx(1.0, abs=0.2)
 
 
 def test_a_leak_larger_than_the_flow_of_the_pump_is_excluded() -> None:

@@ -17,7 +17,7 @@ of the information: rise and changes within the recording together tell its flow
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -340,8 +340,10 @@ def fit_rise(
 
         L + log(f_0 e / sqrt(d^2 + f^2 e^2)) - (r - f s')^2 / (2 (d^2 + f^2 e^2)).
 
-    All onsets together are as probable beforehand as an older leak, and a leak is positive. If all hypotheses are
-    excluded, the result is an older leak under the first law.
+    With the small probability `scatter.tail` (`priors.toml`) on either side the rise tells nothing, as the recording is
+    like none that the healthy ones predict. The rise then has any value up to the fraction `scatter.largest` of the
+    pump's flow, and s' and e alone give the flow. All onsets together are as probable beforehand as an older leak, and
+    a leak is positive. If all hypotheses are excluded, the result is an older leak under the first law.
     """
     from scipy.special import log_ndtr
 
@@ -353,10 +355,11 @@ def fit_rise(
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
+        largest_rise = INFERENCE.scatter.largest * max_flow / float(unit_flows[0])
         for step_fit in step_fits:
-            log_weights, flows, deviations = _combine_with_rise(step_fit, rise, weights)
-            log_weights += law_log_weights[step_fit.law] - math.log(len(positions))
-            fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations))
+            log_prior = law_log_weights[step_fit.law] - math.log(len(positions))
+            for log_weights, flows, deviations in _combine_with_rise(step_fit, rise, largest_rise, weights):
+                fits.append(RiseFits(log_prior + log_weights, test.onsets, part_after, flows, deviations))
     fit = RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
     log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
@@ -365,23 +368,28 @@ def fit_rise(
     return fit._replace(log_weights=log_weights)
 
 
-def _combine_with_rise(fit: _StepFit, rise: Estimate, weights: Array) -> tuple[Array, Array, Array]:
+def _combine_with_rise(
+    fit: _StepFit, rise: Estimate, largest_rise: float, weights: Array
+) -> Iterator[tuple[Array, Array, Array]]:
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
-    `weights` (K,): information of the blocks, with the sum 1. Returns the log weight of each onset, without the priors
-    of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,) each.
+    `largest_rise`: largest rise that the healthy recordings do not predict [m^3/(s Pa)]; `weights` (K,): information of
+    the blocks, with the sum 1. Yields the log weight of each onset, without the priors of law and onset, the mean flow
+    after it, and the flow's standard error [m^3/s], (o,) each: first as the rise shows the step, then as it tells
+    nothing.
     """
+    prior = INFERENCE.growth
     fraction = np.maximum((weights * fit.conductance) @ fit.course, _TINY)
     variance = rise.deviation**2 + (fraction * fit.error) ** 2  # of the rise minus the fraction of the step
     excess = rise.value - fraction * fit.size
-    log_weights = (
-        fit.log_prior + fit.log_ratio + np.log(float(weights @ fit.conductance) * fit.error / np.sqrt(variance))
-    )
-    log_weights -= 0.5 * excess**2 / variance
+    log_likelihood = fit.log_prior + fit.log_ratio + np.log(float(weights @ fit.conductance) * fit.error)
     size = fit.size + fraction * fit.error**2 / variance * excess  # mean of both, weighted by their precisions
     # its standard error, and what remains as the course and the law are simplified
-    deviation = np.hypot(fit.error * rise.deviation / np.sqrt(variance), INFERENCE.growth.scatter * size)
-    return log_weights, size * fit.unit_flow, deviation * fit.unit_flow
+    error = np.hypot(fit.error * rise.deviation / np.sqrt(variance), prior.scatter * size)
+    log_weights = log_likelihood - 0.5 * np.log(variance) - 0.5 * excess**2 / variance
+    yield log_weights, size * fit.unit_flow, error * fit.unit_flow
+    log_chance = math.log(math.sqrt(2.0 * math.pi) * 2.0 * INFERENCE.scatter.tail / max(largest_rise, _TINY))
+    yield log_likelihood + log_chance, fit.size * fit.unit_flow, fit.error * fit.unit_flow
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:

@@ -156,7 +156,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     known = np.isfinite(speed) & np.isfinite(difference) & np.isfinite(magnitude)
     speed, difference, magnitude = (np.where(known, values, 0.0) for values in (speed, difference, magnitude))
     motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
-    step_scale = np.maximum(_average_nearby(np.abs(np.diff(magnitude)), recording.rate), np.finfo(float).tiny)
+    step_scale = _average_nearby(np.abs(np.diff(magnitude)), recording.rate)
+    step_scale = np.maximum(step_scale, np.finfo(float).eps * magnitude.max() + np.finfo(float).tiny)
     # log odds against a change of sign after a sample: a change makes the step of the signed values larger by twice the
     # smaller magnitude, such steps have a Laplace density, and changes are rare
     cost_of_change = 2.0 * np.minimum(magnitude[1:], magnitude[:-1]) / step_scale
