@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,6 +45,8 @@ EXPONENTS = (1.0, 0.75, 0.5)
 N_GROWTHS = 6
 #: Probability of an onset, relative to the most probable one, below which it is omitted.
 NEGLIGIBLE = 1e-3
+#: Standard error of a step, over that of the prior on its size, above which it counts as unknown.
+MAX_ERROR = 1e6
 _TINY = np.finfo(float).tiny
 
 
@@ -335,30 +337,35 @@ def fit_rise(
     A leak with the coefficient s, and a given onset, growth and law, changes the conductance of block k by s c_k. The
     changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
     leak (`step_sizes`). The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted
-    by the information of the blocks; f_0 is this mean for a leak of this law that is older than the recording. With a
-    flat prior on s, the log likelihood ratio to the older leak is
+    by the information of the blocks. The flow of any leak, and so s, has a half-normal prior whose scale, in s the
+    value S, is the pump's flow. With N(x; v) the density of a normal distribution with the variance v, and s'' and e''
+    the mean and the error of s by its prior and s', the likelihood of the leak is, up to a common factor,
 
-        L + log(f_0 e / sqrt(d^2 + f^2 e^2)) - (r - f s')^2 / (2 (d^2 + f^2 e^2)).
+        exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+
+    and that of a leak which is older than the recording N(r; d^2 + R^2), with the rise R by the pump's flow.
 
     With the small probability `scatter.tail` (`priors.toml`) on either side the rise tells nothing, as the recording is
     like none that the healthy ones predict. The rise then has any value up to the fraction `scatter.largest` of the
-    pump's flow, and s' and e alone give the flow. All onsets together are as probable beforehand as an older leak, and
-    a leak is positive. If all hypotheses are excluded, the result is an older leak under the first law.
+    pump's flow, and s'' and e'' alone give the flow. All onsets together are as probable beforehand as an older leak.
+    If all hypotheses are excluded, the result is an older leak under the first law.
     """
     from scipy.special import log_ndtr
 
     unit_flows, law_log_weights = np.array(laws).T
     ones = np.ones(len(laws))
-    older = RiseFits(law_log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows)
+    max_rises = max_flow / unit_flows
+    log_weights = law_log_weights + _log_normal(rise.value, rise.deviation**2 + max_rises**2)
+    older = RiseFits(log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows)
     fits = [older]
     weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
-        largest_rise = INFERENCE.scatter.largest * max_flow / float(unit_flows[0])
         for step_fit in step_fits:
             log_prior = law_log_weights[step_fit.law] - math.log(len(positions))
-            for log_weights, flows, deviations in _combine_with_rise(step_fit, rise, largest_rise, weights):
+            max_rise = float(max_rises[step_fit.law])
+            for log_weights, flows, deviations in _combine_with_rise(step_fit, rise, max_flow, max_rise, weights):
                 fits.append(RiseFits(log_prior + log_weights, test.onsets, part_after, flows, deviations))
     fit = RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
@@ -368,28 +375,40 @@ def fit_rise(
     return fit._replace(log_weights=log_weights)
 
 
+def _log_normal(value: Any, variance: Any) -> Any:
+    """Compute the log density of a normal distribution with the mean 0 and the given `variance` at `value`."""
+    return -0.5 * value**2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
+
+
 def _combine_with_rise(
-    fit: _StepFit, rise: Estimate, largest_rise: float, weights: Array
+    fit: _StepFit, rise: Estimate, max_flow: float, max_rise: float, weights: Array
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
-    `largest_rise`: largest rise that the healthy recordings do not predict [m^3/(s Pa)]; `weights` (K,): information of
-    the blocks, with the sum 1. Yields the log weight of each onset, without the priors of law and onset, the mean flow
-    after it, and the flow's standard error [m^3/s], (o,) each: first as the rise shows the step, then as it tells
-    nothing.
+    `max_flow`: mean flow of the pump [m^3/s]; `max_rise`: rise of the conductance by a leak as large, older than the
+    recording; `weights` (K,): information of the blocks, with the sum 1. Yields the log weight of each onset, without
+    the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,) each: first as the
+    rise shows the step, then as it tells nothing.
     """
-    prior = INFERENCE.growth
-    fraction = np.maximum((weights * fit.conductance) @ fit.course, _TINY)
-    variance = rise.deviation**2 + (fraction * fit.error) ** 2  # of the rise minus the fraction of the step
-    excess = rise.value - fraction * fit.size
-    log_likelihood = fit.log_prior + fit.log_ratio + np.log(float(weights @ fit.conductance) * fit.error)
-    size = fit.size + fraction * fit.error**2 / variance * excess  # mean of both, weighted by their precisions
+    prior_deviation = max_flow / np.maximum(fit.unit_flow, _TINY)  # of the coefficient
+    is_known = fit.error < MAX_ERROR * prior_deviation  # else the blocks tell nothing of a step at this onset
+    size = np.where(is_known, fit.size, 0.0)
+    variance = np.where(is_known, fit.error, MAX_ERROR * prior_deviation) ** 2
+    prior_variance = prior_deviation**2
+    log_likelihood = fit.log_prior + fit.log_ratio + 0.5 * np.log(2.0 * np.pi * variance)
+    log_likelihood += _log_normal(size, prior_variance + variance)
+    shrinkage = prior_variance / (prior_variance + variance)
+    size, variance = size * shrinkage, variance * shrinkage  # by the step and the prior
+    fraction = (weights * fit.conductance) @ fit.course
+    rise_variance = rise.deviation**2 + fraction**2 * variance  # of the rise minus the fraction of the step
+    excess = rise.value - fraction * size
+    combined = size + fraction * variance / rise_variance * excess  # mean of both, weighted by their precisions
     # its standard error, and what remains as the course and the law are simplified
-    error = np.hypot(fit.error * rise.deviation / np.sqrt(variance), prior.scatter * size)
-    log_weights = log_likelihood - 0.5 * np.log(variance) - 0.5 * excess**2 / variance
-    yield log_weights, size * fit.unit_flow, error * fit.unit_flow
-    log_chance = math.log(math.sqrt(2.0 * math.pi) * 2.0 * INFERENCE.scatter.tail / max(largest_rise, _TINY))
-    yield log_likelihood + log_chance, fit.size * fit.unit_flow, fit.error * fit.unit_flow
+    error = np.hypot(rise.deviation * np.sqrt(variance / rise_variance), INFERENCE.growth.scatter * combined)
+    yield log_likelihood + _log_normal(excess, rise_variance), combined * fit.unit_flow, error * fit.unit_flow
+    scatter = INFERENCE.scatter
+    log_chance = math.log(2.0 * scatter.tail / max(scatter.largest * max_rise, _TINY))
+    yield log_likelihood + log_chance, size * fit.unit_flow, np.sqrt(variance) * fit.unit_flow
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:
