@@ -329,6 +329,17 @@ def test_other_sensors_are_compared_among_themselves() -> None:
     assert trend_of(one, healthy=5).verdict == "leak"  # the first sensors again, and twice as much
 
 
+def test_a_scale_that_no_recording_determines_is_no_other_sensor() -> None:
+    """A gate that moves with one speed: the ratio of displacement to area scatters by half from day to day."""
+    random = np.random.default_rng(1)
+    days = [replace(own, scale=float(np.exp(0.3 * random.standard_normal()))) for own in life(40)]
+    groups = [point.group for point in trend_of(days, healthy=5).points]
+    assert groups.count(0) > 30
+    exchanged = [replace(own, scale=own.scale or 1.0) for own in life(40)]
+    exchanged[20:] = [replace(own, scale=1.03 * (own.scale or 1.0)) for own in exchanged[20:]]
+    assert len(trend_of(exchanged, healthy=5).groups) == 2
+
+
 def test_the_oil_s_temperature_is_taken_out_where_it_is_known() -> None:
     """A summer: the oil warms by 25 K within 60 days, and a healthy machine passes 2.7 times as much."""
     days = life(60, scatter=0.03)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Sequence
@@ -39,6 +40,8 @@ from sealscope.signals.details import QUANTITIES
 from sealscope.storage.folders import numeric_sort_key
 from sealscope.units import DAY
 
+#: Factor on the median difference of neighbouring ratios that still belong together; differences needed for a median.
+GAPS, MIN_GAPS = 5.0, 8
 #: Methods of estimating a leakage level, the most specific first. The level is a conductance; for "ringing" it is the
 #: damping of the pressures' wavelet details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
@@ -244,30 +247,51 @@ def build_timeline(
     """Sort leakage readings by time and group those that can be compared with each other.
 
     Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area. This ratio changes if a sensor is replaced by one with another scale, and from
-    machine to machine. `every` is the time between readings [s], by which they are dated in the order of their file
-    names; None if their times are known. Returns the readings with their groups, and for each group a text on its
-    difference from the first group, "" for the first. Raises InputError if the time of a reading is unknown.
+    pump displacement to piston area (`_group_scales`). This ratio changes if a sensor is replaced by one with another
+    scale, and from machine to machine. `every` is the time between readings [s], by which they are dated in the order
+    of their file names; None if their times are known. Returns the readings with their groups, and for each group a
+    text on its difference from the first group, "" for the first. Raises InputError if the time of a reading is
+    unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
+    used = [reading.scale for reading, note in zip(ordered, notes, strict=True) if not note]
+    used_groups = iter(_group_scales(used))
     points = []
-    scales: list[float | None] = []  # ratio of the first reading of each group
     for reading, note in zip(ordered, notes, strict=True):
-        group, start = -1, reading.start or 0.0  # no start is None after sorting
-        if not note:
-            changes = [abs(_relative_change(reading.scale, scale)) for scale in scales]
-            group = next((k for k, change in enumerate(changes) if change <= TREND.reading.scale), len(scales))
-            if group == len(scales):  # begin a new group
-                scales.append(reading.scale)
+        start = reading.start or 0.0  # no start is None after sorting
         fields = vars(reading) | {"start": start, "day": (start - (ordered[0].start or 0.0)) / DAY}
-        points.append(TrendPoint(**fields, group=group, note=note))
+        points.append(TrendPoint(**fields, group=-1 if note else next(used_groups), note=note))
+    scales: list[float | None] = []  # of the first reading of each group
+    for point in points:
+        if point.group == len(scales):
+            scales.append(point.scale)
     differences = [
         f"position or angle is scaled by {100.0 * _relative_change(scale, scales[0]):+.2g} %: a sensor exchanged, or "
         "another machine"
         for scale in scales
     ]
     return points, ("", *differences[1:]) if scales else ()
+
+
+def _group_scales(scales: Sequence[float | None]) -> list[int]:
+    """Assign a number to each group of readings with nearly the same ratio of displacement to area, by appearance.
+
+    `scales`: the ratios. Sorted by size, neighbours are of one group if their logarithms differ by no more than log(1 +
+    `reading.scale`) (`priors.toml`) plus `GAPS` times the median difference of neighbours: where the recordings of a
+    machine do not determine the ratio well, it scatters. The median counts from `MIN_GAPS` differences on. A ratio of
+    None is of the first group.
+    """
+    known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
+    gaps = np.diff(np.log(known))
+    limit = math.log1p(TREND.reading.scale) + (GAPS * float(np.median(gaps)) if len(gaps) >= MIN_GAPS else 0.0)
+    clusters = dict(zip(known, np.concatenate([[0], np.cumsum(gaps > limit)]).tolist(), strict=True)) if known else {}
+    numbers: dict[int | None, int] = {}  # number of the group of each cluster
+    groups = []
+    for scale in scales:
+        cluster = clusters.get(scale) if scale is not None else None
+        groups.append(numbers.setdefault(cluster, len(numbers)) if cluster is not None else 0)
+    return groups
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
