@@ -282,7 +282,8 @@ class RiseFits(NamedTuple):
 
     `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
     is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
-    mean flow after the onset and its standard error [m^3/s].
+    mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if the rise shows the leak, false if
+    it tells nothing. `log_none`: log probability that there is no leak, up to the same constant.
     """
 
     log_weights: Array
@@ -290,6 +291,13 @@ class RiseFits(NamedTuple):
     parts: Array
     flows: Array
     deviations: Array
+    by_rise: NDArray[np.bool_]
+    log_none: float
+
+    def join(self, fits: Sequence[RiseFits], part: slice = slice(None)) -> RiseFits:
+        """Return the `part` of the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
+        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits])[part] for name in self._fields[:-1]}
+        return self._replace(**joined)
 
     @property
     def probabilities(self) -> Array:
@@ -310,8 +318,20 @@ class RiseFits(NamedTuple):
 
     @property
     def bound(self) -> float:
-        """95 % upper bound of the leak's mean flow over the recording [m^3/s], given that it is positive."""
-        return bound_steps(self.probabilities, self.parts * self.flows, self.parts * self.deviations, BOUND_PROBABILITY)
+        """95 % upper bound of the leak's mean flow over the recording [m^3/s], 0 if there is hardly a leak.
+
+        Leaks of which the rise tells nothing do not count: steps are tested by themselves.
+        """
+        from scipy.special import ndtr
+
+        log_weights = np.append(np.where(self.by_rise, self.log_weights, -np.inf), self.log_none)
+        weights = np.exp(log_weights - log_weights.max())
+        weights = weights[:-1] / weights.sum()
+        flows, deviations = self.parts * self.flows, np.maximum(self.parts * self.deviations, _TINY)
+        chance_above, tail = float(weights @ ndtr(flows / deviations)), 1.0 - BOUND_PROBABILITY
+        if chance_above <= tail:
+            return 0.0
+        return bound_steps(weights, flows, deviations, 1.0 - tail / chance_above)
 
 
 def fit_rise(
@@ -338,40 +358,49 @@ def fit_rise(
     changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
     leak (`step_sizes`). The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted
     by the information of the blocks. The flow of any leak, and so s, has a half-normal prior whose scale, in s the
-    value S, is the pump's flow. With N(x; v) the density of a normal distribution with the variance v, and s'' and e''
-    the mean and the error of s by its prior and s', the likelihood of the leak is, up to a common factor,
+    value S, is the fraction `size.usual` of the pump's flow. With N(x; v) the density of a normal distribution with the
+    variance v, and s'' and e'' the mean and the error of s by its prior and s', the likelihood of the leak is, up to a
+    common factor,
 
         exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
 
-    and that of a leak which is older than the recording N(r; d^2 + R^2), with the rise R by the pump's flow.
+    that of a leak which is older than the recording N(r; d^2 + R^2), with the rise R by the pump's flow, and that of no
+    leak N(r; d^2), times the odds against a leak by its prior probability `size.present`.
 
     With the small probability `scatter.tail` (`priors.toml`) on either side the rise tells nothing, as the recording is
-    like none that the healthy ones predict. The rise then has any value up to the fraction `scatter.largest` of the
-    pump's flow, and s'' and e'' alone give the flow. All onsets together are as probable beforehand as an older leak.
-    If all hypotheses are excluded, the result is an older leak under the first law.
+    like none that the healthy ones predict. The rise then has any value up to R, and s'' and e'' alone give the flow.
+    All onsets together are as probable beforehand as an older leak. If all hypotheses are excluded, the result is an
+    older leak under the first law.
     """
     from scipy.special import log_ndtr
 
     unit_flows, law_log_weights = np.array(laws).T
     ones = np.ones(len(laws))
-    max_rises = max_flow / unit_flows
-    log_weights = law_log_weights + _log_normal(rise.value, rise.deviation**2 + max_rises**2)
-    older = RiseFits(log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows)
+    usual_flow = INFERENCE.size.usual * max_flow
+    usual_rises = usual_flow / unit_flows
+    log_weights = law_log_weights + _log_normal(rise.value, rise.deviation**2 + usual_rises**2)
+    present: float = INFERENCE.size.present
+    log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
+    log_none += float(_log_normal(rise.value, rise.deviation**2))
+    flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
+    older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
     fits = [older]
     weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
         for step_fit in step_fits:
+            usual_rise = float(usual_rises[step_fit.law])
+            combined = _combine_with_rise(step_fit, rise, usual_flow, usual_rise, weights)
             log_prior = law_log_weights[step_fit.law] - math.log(len(positions))
-            max_rise = float(max_rises[step_fit.law])
-            for log_weights, flows, deviations in _combine_with_rise(step_fit, rise, max_flow, max_rise, weights):
-                fits.append(RiseFits(log_prior + log_weights, test.onsets, part_after, flows, deviations))
-    fit = RiseFits(*(np.concatenate(values) for values in zip(*fits, strict=True)))
+            for by_rise, (likelihoods, flows, deviations) in zip((True, False), combined, strict=True):
+                flags, log_weights = np.full(len(positions), by_rise), log_prior + likelihoods
+                fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
+    fit = older.join(fits)
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
     log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
     if not np.isfinite(log_weights).any():
-        return RiseFits(*(values[:1] for values in older))
+        return older.join([older], slice(1))
     return fit._replace(log_weights=log_weights)
 
 
@@ -381,16 +410,16 @@ def _log_normal(value: Any, variance: Any) -> Any:
 
 
 def _combine_with_rise(
-    fit: _StepFit, rise: Estimate, max_flow: float, max_rise: float, weights: Array
+    fit: _StepFit, rise: Estimate, usual_flow: float, usual_rise: float, weights: Array
 ) -> Iterator[tuple[Array, Array, Array]]:
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
-    `max_flow`: mean flow of the pump [m^3/s]; `max_rise`: rise of the conductance by a leak as large, older than the
-    recording; `weights` (K,): information of the blocks, with the sum 1. Yields the log weight of each onset, without
-    the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,) each: first as the
-    rise shows the step, then as it tells nothing.
+    `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
+    it is older than the recording; `weights` (K,): information of the blocks, with the sum 1. Yields the log weight of
+    each onset, without the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,)
+    each: first as the rise shows the step, then as it tells nothing.
     """
-    prior_deviation = max_flow / np.maximum(fit.unit_flow, _TINY)  # of the coefficient
+    prior_deviation = usual_flow / np.maximum(fit.unit_flow, _TINY)  # of the coefficient
     is_known = fit.error < MAX_ERROR * prior_deviation  # else the blocks tell nothing of a step at this onset
     size = np.where(is_known, fit.size, 0.0)
     variance = np.where(is_known, fit.error, MAX_ERROR * prior_deviation) ** 2
@@ -406,8 +435,7 @@ def _combine_with_rise(
     # its standard error, and what remains as the course and the law are simplified
     error = np.hypot(rise.deviation * np.sqrt(variance / rise_variance), INFERENCE.growth.scatter * combined)
     yield log_likelihood + _log_normal(excess, rise_variance), combined * fit.unit_flow, error * fit.unit_flow
-    scatter = INFERENCE.scatter
-    log_chance = math.log(2.0 * scatter.tail / max(scatter.largest * max_rise, _TINY))
+    log_chance = math.log(2.0 * INFERENCE.scatter.tail / max(usual_rise, _TINY))
     yield log_likelihood + log_chance, size * fit.unit_flow, np.sqrt(variance) * fit.unit_flow
 
 

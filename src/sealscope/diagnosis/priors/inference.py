@@ -96,6 +96,8 @@ class SizePriors(PriorTable):
     displacement: float  # displacement of the pump
     law: float  # mean flow of a leak if its law is unknown: laminar, an orifice, or between the two
     laminar: float  # prior probability of a laminar leak
+    usual: float  # scale of the prior on the flow of a leak, over the pump's flow
+    present: float  # prior probability that there is a leak in a recording
     readings: int  # number of independent values by which a recording tells the leak's law
     meter: float  # scale of a flow meter
     area: float  # piston area

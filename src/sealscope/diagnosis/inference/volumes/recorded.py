@@ -130,10 +130,11 @@ class RecordedBalance:
     def _first_motion(self) -> int:
         """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test.
 
-        Only the balance of a cylinder has a pump's flow; otherwise it is the first block in which the machine moves.
+        A machine begins with the flow of its pump or, behind a servo valve (two balances), with the piston's motion.
+        Where a cylinder's flow is not known, it is the first block in which the machine moves.
         """
         first = int(np.argmax(self.blocks.is_moving))
-        if self.equations[0].name == CYLINDER:
+        if self.equations[0].name == CYLINDER or len(self.equations) > 1:
             rate = self.recording.rate
             rests = find_rests(self._pumped, rate, max_rest_rate(self._pumped, rate))
             begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
