@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
-from sealscope.diagnosis.inference.leak_law import RiseFits, find_leak_step, fit_rise
+from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.onset import Estimate, Information
+from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, fit_rise
 from sealscope.recordings.recording import Array
 
 K, BLOCK_S, PRESSURE = 60, 2.0, 5e6

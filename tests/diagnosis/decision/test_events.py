@@ -53,7 +53,7 @@ def volume_names() -> Iterator[str]:
         rig = load_rig(name)
         balances = [*equations(rig, channels), circulation(rig, channels), locked(rig, channels)]
         for term in (term for balance in balances if balance for term in balance.terms):
-            if term.name != BIAS and not term.compared and not term.name.startswith("motion"):
+            if term.name != BIAS and not term.is_compared and not term.name.startswith("motion"):
                 yield term.name
 
 

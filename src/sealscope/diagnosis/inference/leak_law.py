@@ -3,37 +3,28 @@
 The law of a leak is the exponent e of its flow c |p_A - p_B|^e. Such a leak, in addition to the healthy leakage,
 changes the conductance of block k by c r_k. Here r_k is the regression coefficient of |p_A - p_B|^e on the pressure
 difference within the block. A step test with a size proportional to r_k in each block thus covers every law, and the
-healthy laminar leakage does not enter. A seal that continues to wear leaks more towards the end: the step grows by a
-fraction of its size. The flow of a step is a mixture over laws, growths and onsets, weighted by their likelihood, and
-growths by their prior, too.
+healthy laminar leakage does not enter.
 
 A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
 p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
-coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. Of a
-leak that began or grew within the recording the rise shows a part only, as the blocks after the onset have but a part
-of the information: rise and changes within the recording together tell its flow (`fit_rise`).
+coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. The
+flow of a leak that began within the recording follows in `volumes/leak_flow.py`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
 from sealscope.diagnosis.inference.onset import (
-    BOUND_PROBABILITY,
     Estimate,
     Information,
     StepTest,
-    bound_steps,
     constant_log_ratio,
-    step_shapes,
-    step_sizes,
     step_test,
 )
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -43,10 +34,6 @@ from sealscope.recordings.recording import Array
 EXPONENTS = (1.0, 0.75, 0.5)
 #: Number of relative growths of a step that are tried, besides zero.
 N_GROWTHS = 6
-#: Probability of an onset, relative to the most probable one, below which it is omitted.
-NEGLIGIBLE = 1e-3
-#: Standard error of a step, over that of the prior on its size, above which it counts as unknown.
-MAX_ERROR = 1e6
 _TINY = np.finfo(float).tiny
 
 
@@ -199,244 +186,6 @@ def growth_priors() -> list[tuple[float, float]]:
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     probability = (1.0 - prior.steady) / N_GROWTHS
     return [(0.0, prior.steady), *((float(growth), probability) for growth in growths)]
-
-
-def _step_growths() -> list[tuple[float, float]]:
-    """List the relative growths of a leak that begins within a recording, with their prior probabilities.
-
-    They are those of `growth_priors`, and infinity for a leak that grows from nothing: it has the fraction
-    `growth.from_nothing` (`priors.toml`) of the probability of leaks that grow.
-    """
-    from_nothing: float = INFERENCE.growth.from_nothing
-    steady, *growing = growth_priors()
-    growths = [steady, *((growth, (1.0 - from_nothing) * probability) for growth, probability in growing)]
-    return [*growths, (math.inf, from_nothing * (1.0 - steady[1]))]
-
-
-def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording.
-
-    `test` counts a prior on the level as one more block before the first (`StepTest.positions`).
-    """
-    return test.positions - float(np.isfinite(leak.level))
-
-
-class _StepFit(NamedTuple):
-    """Steps of a leak with one law and one growth, fitted at each of o onsets.
-
-    - `law`: index of the law in `EXPONENTS`; `log_prior`: log probability of the growth;
-    - `conductance` (K,): change of the conductance in K blocks by a leak with the coefficient 1 that is older than the
-      recording; `course` (K, o): factor on it for each onset and this growth (`step_shapes`);
-    - `log_ratio`, `size`, `error` (o,): log likelihood ratio to no step, coefficient and its standard error;
-    - `unit_flow` (o,): mean flow after the onset [m^3/s] for a coefficient of 1.
-    """
-
-    law: int
-    log_prior: float
-    conductance: Array
-    course: Array
-    log_ratio: Array
-    size: Array
-    error: Array
-    unit_flow: Array
-
-
-def _fit_steps(
-    blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, positions: Array, onsets: NDArray[np.intp]
-) -> tuple[list[_StepFit], Array]:
-    """Fit a step of the leak with each growth of `_step_growths` and each law of `EXPONENTS`, at each of o onsets.
-
-    `positions` (o,): the onsets, counted in blocks; `onsets` (o,): their indices in the step test. Returns the fits,
-    and the fraction of the recording after each onset, (o,).
-    """
-    weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
-    part_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
-    conductances, flows, fits = apparent_conductances(blocks, columns), law_flows(blocks), list[_StepFit]()
-    for growth, probability in _step_growths():
-        steps = step_shapes(len(blocks), positions, growth)  # (K, o)
-        for law, exponent in enumerate(EXPONENTS):
-            sizes = step_sizes(leak, onsets, conductances[exponent], growth)
-            unit_flow = (weights * flows[exponent]) @ steps / part_after
-            fits.append(_StepFit(law, math.log(probability), conductances[exponent], steps, *sizes, unit_flow))
-    return fits, part_after
-
-
-def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
-    """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
-
-    It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
-    leak increases from the onset to the end) and an onset, weighted by their likelihood and the prior probability of
-    the growth; its standard error is the standard deviation of their mixture. `leak`: likelihood of the leak's
-    coefficient in the blocks; `test`: step test of this coefficient, whose onsets are used except improbable ones.
-    """
-    onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
-    fits, _ = _fit_steps(blocks, columns, leak, _onset_positions(leak, test)[onsets], onsets)
-    log_weights = np.concatenate([fit.log_prior + fit.log_ratio for fit in fits])
-    flows = np.concatenate([fit.size * fit.unit_flow for fit in fits])
-    deviations = np.concatenate([fit.error * fit.unit_flow for fit in fits])
-    return mixture_flow(np.exp(log_weights - log_weights.max()), flows, deviations)
-
-
-class RiseFits(NamedTuple):
-    """Leak above healthy recordings under h hypotheses on its onset, growth and law.
-
-    `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
-    is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
-    mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if the rise shows the leak, false if
-    it tells nothing. `log_none`: log probability that there is no leak, up to the same constant.
-    """
-
-    log_weights: Array
-    onsets: Array
-    parts: Array
-    flows: Array
-    deviations: Array
-    by_rise: NDArray[np.bool_]
-    log_none: float
-
-    def join(self, fits: Sequence[RiseFits], part: slice = slice(None)) -> RiseFits:
-        """Return the `part` of the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
-        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits])[part] for name in self._fields[:-1]}
-        return self._replace(**joined)
-
-    @property
-    def probabilities(self) -> Array:
-        """Probability of each hypothesis (h,)."""
-        weights = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(weights / weights.sum())
-
-    @property
-    def flow(self) -> Estimate:
-        """Mean flow [m^3/s] of the leak after its onset, averaged over the hypotheses."""
-        return mixture_flow(self.probabilities, self.flows, self.deviations)
-
-    @property
-    def flow_within(self) -> Estimate | None:
-        """The same flow, given that the leak began within the recording; None if this is excluded."""
-        log_weights = np.where(np.isneginf(self.onsets), -np.inf, self.log_weights)
-        return self._replace(log_weights=log_weights).flow if np.isfinite(log_weights).any() else None
-
-    @property
-    def bound(self) -> float:
-        """95 % upper bound of the leak's mean flow over the recording [m^3/s], 0 if there is hardly a leak.
-
-        Leaks of which the rise tells nothing do not count: steps are tested by themselves.
-        """
-        from scipy.special import ndtr
-
-        log_weights = np.append(np.where(self.by_rise, self.log_weights, -np.inf), self.log_none)
-        weights = np.exp(log_weights - log_weights.max())
-        weights = weights[:-1] / weights.sum()
-        flows, deviations = self.parts * self.flows, np.maximum(self.parts * self.deviations, _TINY)
-        chance_above, tail = float(weights @ ndtr(flows / deviations)), 1.0 - BOUND_PROBABILITY
-        if chance_above <= tail:
-            return 0.0
-        return bound_steps(weights, flows, deviations, 1.0 - tail / chance_above)
-
-
-def fit_rise(
-    blocks: Blocks,
-    columns: Sequence[ColumnRoles],
-    leak: Information,
-    weights: Array,
-    test: StepTest | None,
-    rise: Estimate,
-    laws: Sequence[tuple[float, float]],
-    max_flow: float,
-) -> RiseFits:
-    """Fit a leak to the rise over healthy recordings and to the changes of the leakage within the recording.
-
-    - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
-      in the blocks; `test`: test for a step of it, None for a leak from the start; `weights` (K,): information of each
-      block in the comparison with healthy recordings;
-    - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
-    - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
-      a constant;
-    - `max_flow`: mean flow of the pump [m^3/s]; hypotheses with a larger leak are excluded.
-
-    A leak with the coefficient s, and a given onset, growth and law, changes the conductance of block k by s c_k. The
-    changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
-    leak (`step_sizes`). The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted
-    by the information of the blocks. The flow of any leak, and so s, has a half-normal prior whose scale, in s the
-    value S, is the fraction `size.usual` of the pump's flow. With N(x; v) the density of a normal distribution with the
-    variance v, and s'' and e'' the mean and the error of s by its prior and s', the likelihood of the leak is, up to a
-    common factor,
-
-        exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
-
-    that of a leak which is older than the recording N(r; d^2 + R^2), with the rise R by the pump's flow, and that of no
-    leak N(r; d^2), times the odds against a leak by its prior probability `size.present`.
-
-    With the small probability `scatter.tail` (`priors.toml`) on either side the rise tells nothing, as the recording is
-    like none that the healthy ones predict. The rise then has any value up to R, and s'' and e'' alone give the flow.
-    All onsets together are as probable beforehand as an older leak. If all hypotheses are excluded, the result is an
-    older leak under the first law.
-    """
-    from scipy.special import log_ndtr
-
-    unit_flows, law_log_weights = np.array(laws).T
-    ones = np.ones(len(laws))
-    usual_flow = INFERENCE.size.usual * max_flow
-    usual_rises = usual_flow / unit_flows
-    log_weights = law_log_weights + _log_normal(rise.value, rise.deviation**2 + usual_rises**2)
-    present: float = INFERENCE.size.present
-    log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
-    log_none += float(_log_normal(rise.value, rise.deviation**2))
-    flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
-    older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
-    fits = [older]
-    weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
-    if test is not None:
-        positions = _onset_positions(leak, test)
-        step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
-        for step_fit in step_fits:
-            usual_rise = float(usual_rises[step_fit.law])
-            combined = _combine_with_rise(step_fit, rise, usual_flow, usual_rise, weights)
-            log_prior = law_log_weights[step_fit.law] - math.log(len(positions))
-            for by_rise, (likelihoods, flows, deviations) in zip((True, False), combined, strict=True):
-                flags, log_weights = np.full(len(positions), by_rise), log_prior + likelihoods
-                fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
-    fit = older.join(fits)
-    log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
-    log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
-    if not np.isfinite(log_weights).any():
-        return older.join([older], slice(1))
-    return fit._replace(log_weights=log_weights)
-
-
-def _log_normal(value: Any, variance: Any) -> Any:
-    """Compute the log density of a normal distribution with the mean 0 and the given `variance` at `value`."""
-    return -0.5 * value**2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
-
-
-def _combine_with_rise(
-    fit: _StepFit, rise: Estimate, usual_flow: float, usual_rise: float, weights: Array
-) -> Iterator[tuple[Array, Array, Array]]:
-    """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
-
-    `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
-    it is older than the recording; `weights` (K,): information of the blocks, with the sum 1. Yields the log weight of
-    each onset, without the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,)
-    each: first as the rise shows the step, then as it tells nothing.
-    """
-    prior_deviation = usual_flow / np.maximum(fit.unit_flow, _TINY)  # of the coefficient
-    is_known = fit.error < MAX_ERROR * prior_deviation  # else the blocks tell nothing of a step at this onset
-    size = np.where(is_known, fit.size, 0.0)
-    variance = np.where(is_known, fit.error, MAX_ERROR * prior_deviation) ** 2
-    prior_variance = prior_deviation**2
-    log_likelihood = fit.log_prior + fit.log_ratio + 0.5 * np.log(2.0 * np.pi * variance)
-    log_likelihood += _log_normal(size, prior_variance + variance)
-    shrinkage = prior_variance / (prior_variance + variance)
-    size, variance = size * shrinkage, variance * shrinkage  # by the step and the prior
-    fraction = (weights * fit.conductance) @ fit.course
-    rise_variance = rise.deviation**2 + fraction**2 * variance  # of the rise minus the fraction of the step
-    excess = rise.value - fraction * size
-    combined = size + fraction * variance / rise_variance * excess  # mean of both, weighted by their precisions
-    # its standard error, and what remains as the course and the law are simplified
-    error = np.hypot(rise.deviation * np.sqrt(variance / rise_variance), INFERENCE.growth.scatter * combined)
-    yield log_likelihood + _log_normal(excess, rise_variance), combined * fit.unit_flow, error * fit.unit_flow
-    log_chance = math.log(2.0 * INFERENCE.scatter.tail / max(usual_rise, _TINY))
-    yield log_likelihood + log_chance, size * fit.unit_flow, np.sqrt(variance) * fit.unit_flow
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:

@@ -16,11 +16,8 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
-    RiseFits,
     estimate_bend_flows,
     estimate_older_flow,
-    estimate_step_flow,
-    fit_rise,
     law_priors,
     mixture_flow,
     older_log_ratios,
@@ -35,6 +32,7 @@ from sealscope.diagnosis.inference.onset import (
     StepTest,
     fit_history,
 )
+from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage
