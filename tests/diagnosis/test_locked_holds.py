@@ -129,6 +129,13 @@ def test_a_side_that_is_open_to_the_charge_line_leaves_the_piston_possible() -> 
     assert chambers.piston_leak.fit.value == pytest.approx(SEAL, rel=0.35)
 
 
+def test_a_side_that_a_leak_fills_in_every_hold_is_not_open() -> None:
+    """A clamp with a leak of 8 % was bounded at a thousandth: its rod side, at 40 bar, passed for an open one."""
+    chambers = held_press(piston=30.0 * SEAL, charge=0.0)
+    assert all(SideSupply.OPEN not in supplies for supplies in chambers._possible_supplies)
+    assert chambers.piston_leak.probability > 0.95
+
+
 def test_a_side_that_is_open_to_the_tank_leaves_the_piston_possible() -> None:
     """A loses oil in any case; B tells nothing, at the pressure of a tank."""
     chambers = held_press(piston=SEAL, vented=True, charge=0.0)

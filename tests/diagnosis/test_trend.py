@@ -338,6 +338,8 @@ def test_a_scale_that_no_recording_determines_is_no_other_sensor() -> None:
     exchanged = [replace(own, scale=own.scale or 1.0) for own in life(40)]
     exchanged[20:] = [replace(own, scale=1.03 * (own.scale or 1.0)) for own in exchanged[20:]]
     assert len(trend_of(exchanged, healthy=5).groups) == 2
+    unknown = [replace(exchanged[0], scale=None), *exchanged[1:]]
+    assert any("+3 %" in finding.text for finding in trend_of(unknown, healthy=5).findings)
 
 
 def test_the_oil_s_temperature_is_taken_out_where_it_is_known() -> None:

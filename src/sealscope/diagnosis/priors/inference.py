@@ -174,7 +174,7 @@ class HeldOilPriors(PriorTable):
     charge: float  # relative margin above the charge pressure from which no check valve feeds a side
     tank: float  # standard deviation of the gauge pressure in a line to the tank
     open: float  # probability that the side without the load is open to the charge line
-    above: float  # probability that a reading of an open side is above the charge pressure
+    above: float  # usual fraction of a hold in which an open side is above the charge pressure
     resolved: float  # further margin, within which a sensor cannot tell a pressure from the charge pressure
     steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
     # volume fraction of free air in the oil, and the standard deviation of its logarithm

@@ -266,6 +266,8 @@ def build_timeline(
     for point in points:
         if point.group == len(scales):
             scales.append(point.scale)
+        elif point.group >= 0 and scales[point.group] is None:
+            scales[point.group] = point.scale  # the first that is known
     differences = [
         f"position or angle is scaled by {100.0 * _relative_change(scale, scales[0]):+.2g} %: a sensor exchanged, or "
         "another machine"

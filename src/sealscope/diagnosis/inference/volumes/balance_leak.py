@@ -205,7 +205,7 @@ class BalanceLeak(LeakMeasure):
         )
 
     def _mix_with_holds(self, flow: Estimate) -> Estimate:
-        """Combine the flow of a leak over the whole recording with its flow during holds, if the holds show a leak.
+        """Combine the flow of a leak since its onset with its flow during holds, if the holds show a leak.
 
         In a hold shut valves keep the load in place. The estimate from holds has the weight `held_oil.right` of
         `priors.toml`, the probability that it is right if the two disagree.

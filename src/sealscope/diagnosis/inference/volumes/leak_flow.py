@@ -42,6 +42,8 @@ from sealscope.recordings.recording import Array
 NEGLIGIBLE = 1e-3
 #: Standard error of a step, over that of the prior on its size, above which it counts as unknown.
 MAX_ERROR = 1e6
+#: Smallest mean flow of a unit step after an onset, over that of other onsets.
+MIN_UNIT = 1e-6
 _TINY = np.finfo(float).tiny
 
 
@@ -138,9 +140,9 @@ class RiseFits(NamedTuple):
     by_rise: NDArray[np.bool_]
     log_none: float
 
-    def join(self, fits: Sequence[RiseFits], part: slice = slice(None)) -> RiseFits:
-        """Return the `part` of the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
-        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits])[part] for name in self._fields[:-1]}
+    def join(self, fits: Sequence[RiseFits]) -> RiseFits:
+        """Return the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
+        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits]) for name in self._fields[:-1]}
         return self._replace(**joined)
 
     @property
@@ -151,14 +153,17 @@ class RiseFits(NamedTuple):
 
     @property
     def flow(self) -> Estimate:
-        """Mean flow [m^3/s] of the leak after its onset, averaged over the hypotheses."""
-        return mixture_flow(self.probabilities, self.flows, self.deviations)
+        """Mean flow [m^3/s] of the leak that the rise shows, after its onset, averaged over the hypotheses."""
+        log_weights = np.where(self.by_rise, self.log_weights, -np.inf)
+        return mixture_flow(self._replace(log_weights=log_weights).probabilities, self.flows, self.deviations)
 
     @property
     def flow_within(self) -> Estimate | None:
-        """The same flow, given that the leak began within the recording; None if this is excluded."""
+        """Mean flow [m^3/s] of a leak that began within the recording, after its onset; None if this is excluded."""
         log_weights = np.where(np.isneginf(self.onsets), -np.inf, self.log_weights)
-        return self._replace(log_weights=log_weights).flow if np.isfinite(log_weights).any() else None
+        if not np.isfinite(log_weights).any():
+            return None
+        return mixture_flow(self._replace(log_weights=log_weights).probabilities, self.flows, self.deviations)
 
     @property
     def bound(self) -> float:
@@ -172,10 +177,11 @@ class RiseFits(NamedTuple):
         weights = np.exp(log_weights - log_weights.max())
         weights = weights[:-1] / weights.sum()
         flows, deviations = self.parts * self.flows, np.maximum(self.parts * self.deviations, _TINY)
-        chance_above, tail = float(weights @ ndtr(flows / deviations)), 1.0 - BOUND_PROBABILITY
-        if chance_above <= tail:
+        chance, tail = float(weights.sum()), 1.0 - BOUND_PROBABILITY  # of a leak, which is positive
+        if chance <= tail:
             return 0.0
-        return bound_steps(weights, flows, deviations, 1.0 - tail / chance_above)
+        truncated = weights / np.maximum(ndtr(flows / deviations), _TINY)  # of normal densities without negative flows
+        return bound_steps(truncated, flows, deviations, 1.0 - tail / chance)
 
 
 def fit_rise(
@@ -196,7 +202,7 @@ def fit_rise(
     - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
-    - `max_flow`: mean flow of the pump [m^3/s]; hypotheses with a larger leak are excluded.
+    - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, but an older one under the first law.
 
     A leak with the coefficient s, and a given onset, growth and law, changes the conductance of block k by s c_k. The
     changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
@@ -208,13 +214,13 @@ def fit_rise(
 
         exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
 
-    that of a leak which is older than the recording N(r; d^2 + R^2), with the rise R by the pump's flow, and that of no
-    leak N(r; d^2), times the odds against a leak by its prior probability `size.present`.
+    that of a leak which is older than the recording N(r; d^2 + R^2), where R is the rise by a leak of the usual flow,
+    and that of no leak N(r; d^2), times the odds against a leak by its prior probability `size.present`. The flow of an
+    older leak is that of the rise alone.
 
-    With the small probability `scatter.tail` (`priors.toml`) on either side the rise tells nothing, as the recording is
-    like none that the healthy ones predict. The rise then has any value up to R, and s'' and e'' alone give the flow.
-    All onsets together are as probable beforehand as an older leak. If all hypotheses are excluded, the result is an
-    older leak under the first law.
+    With the small probability 2 `scatter.tail` (`priors.toml`) the rise tells nothing, as the recording is like none
+    that the healthy ones predict. Its density is then 1 / R, and s'' and e'' alone give the flow. All onsets together
+    are as probable beforehand as an older leak.
     """
     from scipy.special import log_ndtr
 
@@ -226,6 +232,8 @@ def fit_rise(
     present: float = INFERENCE.size.present
     log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
     log_none += float(_log_normal(rise.value, rise.deviation**2))
+    if test is None:
+        log_none -= math.log(2.0)  # an older leak has the whole probability, of which it has half beside one within
     flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
     older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
     fits = [older]
@@ -242,14 +250,14 @@ def fit_rise(
                 fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
     fit = older.join(fits)
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
-    log_weights = np.where(np.abs(fit.flows) > max_flow, -np.inf, log_weights)
-    if not np.isfinite(log_weights).any():
-        return older.join([older], slice(1))
-    return fit._replace(log_weights=log_weights)
+    is_excluded = np.abs(fit.flows) > max_flow
+    is_excluded[0] = False  # the older leak under the first law always counts
+    return fit._replace(log_weights=np.where(is_excluded, -np.inf, log_weights))
 
 
 def _log_normal(value: Any, variance: Any) -> Any:
     """Compute the log density of a normal distribution with the mean 0 and the given `variance` at `value`."""
+    variance = np.maximum(variance, _TINY)
     return -0.5 * value**2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
 
 
@@ -263,12 +271,15 @@ def _combine_with_rise(
     each onset, without the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,)
     each: first as the rise shows the step, then as it tells nothing.
     """
-    prior_deviation = usual_flow / np.maximum(fit.unit_flow, _TINY)  # of the coefficient
+    unit_flow = np.maximum(fit.unit_flow, MIN_UNIT * float(fit.unit_flow.max()))  # 0 where no pressure is known
+    prior_deviation = usual_flow / unit_flow  # of the coefficient
     is_known = fit.error < MAX_ERROR * prior_deviation  # else the blocks tell nothing of a step at this onset
     size = np.where(is_known, fit.size, 0.0)
-    variance = np.where(is_known, fit.error, MAX_ERROR * prior_deviation) ** 2
-    prior_variance = prior_deviation**2
-    log_likelihood = fit.log_prior + fit.log_ratio + 0.5 * np.log(2.0 * np.pi * variance)
+    error = np.where(is_known, fit.error, MAX_ERROR * prior_deviation)
+    variance, prior_variance = error**2, prior_deviation**2
+    # `log_ratio` counts steps down as 0; the likelihood of a step is that of a normal distribution about any `size`
+    log_likelihood = fit.log_prior + fit.log_ratio + 0.5 * np.minimum(size / error, 0.0) ** 2
+    log_likelihood += 0.5 * np.log(2.0 * np.pi * variance)
     log_likelihood += _log_normal(size, prior_variance + variance)
     shrinkage = prior_variance / (prior_variance + variance)
     size, variance = size * shrinkage, variance * shrinkage  # by the step and the prior
@@ -278,6 +289,6 @@ def _combine_with_rise(
     combined = size + fraction * variance / rise_variance * excess  # mean of both, weighted by their precisions
     # its standard error, and what remains as the course and the law are simplified
     error = np.hypot(rise.deviation * np.sqrt(variance / rise_variance), INFERENCE.growth.scatter * combined)
-    yield log_likelihood + _log_normal(excess, rise_variance), combined * fit.unit_flow, error * fit.unit_flow
+    yield log_likelihood + _log_normal(excess, rise_variance), combined * unit_flow, error * unit_flow
     log_chance = math.log(2.0 * INFERENCE.scatter.tail / max(usual_rise, _TINY))
-    yield log_likelihood + log_chance, size * fit.unit_flow, np.sqrt(variance) * fit.unit_flow
+    yield log_likelihood + log_chance, size * unit_flow, np.sqrt(variance) * unit_flow

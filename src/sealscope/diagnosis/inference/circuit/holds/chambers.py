@@ -153,16 +153,17 @@ class HeldChambers:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
         An open side has the probability `held_oil.open` (`priors.toml`). Only while it empties, it is above the charge
-        pressure by more than the back pressure `held_oil.tank` of its line: the fraction of a hold in which it is has
-        an exponential prior with the mean `held_oil.above`. If check valves keep both sides at their pressure, a side
-        that gains oil must drain to the tank. The charge pressure is then that of a tank line, whose gauge pressure has
-        a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
+        pressure by more than the back pressure `held_oil.tank` of its line: for the fraction a = `held_oil.above` of a
+        hold. A larger fraction f has the relative probability exp(-(f - a) / a). If check valves keep both sides at
+        their pressure, a side that gains oil must drain to the tank. The charge pressure is then that of a tank line,
+        whose gauge pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
             is_A = supplies[0] is SideSupply.OPEN
             above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank) for hold in self.holds]
-            return math.log(prior.open) - sum(float(flags.mean()) for flags in above) / prior.above
+            excess = [max(float(flags.mean()) - prior.above, 0.0) for flags in above]  # in each hold
+            return math.log(prior.open) - sum(excess) / prior.above
         log_prior = math.log1p(-prior.open)
         if drains and supplies == BOTH:
             log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank) ** 2
