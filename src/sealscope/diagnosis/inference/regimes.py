@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -164,8 +165,8 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
     Pa)], or all are flows [m^3/s]. The result is limited to +-`rest.most`.
     """
     prior = INFERENCE.rest
-    if_shut = _normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
-    if_open = _normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
+    if_shut = normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
+    if_open = normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
     return float(np.clip(if_shut - if_open, -prior.most, prior.most))
 
 
@@ -183,6 +184,7 @@ def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tu
     return coefficients, inverse @ (scores.T @ scores) @ inverse * small_sample_factor
 
 
-def _normal_log_density(value: float, variance: float) -> float:
-    """Compute the log density at `value` of a normal distribution with mean 0 and a `variance`, up to a constant."""
-    return -0.5 * value * value / variance - 0.5 * float(np.log(variance))
+def normal_log_density(value: Any, variance: Any) -> Any:
+    """Compute the log density at `value` of a normal distribution with mean 0 and a `variance`, numbers or arrays."""
+    variance = np.maximum(variance, np.finfo(float).tiny)
+    return -0.5 * value * value / variance - 0.5 * np.log(2.0 * np.pi * variance)

@@ -18,7 +18,10 @@ class LevelError(PriorTable):
     """Errors of the leakage level (conductance or log RMS of wavelet details) of a single recording."""
 
     ringing: float  # standard error of the logarithm of the RMS of the pressures' wavelet details (their ringing)
-    scale: float  # largest relative difference of displacement over area between compared recordings
+    # largest relative difference of displacement over area between neighbours, in order of size, that are compared
+    scale: float
+    scatter: float  # further difference of the logarithms, over the median difference of neighbours
+    fewest: int  # smallest number of differences with such a median
 
 
 class ChangeScales(PriorTable):

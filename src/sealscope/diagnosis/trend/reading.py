@@ -40,8 +40,6 @@ from sealscope.signals.details import QUANTITIES
 from sealscope.storage.folders import numeric_sort_key
 from sealscope.units import DAY
 
-#: Factor on the median difference of neighbouring ratios that still belong together; differences needed for a median.
-GAPS, MIN_GAPS = 5.0, 8
 #: Methods of estimating a leakage level, the most specific first. The level is a conductance; for "ringing" it is the
 #: damping of the pressures' wavelet details.
 Basis = Literal["volume balance", "pressure response", "ringing"]
@@ -280,13 +278,16 @@ def _group_scales(scales: Sequence[float | None]) -> list[int]:
     """Assign a number to each group of readings with nearly the same ratio of displacement to area, by appearance.
 
     `scales`: the ratios. Sorted by size, neighbours are of one group if their logarithms differ by no more than log(1 +
-    `reading.scale`) (`priors.toml`) plus `GAPS` times the median difference of neighbours: where the recordings of a
-    machine do not determine the ratio well, it scatters. The median counts from `MIN_GAPS` differences on. A ratio of
-    None is of the first group.
+    `reading.scale`) (`priors.toml`) plus `reading.scatter` times the median difference of neighbours: where the
+    recordings of a machine do not determine the ratio well, it scatters. The median counts from `reading.fewest`
+    differences on. A ratio of None is of the first group.
     """
     known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
     gaps = np.diff(np.log(known))
-    limit = math.log1p(TREND.reading.scale) + (GAPS * float(np.median(gaps)) if len(gaps) >= MIN_GAPS else 0.0)
+    prior = TREND.reading
+    limit = math.log1p(prior.scale)
+    if len(gaps) >= prior.fewest:
+        limit += prior.scatter * float(np.median(gaps))
     clusters = dict(zip(known, np.concatenate([[0], np.cumsum(gaps > limit)]).tolist(), strict=True)) if known else {}
     numbers: dict[int | None, int] = {}  # number of the group of each cluster
     groups = []

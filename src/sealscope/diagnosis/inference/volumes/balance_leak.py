@@ -335,9 +335,12 @@ class BalanceLeak(LeakMeasure):
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
             return np.inf
-        bound = test.bound() * self.balance.mean_pressure() if self._hold_rise is None else self._hold_bound()
-        if self._motion_rise is not None and self._hold_rise is None:
-            bound = max(bound, self._rise_fits.bound)  # the leakage may have begun, or grown, within the recording
+        if self._hold_rise is not None:
+            bound = self._hold_bound()
+        else:
+            bound = test.bound() * self.balance.mean_pressure()
+            if self._motion_rise is not None:
+                bound = max(bound, self._rise_fits.bound)  # a leak may have begun, or grown, within the recording
         return bound * (1.0 + UPPER_95 * float(np.hypot(self.balance.size.deviation, INFERENCE.size.law)))
 
     def _hold_bound(self) -> float:

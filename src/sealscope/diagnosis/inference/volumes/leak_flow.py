@@ -35,6 +35,7 @@ from sealscope.diagnosis.inference.onset import (
     step_shapes,
     step_sizes,
 )
+from sealscope.diagnosis.inference.regimes import normal_log_density
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -146,24 +147,20 @@ class RiseFits(NamedTuple):
         return self._replace(**joined)
 
     @property
-    def probabilities(self) -> Array:
-        """Probability of each hypothesis (h,)."""
-        weights = np.exp(self.log_weights - self.log_weights.max())
-        return np.asarray(weights / weights.sum())
-
-    @property
     def flow(self) -> Estimate:
         """Mean flow [m^3/s] of the leak that the rise shows, after its onset, averaged over the hypotheses."""
-        log_weights = np.where(self.by_rise, self.log_weights, -np.inf)
-        return mixture_flow(self._replace(log_weights=log_weights).probabilities, self.flows, self.deviations)
+        return self._mean_flow(self.by_rise)
 
     @property
     def flow_within(self) -> Estimate | None:
         """Mean flow [m^3/s] of a leak that began within the recording, after its onset; None if this is excluded."""
-        log_weights = np.where(np.isneginf(self.onsets), -np.inf, self.log_weights)
-        if not np.isfinite(log_weights).any():
-            return None
-        return mixture_flow(self._replace(log_weights=log_weights).probabilities, self.flows, self.deviations)
+        is_possible = np.isfinite(self.onsets) & np.isfinite(self.log_weights)
+        return self._mean_flow(is_possible) if is_possible.any() else None
+
+    def _mean_flow(self, is_counted: NDArray[np.bool_]) -> Estimate:
+        """Average the flow [m^3/s] over the hypotheses flagged in `is_counted` (h,)."""
+        weights = np.exp(self.log_weights[is_counted] - self.log_weights[is_counted].max())
+        return mixture_flow(weights, self.flows[is_counted], self.deviations[is_counted])
 
     @property
     def bound(self) -> float:
@@ -228,10 +225,10 @@ def fit_rise(
     ones = np.ones(len(laws))
     usual_flow = INFERENCE.size.usual * max_flow
     usual_rises = usual_flow / unit_flows
-    log_weights = law_log_weights + _log_normal(rise.value, rise.deviation**2 + usual_rises**2)
+    log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
     present: float = INFERENCE.size.present
     log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
-    log_none += float(_log_normal(rise.value, rise.deviation**2))
+    log_none += float(normal_log_density(rise.value, rise.deviation**2))
     if test is None:
         log_none -= math.log(2.0)  # an older leak has the whole probability, of which it has half beside one within
     flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
@@ -255,12 +252,6 @@ def fit_rise(
     return fit._replace(log_weights=np.where(is_excluded, -np.inf, log_weights))
 
 
-def _log_normal(value: Any, variance: Any) -> Any:
-    """Compute the log density of a normal distribution with the mean 0 and the given `variance` at `value`."""
-    variance = np.maximum(variance, _TINY)
-    return -0.5 * value**2 / variance - 0.5 * np.log(2.0 * np.pi * variance)
-
-
 def _combine_with_rise(
     fit: _StepFit, rise: Estimate, usual_flow: float, usual_rise: float, weights: Array
 ) -> Iterator[tuple[Array, Array, Array]]:
@@ -280,7 +271,7 @@ def _combine_with_rise(
     # `log_ratio` counts steps down as 0; the likelihood of a step is that of a normal distribution about any `size`
     log_likelihood = fit.log_prior + fit.log_ratio + 0.5 * np.minimum(size / error, 0.0) ** 2
     log_likelihood += 0.5 * np.log(2.0 * np.pi * variance)
-    log_likelihood += _log_normal(size, prior_variance + variance)
+    log_likelihood += normal_log_density(size, prior_variance + variance)
     shrinkage = prior_variance / (prior_variance + variance)
     size, variance = size * shrinkage, variance * shrinkage  # by the step and the prior
     fraction = (weights * fit.conductance) @ fit.course
@@ -289,6 +280,6 @@ def _combine_with_rise(
     combined = size + fraction * variance / rise_variance * excess  # mean of both, weighted by their precisions
     # its standard error, and what remains as the course and the law are simplified
     error = np.hypot(rise.deviation * np.sqrt(variance / rise_variance), INFERENCE.growth.scatter * combined)
-    yield log_likelihood + _log_normal(excess, rise_variance), combined * unit_flow, error * unit_flow
+    yield log_likelihood + normal_log_density(excess, rise_variance), combined * unit_flow, error * unit_flow
     log_chance = math.log(2.0 * INFERENCE.scatter.tail / max(usual_rise, _TINY))
     yield log_likelihood + log_chance, size * unit_flow, np.sqrt(variance) * unit_flow
