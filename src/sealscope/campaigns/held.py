@@ -46,7 +46,7 @@ class PlannedHold(NamedTuple):
     """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
     `duration` [s]: time with shut valves; `pressure_A`, `pressure_B` [Pa]: absolute pressures when the valves shut;
-    `conductance` [m^3/(s Pa)] of the smallest leak that is found, inf if none is found.
+    `conductance` [m^3/(s Pa)]: that of the smallest leak, inf if no leak is found.
     """
 
     duration: float
@@ -109,8 +109,9 @@ def plan_hold(
     """Find the shortest locked hold under a load [N] that detects a leak of the conductance `find` [m^3/(s Pa)].
 
     If no duration in `HOLD_DURATIONS` suffices, the longest is planned. If `find` is None, the hold lasts
-    `DEFAULT_DURATION`. `flow` [m^3/s]: mean flow of the pump under the usual duty; `false_alarm`, `detection`:
-    probability of the verdict `leak` without and with a leak. Raises InputError if the load is not > 0.
+    `DEFAULT_DURATION`. `flow` [m^3/s]: mean flow of the pump under the usual duty, to which the assumed scatter of a
+    healthy machine's leakage is proportional; `false_alarm`, `detection`: probability of the verdict `leak` without and
+    with a leak. Raises InputError if the load is not > 0.
     """
     if not load > 0.0:
         raise InputError(f"a locked hold must be under a load > 0 N, got {load:g} N")
@@ -186,8 +187,9 @@ def _decay_rate_per_conductance(rig: Rig) -> float:
 def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed: int) -> RecordingSums:
     """Simulate a locked hold with a leak past the piston and with sensor noise, and estimate the leak from it.
 
-    `conductance` [m^3/(s Pa)]: that of the leak; `flow` [m^3/s]: mean flow of the pump under the usual duty. Returns
-    the summary of a recording with this hold. Its Gram matrix is 0, because the piston does not move.
+    `hold`: duration and initial pressures; `conductance` [m^3/(s Pa)]: that of the leak; `flow` [m^3/s]: mean flow of
+    the pump under the usual duty. Returns the summary of a recording with this hold. Its Gram matrix is 0, because the
+    piston does not move.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors

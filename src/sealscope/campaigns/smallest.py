@@ -6,8 +6,9 @@ test that `diagnose` uses (`StepTest.detectable_step`),
 
     detectable step = (threshold^(1/2) + z_detection) s,
 
-with the standard error s of a step at the median onset, the threshold of the likelihood ratio at the false-alarm
-probability, and the normal quantile z_detection. Flows are stated at the mean pressure difference of the usual duty.
+with the standard error s of a step (its median over all onsets), the threshold of the likelihood ratio at the
+false-alarm probability, and the normal quantile z_detection. Flows are stated at the mean pressure difference of the
+usual duty.
 The smallest step that can be told from a step of the pump's leakage follows from the Fisher information of both.
 """
 
@@ -234,14 +235,14 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     of the balance, the roles of its columns. The factor is inf if the balance has several equations or no column for
     the pump's leakage, or if the two steps cannot be told apart.
     """
-    column = columns[0]
-    if PUMP not in column.names or len(columns) > 1:
+    roles = columns[0]
+    if PUMP not in roles.names or len(columns) > 1:
         return np.inf
     middle = len(blocks) // 2
     gram = blocks.gram[:, 0].sum(axis=0)  # 0: the only equation
-    gram_after_step = blocks.gram[middle:, 0].sum(axis=0)
-    constants = np.array(column.nuisance)
-    steps = np.array([column.leak, column.names.index(PUMP)])
+    gram_after_step = blocks.gram[middle:, 0].sum(axis=0)  # products of a step's column, which is 0 before the step
+    constants = np.array(roles.nuisance)
+    steps = np.array([roles.leak, roles.names.index(PUMP)])
     cross = gram_after_step[np.ix_(constants, steps)]
     # Fisher information of both steps with the constant terms eliminated (Schur complement)
     information = gram_after_step[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(constants, constants)], cross)

@@ -40,8 +40,8 @@ class CompiledLaw(NamedTuple):
     `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler.
     It returns the voltage [V]; `measured` points to the fields of a `Measured` in their order. `memory` (n,):
     parameters and state of the control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the
-    controller compensates, or NaN if it reports none. `kept`: an object that the law needs, such as the `CompiledLaw`
-    that it calls, or None.
+    controller compensates, or NaN if it reports none. `kept`: an object that must exist as long as the law, such as the
+    `CompiledLaw` that the law calls, or None.
     """
 
     address: int
@@ -66,7 +66,10 @@ class Started:
 
     @property
     def compensated(self) -> float:
-        """Leakage flow [m^3/s] compensated at the last sample; AttributeError if the controller reports none."""
+        """Leakage flow [m^3/s] compensated at the last sample.
+
+        Raises AttributeError if the controller reports none, so that it seems to have no such attribute (`Controller`).
+        """
         flow = float(self._law.memory[0])
         if math.isnan(flow):
             raise AttributeError("compensated")
@@ -78,14 +81,17 @@ LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _PythonLaw:
-    """Adapter by which compiled code calls `voltage`, the function of a controller written in Python, through `law`."""
+    """A control law for compiled code (`law`), which calls the function `voltage` of a controller written in Python.
+
+    `raised`: the exception with which the controller failed, None if it has not.
+    """
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
         self._voltage, self._memory = voltage, np.full(1, math.nan)
         self.raised: BaseException | None = None
         self._function = LAW(self._call_voltage)
         address = ctypes.cast(self._function, ctypes.c_void_p).value
-        assert address is not None
+        assert address is not None  # for the type checker
         self.law = CompiledLaw(address, self._memory, self)
 
     def _call_voltage(self, _memory: int, measured: int) -> float:
@@ -108,7 +114,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run; return its control law in the form that compiled code can call.
 
-    It is the controller's machine code or, if its method `compiled` is missing or returns None, a law that calls the
+    This is the controller's machine code or, if its method `compiled` is missing or returns None, a law that calls the
     Python function of its method `start`.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
@@ -127,11 +133,11 @@ def reraise_python_error(law: CompiledLaw) -> None:
 class Controller(Protocol):
     """A sampled controller of the piston's position: the interface that a controller of your own must have.
 
-    `rate` [Hz]: sampling rate, the rig's times n/m with whole numbers n and m up to 64; `delay`: number of whole
-    samples from a measurement to the voltage computed from it. A run calls `start` once, and then calls the returned
-    function once a sample. All state must be in this function: then a run can be repeated. The voltage is constant
-    between samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields identify
-    the run.
+    `rate` [Hz]: sampling rate, which is n/m times the rig's with whole numbers m and n, n <= 64; `delay`: number of
+    whole samples from a measurement to the voltage computed from it. A run calls `start` once, and then calls the
+    returned function once a sample. All state must be in this function: then a run can be repeated. The voltage is
+    constant between samples, and limited to the converter's range. Make the controller a frozen dataclass: its fields
+    identify the run.
 
     The function may have an attribute `compensated`, the leakage flow [m^3/s] that it compensated at its last sample.
     The recording then has it as channel `q_comp`; without it, control would hide the wear.

@@ -31,7 +31,8 @@ _RESOLVED_COUNTS = 0.5
 _MIN_BLOCKS = 4
 #: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
 _NEGLIGIBLE_G = 1e-18
-#: State and parameters of the control law. `inner`, `inner_memory`: addresses of the inner controller's law and memory.
+#: State and parameters of the control law. `inner`, `inner_memory`: addresses of the inner controller's law and memory;
+#: `mean_A`, `mean_B`: averaged pressures [Pa]; `G`: compensated conductance [m^3/(s Pa)].
 _MEMORY = record_dtype(
     *("compensated", "inner", "inner_memory", "u_max", "G_assumed", "is_known", "pressure_gain", "blend_gain"),
     *("mean_A", "mean_B", "G", "is_significant"),

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 _LOAD_LAG = 0.1
 #: Change of the target's speed within a sample, relative to `v_max`, from which on it is a jump and no acceleration.
 _MAX_SPEED_CHANGE = 0.1
-#: State and parameters of the control law.
+#: State and parameters of the control law; `v`, `dp`: values of the last sample; `load`: averaged load [N].
 _MEMORY = record_dtype(
     *("compensated", "v_max", "M", "F_C", "v_th", "F_v", "G", "C", "T", "load_gain", "is_first", "v", "dp", "load"),
     drive=DRIVE,
@@ -36,11 +36,12 @@ def _flatness_law(memory: Any, sample: Any) -> Any:
 
     The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against the pressure
     difference dp that the load and the target's speed v and acceleration a require. At the first sample a and d(dp)/dt
-    are 0. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    are 0. A target that is faster than `v_max` jumps; v is then taken as 0. `memory`, `sample`: addresses of a record
+    `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
-    v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # jumps are not fed forward
+    v = measured.target_speed if abs(measured.target_speed) <= m.v_max else 0.0  # else a jump
     a = 0.0 if is_first else (v - m.v) / m.T
     a = a if abs(a) * m.T < _MAX_SPEED_CHANGE * m.v_max else 0.0  # a jump of the speed is no acceleration
     force = m.M * a + m.F_C * math.tanh(v / m.v_th) + m.F_v * v
@@ -71,7 +72,7 @@ class Flatness:
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
     averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
     are assumed; V is the volume of a chamber and K the bulk modulus of the oil. A speed of the target above `v_max`
-    [m/s] is taken as a jump of the target, and is not fed forward.
+    [m/s] is taken as a jump, to which only `feedback` responds.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """

@@ -51,11 +51,12 @@ def update_observer(m: Any, theta: float, x: float, p_A: float, p_B: float) -> N
 
     A Kalman filter estimates the conductance G between the chambers from the volume balance of each block of `BLOCK`
     seconds. The chamber with the higher pressure is balanced, because a check valve may feed the other. For chamber A,
-    D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt; for B the signs are
-    opposite. D is the displacement of the pump, A the piston area, V(x) the volume of the chamber, and K the bulk
-    modulus. dtheta, dx and dp_A are the changes of angle, position and p_A in the block. dtheta_in is the rotation that
-    pumps oil into the balanced chamber; this oil is compressed from the other chamber's lower pressure. The filter also
-    estimates the relative errors of 1/K and of the area. Friction and load do not enter.
+    D dtheta - A dx - (V(x)/K) dp_A - (|p_A - p_B|/K) D dtheta_in = G integral of (p_A - p_B) dt. For chamber B, dp_B
+    takes the place of dp_A, and both compression terms, those with 1/K, are positive. D is the displacement of the
+    pump, A the piston area, V(x) the volume of the chamber, and K the bulk modulus. dtheta, dx and dp_A are the changes
+    of angle, position and p_A in the block. dtheta_in is the rotation that pumps oil into the balanced chamber; this
+    oil is compressed from the other chamber's lower pressure. The filter also estimates the relative errors of 1/K and
+    of the area. Friction and load do not enter.
     """
     sample, means = (theta, x, p_A, p_B), m.means  # `means`: moving averages of the same four signals
     if m.count == 0.0:

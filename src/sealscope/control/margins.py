@@ -38,8 +38,9 @@ class Margins:
     `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
     [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
     `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
-    `damped`: True if the rig without controller is stable. It may be unstable in slow strokes, where friction falls
-    with speed; the margins then do not prove that the loop is stable.
+    `damped`: True if the rig without controller is stable. If |L| is never 1, phase and delay are inf, and crossover is
+    0. The rig may be unstable in slow strokes, where friction falls with speed; the margins then do not prove that the
+    loop is stable.
     """
 
     speed: float
@@ -213,7 +214,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
 def compute_margins(f: Array, L: NDArray[np.complex128], speed: float = 0.0, damped: bool = True) -> Margins:
     """Compute the stability margins of an open-loop response L (n,) at the frequencies `f` (n,) [Hz].
 
-    Between them, L is interpolated linearly. `speed` [m/s] and `damped` are copied to the result.
+    Between the frequencies, L is interpolated linearly. `speed` [m/s] and `damped` are copied to the result.
     """
     indices = np.arange(f.size)
     unit_gain = _crossings(np.abs(L) - 1.0)  # fractional indices at which |L| = 1

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 #: Time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load.
 _PRESSURE_LAG = 0.02
-#: State and parameters of the control law.
+#: State and parameters of the control law: `integral` is k_i times the integral of the error [m/s], `dp` the averaged
+#: p_A - p_B [Pa].
 FOLLOWING = record_dtype(
     *("compensated", "area_A", "area_B", "k_v", "k_i_T", "dead_band", "u_max", "pressure_gain", "integral", "dp"),
     drive=DRIVE,

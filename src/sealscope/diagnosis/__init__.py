@@ -1,1 +1,1 @@
-"""Detectors and their contract, the thesis's method, and the verdict on a recording."""
+"""Diagnosis of leaks: detectors, the decision by their reports, the verdict, and the history of a machine."""

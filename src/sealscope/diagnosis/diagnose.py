@@ -86,6 +86,7 @@ class Examination:
         names = set(channels)
 
         def select_channels(recording: Recording) -> Recording:
+            """Return the recording with those of its channels that are in `names`."""
             return recording.only(name for name in recording.channels if name in names)
 
         baseline = [select_channels(healthy) for healthy in self.baseline if isinstance(healthy, Recording)]
@@ -108,7 +109,7 @@ class Examination:
 
     @cached_property
     def null(self) -> HealthyNull:
-        """Distribution of the detectors' test results in the healthy recordings (`baseline`).
+        """Distributions of the detectors' p-values in the healthy recordings (`baseline`), test by test.
 
         If valves cut the pump off at rest in the judged recording, the same is assumed for the healthy ones.
         """
@@ -128,7 +129,8 @@ class Examination:
         """Decide from the observations of all registered detectors if the machine leaks.
 
         Detectors that measure the leak (`ORDER`) run one after the other until one of them decides; all others always
-        run. The verdict cannot be "no leak" if a measuring detector failed, or if there is a `refusal`.
+        run. The verdict cannot be "no leak" if a measuring detector failed, or if none of the given healthy recordings
+        could be compared, for all detectors (`refusal`) or for a measuring one (`Observed.refusal`).
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
         # the test results in these reports may show causes other than a leak, whichever detector decides
@@ -137,7 +139,7 @@ class Examination:
         for name in names:
             if name not in ORDER or not any(is_decided(decision) for decision in decisions.values()):
                 decisions[name] = self._decide_by(name, reports)
-        reports_in_order = [self.report(name) for name in ORDER if name in decisions]
+        reports_in_order = [self.report(name) for name in ORDER if name in decisions]  # of measuring detectors
         refusals = [report.lack if report.has_failed else report.refusal for report in reports_in_order]
         refusal = self.refusal or next(filter(None, refusals), None)  # reason not to state "no leak"
         return combine(list(decisions.values()), refusal)
@@ -169,8 +171,9 @@ def diagnose(
     """Decide if oil bypasses the piston in a recording.
 
     Four methods are asked in this order: the balance of volumes, the response of the pressures, plug-ins, and the
-    change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict. The results of
-    plug-ins and of the change of RMS are always stated in addition.
+    change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict; the change of
+    RMS gives it only if the channels allow neither of the first two. The results of plug-ins and of the change of RMS
+    are always stated in addition.
 
     Parameters
     ----------
@@ -178,7 +181,8 @@ def diagnose(
         The recording to judge.
     baseline : Recording or sequence of Recording, optional
         Leak-free recordings of the same machine. Those that cannot be compared are left out, and a finding names them.
-        Without a baseline, the recording is tested for a leak that begins within it.
+        Without a baseline, the recording is tested for a leak that begins within it, and its total leakage against the
+        limit for a healthy pump if the rig's file states one.
     false_alarm_probability : float, optional
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional

@@ -23,8 +23,9 @@ class SummarisedRecording:
     seconds: float  # duration [s]
     start_s: float | None  # time of its first sample [s since 1970], None if unknown
     summaries: Mapping[str, Summary]  # summary by each detector, by the detector's name
-    about: Mapping[str, Any] = field(default_factory=dict)  # pressure, oil, noise and problems, for display
-    # surprisal, -log(p-value), of each change within it, by the key of the change (`healthy_surprisals`)
+    # pressure, oil, noise and problems, for display (`commissioned.summary.describe_recording`)
+    about: Mapping[str, Any] = field(default_factory=dict)
+    # surprisal, -log(p-value), of each test for a change within it, by the key of the test (`healthy_surprisals`)
     statistics: Mapping[str, float | Array] = field(default_factory=dict)
 
 

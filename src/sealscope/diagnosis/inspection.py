@@ -32,7 +32,7 @@ class Inspection:
     part: Recording
     findings: tuple[Finding, ...]  # defects found in the whole recording
     distrust: str | None  # reason why the chamber pressures cannot be trusted; None if they can
-    share: float  # fraction of the recording's samples that `part` contains
+    share: float  # fraction of the recording's samples between the first and the last time of `part`
     judged_until: float = 1.0  # fraction of the recording's samples up to the last time of `part`
 
     @property
@@ -62,7 +62,7 @@ class Inspection:
 
 
 def inspect_recording(recording: Recording, channels: Iterable[str] | None = None) -> Inspection:
-    """Correct a recording and check its `channels`, by default all; the result is cached with the recording."""
+    """Correct a recording and look for defects of its `channels`, by default of all; the result is cached with it."""
     names = tuple(name for name in recording.channels if channels is None or name in channels)
     return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
 
@@ -97,7 +97,7 @@ class Baselines(NamedTuple):
 
     judged: Recording  # the judged recording, without channels that none of the comparable ones has
     parts: tuple[Healthy, ...]  # the comparable recordings: samples that can be analysed, or stored summaries
-    findings: tuple[Finding, ...]  # baselines that were left out, with the reasons
+    findings: tuple[Finding, ...]  # baselines that were left out, with the reasons, and channels that were left out
     refusal: str | None  # if all given baselines were left out, the most frequent reason
 
 

@@ -52,7 +52,7 @@ def order_ranks(n: int, order: float, confidence: float = 0.95) -> tuple[int, in
     as_probability(order, "the order of a quantile")
     tail = (1.0 - as_probability(confidence, "confidence")) / 2.0
     k = np.arange(1, n + 1)
-    p_at_least_k = betainc(k, n + 1 - k, order)  # falls with k: counting its large values finds the last of them
+    p_at_least_k = betainc(k, n + 1 - k, order)  # P(X >= k) falls with k: a count of its large values is a rank
     r = int(np.count_nonzero(1.0 - p_at_least_k <= tail))
     s = int(np.count_nonzero(p_at_least_k > tail)) + 1
     return r, s

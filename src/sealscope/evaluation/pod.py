@@ -106,7 +106,9 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
         eta = design @ beta
         p = expit(eta)
         residual = k - n * p
-        if firth:  # adds leverage of each size times (1/2 - p): Firth (1993), Heinze and Schemper (2002)
+        # adds h (1/2 - p), with the leverage h = n p (1 - p) x' I^-1 x of a size, x its row of the design and I the
+        # information: Firth (1993), Heinze and Schemper (2002)
+        if firth:
             inverse = np.linalg.pinv(_information(design, n, eta))
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual

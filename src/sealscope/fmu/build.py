@@ -353,7 +353,8 @@ def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:
     """Choose the platforms of an FMU, `platforms` or else the present one, and check that the FMU can be built.
 
-    Raises InputError if `path` does not end in .fmu, or if the FMI version or a platform is not supported.
+    Raises InputError if `path` does not end in .fmu, if the FMI version or a platform is not supported, or if the
+    compiler found cannot compile for another platform than the present one.
     """
     if Path(path).suffix != ".fmu":
         raise InputError(f"a unit's file must end in .fmu, got {path}")

@@ -38,14 +38,15 @@ def base_units(unit: str) -> dict[str, str] | None:
     if any(power.denominator != 1 for _, power in parsed.powers):
         return None
     base = {name: str(power) for name, power in parsed.powers if name != "count"}  # FMI has no unit of counts
-    factor = float(parsed.factor) * math.pi ** float(parsed.pi_power)
+    factor = float(parsed.factor) * math.pi ** float(parsed.pi_power)  # pi occurs in rpm, for example
     return base if factor == 1.0 else base | {"factor": repr(factor)}
 
 
 def format_description(fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable]) -> str:
     """Format modelDescription.xml, the description of an FMU for version 2 or 3 of FMI.
 
-    `identifier`: prefix of the C functions; `token`: hash by which the library recognises it; `summary`: one line.
+    `identifier`: prefix of the C functions; `token`: hash by which the compiled library recognises this description;
+    `summary`: one line that describes the FMU.
     """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]

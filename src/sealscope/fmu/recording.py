@@ -71,7 +71,7 @@ def record_fmu(
     Raises
     ------
     InputError
-        The unit cannot be read, lacks an input that the experiment needs, or has no chamber pressure.
+        The unit cannot be read, or lacks a chamber pressure or an input that the experiment needs.
     SimulationFailed
         The unit failed during the run.
 

@@ -1,8 +1,10 @@
 """The code of a soft sensor, a functional mock-up unit (FMU) that estimates leakage: functions that C can call.
 
-The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`). Each sample adds the
-increments of the balance's terms to the unfinished rows of the weak form. The rows of a block are weighted and summed
-to estimate its leakage conductance. Only the samples within `HALF_DIFFERENCE` of the present one are stored.
+The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`). A row is this balance,
+integrated with a test function over `SPAN` strides (`rows.weak_form`); a row begins every stride of about 0.125 s. Each
+sample adds the increments of the balance's terms to the unfinished rows. The rows of a block of 3 s are weighted and
+summed to a Gram matrix, the products of all terms, from which the block's leakage conductance is estimated. Only the
+samples within `HALF_DIFFERENCE` of the present one are stored.
 
 The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
 
@@ -10,14 +12,14 @@ The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
 
 with the standard deviation s of the blocks' estimates, their standard errors sd, Student's t, and the systematic
 standard error o due to the other coefficients and to the machine's sizes (displacement, piston area). The rise is the
-mean of the last n blocks minus that of the first N = `WINDOW` blocks, the baseline, which lies d blocks earlier. Its
-variance is
+mean of the last n blocks minus that of the first N = `WINDOW` blocks, the baseline, d blocks earlier from middle to
+middle. Its variance is
 
     variance of the rise = v/n + v_0/N + w d sigma^2,    sigma^2 = v_0/(1 + w (N + 1)/6)
 
 with the variance v_0 of the baseline's blocks. The last term is the random walk of a healthy machine: in each block
-its variance is w = `WALK` times the variance sigma^2 of a block's noise. The divisor is there because this walk adds
-w (N + 1)/6 times sigma^2 to v_0. The flow is G times the mean of abs(p_A - p_B) as recorded; the live balance also
+its variance grows by w = `WALK` times the variance sigma^2 of a block's noise. The divisor is there because this walk
+adds w (N + 1)/6 times sigma^2 to v_0. The flow is G times the mean of abs(p_A - p_B) as recorded; the live balance also
 subtracts the sensors' noise from this mean, a few per cent.
 """
 
@@ -149,8 +151,7 @@ class SensorChoice(NamedTuple):
 def _count_samples(rate: float) -> tuple[int, int, int]:
     """Compute the samples in a stride, the strides in a block, and the samples in half a difference, at `rate` [Hz].
 
-    A stride is the time between two rows of the volume balance. The direction of motion is the sign of a central
-    difference of the position.
+    The difference is the central one of the position, whose sign is the direction of motion.
     """
     return stride_samples(rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * rate))
 
@@ -158,11 +159,10 @@ def _count_samples(rate: float) -> tuple[int, int, int]:
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     """Build the layout of a soft sensor's memory: numpy's type of a record of the scalars `_SCALARS` and some arrays.
 
-    A row of the volume balance is the weighted integral of all terms over `SPAN` strides, where a stride is the time
-    from one row to the next. A block is open until its rows are weighted.
+    A block is open until its rows are weighted.
 
     - `ring`: last samples, a column each; `increments`: of each term of the balance over the last sampling interval
-    - `unfinished`: the `SPAN` rows to which the present interval adds; `rows`: finished rows of the open blocks
+    - `unfinished`: the `SPAN` rows to which the present sample adds; `rows`: finished rows of the open blocks
     - `ends`: index past the last row of each open block; `gram`: Gram matrices of the blocks weighted last
     - `pressure_sums`: sum of abs(p_A - p_B) and number of samples, for each of the last blocks
     - `slow_sums`: sums over earlier blocks for the coefficients that are not fitted to each block (`weigh_rows`)
@@ -263,8 +263,7 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
     def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
         """Add a sample to the sensor's memory m, and estimate the leakage when a block of rows is complete.
 
-        A row is an equation of the volume balance, integrated with the test function phi over `SPAN` strides.
-        `displacement` [m^3/rad]; `p_A`, `p_B` [Pa]; `theta` [rad]: angle of the pump; `x` [m]: position.
+        `displacement` [m^3/rad] of the pump; `p_A`, `p_B` [Pa]; `theta` [rad]: angle of the pump; `x` [m]: position.
         """
         n_samples, width = int(m.sample_count), m.ring.shape[1]
         newest = n_samples % width
@@ -354,8 +353,8 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 def _find_angle_sign(m: Any, n_rows: int) -> None:
     """Find the sign of the pump's recorded angle, and store it in the sensor's memory m: `m.angle_sign`, 1 or -1.
 
-    It is the sign of the covariance between p_A - p_B and the pump's flow in the first `n_rows` rows (equations) of the
-    volume balance: with the right sign, the flow rises with p_A - p_B.
+    It is the sign of the covariance between p_A - p_B and the pump's flow in the first `n_rows` rows of the volume
+    balance: with the right sign, the flow rises with p_A - p_B.
     """
     mean, covariance = 0.0, 0.0
     for r in range(n_rows):
@@ -419,7 +418,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard all coefficients and estimates in memory m, as those of a standstill differ from those in motion."""
+    """Discard all coefficients and estimates in the sensor's memory m: those of a standstill do not hold in motion."""
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -433,7 +432,8 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
 
     Before the first fit, blocks are only stored, beginning with the first that has motion; the coefficients are fitted
     to the first `LEARNED` blocks together. After `N_WAKING` successive blocks whose mean square motion is more than
-    1/`STANDSTILL` times that of earlier blocks, all estimates are discarded, and the first fit is repeated.
+    1/`STANDSTILL` times that of earlier blocks, the machine is taken to have stood still before: all estimates are
+    discarded, and the first fit is repeated.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
     `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B).
@@ -531,14 +531,14 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
-    The baseline is the first `WINDOW` blocks. With means over the last blocks, and p = abs(p_A - p_B),
+    With means over the last blocks, and p = abs(p_A - p_B),
 
         leakage = (mean of p) (mean of G),
         rise = (mean of p) ((mean of g) - (mean of g in the baseline)),
 
-    where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`). The means are
-    over the last `WINDOW` blocks, for the rise without those of the baseline. The leakage needs two blocks, the rise
-    two blocks after the baseline; without them their outputs are 0.
+    where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`). At most the
+    last `WINDOW` blocks count, for the rise without those of the baseline. The leakage needs two blocks, the rise and
+    the flag `settled` need two blocks after the baseline; without them these outputs are 0.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes;
     `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`.

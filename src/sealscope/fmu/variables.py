@@ -14,7 +14,7 @@ from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
 from sealscope.physics.state import OUTPUTS
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
-#: Parameters of an FMU in the order of its code: those of the equations, then those of derived numbers.
+#: Parameters of an FMU in the order of its code: those of the equations, then those from which numbers are derived.
 VALUES = tuple(NAMES_OF_VALUES.values())
 _TABLES: dict[str, Any] = tomllib.loads((files("sealscope.fmu") / "variables.toml").read_text("utf-8"))
 #: (unit, description) of inputs and outputs of a rig's FMU, and of a soft sensor's outputs, in the code's order.
@@ -52,13 +52,13 @@ def input_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
 
 def output_variables(rows: Mapping[str, tuple[str, str]]) -> Iterator[Variable]:
     """Yield the output variables of an FMU, without a servo valve's. `rows`: (unit, description) of each, by name."""
-    for k, (name, (unit, description)) in enumerate(rows.items()):
+    for k, (name, (unit, description)) in enumerate(rows.items()):  # k: index in the code's results, valve included
         if name not in _VALVE_OUTPUTS:
             yield Variable(REFERENCES["result"] + k, name, "output", "continuous", unit, description, start=None)
 
 
 def rig_variable(rig: Rig, name: str, variability: Literal["tunable", "fixed"]) -> Variable | None:
-    """Make the FMU variable of the rig's parameter `name`, such as "pump.q_b"; None if the rig lacks the part."""
+    """Make the FMU variable of a rig's parameter, such as "pump.q_b"; None if the rig lacks the part it describes."""
     value = float(attrgetter(name)(rig))
     field = dict(iter_fields(Rig))[name]
     if value == absent_of(field):  # the value that stands for an absent part

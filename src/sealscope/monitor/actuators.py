@@ -2,7 +2,8 @@
 
 One transaction stores the identities of blocks, their estimates, alarms and samples. The samples are stored as pending
 until the next checkpoint, which stores the whole state of an actuator: after 16 blocks or 400 kB, and with each mark of
-a person. A restart loads the last checkpoint and judges the pending samples again, with the settings of the first time.
+a person. Those of a stream's recording that has not ended stay pending until it ends. A restart loads the last
+checkpoint and judges the samples after it again, with the settings of the first time.
 """
 
 from __future__ import annotations
@@ -62,12 +63,12 @@ _AlarmEvent = tuple[Alarm, str, float]
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    `watch`, `judge`: decide on the leak and on the alarm; `pending`, `bytes`: number and size of the blocks of samples
-    since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over
-    the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if
-    unknown; `judged_s` [s]: end of the last judged samples; `verdict`: verdict on the last recording, None if there is
-    none or newer results replace it; `alarm_samples`: last samples during an alarm, which may become a healthy
-    recording; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other
+    `watch`: the detector of a leak; `judge`: decides on the alarm; `pending`, `bytes`: number and size [bytes] of the
+    blocks of samples since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with
+    flows averaged over the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature
+    [deg C], None if unknown; `judged_s` [s]: end of the last judged block; `verdict`: verdict on the last recording,
+    None if there is none or newer results replace it; `alarm_samples`: last samples during an alarm, which may become a
+    healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other
     actuators.
     """
 
@@ -91,14 +92,15 @@ class _Actuator:
         """Judge new samples; return the leakage estimates of blocks of some seconds, and the changes of the alarm.
 
         `follows`: False after a gap; `settings`: thresholds of the alarm; `verdict`: verdict on the recording that ends
-        with these samples, None for none. For a file, the recording consists of these samples: a verdict that decides
-        (`RecordingVerdict.decides`) replaces the leak in the estimates, and alone updates the alarm. For a stream, the
-        recording has the last minutes, and both the estimates and the verdict update the alarm.
+        with these samples, None for none. For a file, the recording consists of these samples: a verdict that decides,
+        "leak" or "no leak" (`RecordingVerdict.decides`), replaces the leak in the estimates, and alone updates the
+        alarm. For a stream, the recording has the last minutes, and both the estimates and the verdict update the
+        alarm. A stream's verdict is forgotten `not_comparable_s` after its recording, if no other has followed.
         """
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
-        self.pending += 1  # blocks of samples since the last checkpoint
+        self.pending += 1
         self.bytes += count_bytes(samples)
         if (oil_celsius := measured_oil_temperature(samples)) is not None:
             self.oil_celsius = oil_celsius
@@ -118,7 +120,7 @@ class _Actuator:
         if verdict is not None or self.recorder is None:
             events.extend(self._apply_verdict(verdict, settings))
         elif self.verdict is not None and len(samples):
-            age_s = float(samples.t[-1]) - self.verdict.end_s  # long if no recording could be judged since
+            age_s = float(samples.t[-1]) - self.verdict.end_s
             self.verdict = None if age_s > settings.not_comparable_s else self.verdict
         self._update_alarm_samples(samples, follows=follows)
         return estimates, events
@@ -126,23 +128,23 @@ class _Actuator:
     def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
         """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
 
-        For a stream, a verdict that does not decide is dropped once there is an estimate of a block, which tells more.
-        Also for a stream, the verdict `no leak` is dropped if its bound does not exclude the leak of the alarm.
-        Otherwise `no leak` also makes the detector withdraw its leak.
+        None, for a file without a verdict, only replaces the earlier verdict. For a stream, a verdict that does not
+        decide is dropped once there is an estimate of a block, which tells more, and the verdict `no leak` is dropped
+        if its bound does not exclude the leak of the alarm. Otherwise `no leak` makes the detector withdraw its leak.
         """
         earlier_verdict, self.verdict = self.verdict, verdict
         is_stream, alarm = self.recorder is not None, self.judge.alarm
         if is_stream and verdict is not None:
             self.judge.add_evidence(verdict)
         if verdict is None or not verdict.decides:
-            if is_stream and self.last is not None:  # the blocks of the stream tell more
+            if is_stream and self.last is not None:
                 self.verdict = None
             return []
         if verdict.excludes_leak:
             if is_stream and alarm is not None and not verdict.excludes(alarm.leak_lpm):
                 self.verdict = None
                 return []
-            if self.watch.leak is not None:  # the detector withdraws its leak
+            if self.watch.leak is not None:
                 self.watch.dismiss()
         version = self._baseline_version()
         change = self.judge.update_from_verdict(verdict, earlier_verdict, version, settings, is_stream=is_stream)
@@ -172,7 +174,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", *_RESULT_TYPES, "n_stored", "recorder"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore the detector and the last results from `state`, plain values of a checkpoint; keep the alarm."""
+        """Restore detector, recorder and last results from `state`, plain values of a checkpoint, but not the alarm."""
         self.watch = Watch.from_state(state["watch"])
         restore_attributes(self, _RESULT_TYPES, state, _RESULT_TYPES)
         if self.recorder is not None and state["recorder"] is not None:
@@ -201,7 +203,7 @@ class _Actuator:
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        Status and time are those of the last verdict on a whole recording, if there is one, else of the last block. The
+        Status and time are those of the verdict on the last recording, if there is one, else of the last block. The
         flows are those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are None.
 
         - `blocks`: number of blocks of some seconds that the detector has processed; `counters`: its counters; `by`:
@@ -260,14 +262,15 @@ class WatchedActuators:
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from its last checkpoint in the database and the samples since then, or create it."""
+        """Restore an actuator from its last checkpoint and the samples since then, or create and store it."""
         name = settings.name
         watched = load_watched(settings.rig)
         is_cut_into_recordings = watched.machine is not None and settings.folder is None and settings.recording_s > 0.0
-        stream_share = 1.0 - STREAM_SHARE if is_cut_into_recordings else 1.0  # the recordings take the rest
+        # share of the allowed false alarms for the blocks; the recordings take the rest
+        block_share = 1.0 - STREAM_SHARE if is_cut_into_recordings else 1.0
         fresh = watch(
             watched.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * stream_share,
+            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * block_share,
             learn_hours=settings.learn_hours,
             healthy=watched.healthy,
         )
@@ -339,7 +342,8 @@ class WatchedActuators:
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Blocks of actuators not in the settings are only counted. Repeat the call after an error of the database.
+        Blocks of actuators not in the settings are only counted. After an error of the database nothing is stored, and
+        the call can be repeated.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]
@@ -398,7 +402,10 @@ class WatchedActuators:
         return self._actuators[name]
 
     def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
-        """Judge the samples of an actuator's block, and add the results to the database rows that will be stored."""
+        """Judge the samples of an actuator's block, and add the results to the database rows that will be stored.
+
+        If a recording of the stream ends with the block, it is judged, too. A checkpoint is added when it is due.
+        """
         settings, follows, verdict = actuator.settings, block.follows, block.verdict
         name, number, recorder = settings.name, actuator.n_stored, actuator.recorder
         if recorder is not None and (recording := recorder.take(number, samples)) is not None:
@@ -417,13 +424,14 @@ class WatchedActuators:
             self._checkpoint(actuator, rows)
         else:
             self._add_summary(actuator, rows)
-        if not is_due or (recorder is not None and recorder.first):  # the recording is judged when it ends
+        if not is_due or (recorder is not None and recorder.first):  # the recording that has not ended needs the block
             rows.add_pending(name, number, samples, follows, verdict)
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion.
 
-        The number and size of its pending samples become 0.
+        Of the pending samples, those of a stream's recording that has not ended are kept (`first_kept`). Their number
+        and size since the last checkpoint become 0.
         """
         settings = actuator.settings
         state, recorder = actuator.state(), actuator.recorder
@@ -497,7 +505,7 @@ class WatchedActuators:
 
     @property
     def false_alarms_per_1000_h(self) -> float:
-        """Limit of the expected number of false alarms in 1000 h of operation, if all actuators run and are healthy."""
+        """Limit of the expected number of false alarms in 1000 h in which all actuators run and are healthy."""
         return sum(settings.false_alarms_per_1000_h for settings in self.settings.values())
 
     def summaries(self) -> dict[str, dict[str, Any]]:

@@ -5,10 +5,11 @@ its cause has ended and a person has seen it, or when a person marks a repair; a
 alarm whose cause has ended is "returned to normal, unacknowledged" in the standard ISA-18.2.)
 
 Two ways lead to an alarm, both in `AlarmJudge`: `update`, from the blocks of a stream, once their detector (`Watch`)
-has found a leak; and `update_from_verdict`, from whole recordings. Of a file, a verdict that decides leaves the blocks
-no say. The recordings of a commissioned machine's stream add up their evidence; they and the blocks have half the rate
-`false_alarms_per_1000_h` each (`verdicts.STREAM_SHARE`), and other streams' blocks all of it. Nine tenths of the
-blocks' part go to their test for a step, one tenth to that against the baseline (`diagnosis/live/priors.toml`).
+has found a leak; and `update_from_verdict`, from whole recordings. For a file, a verdict of leak or no leak replaces
+the results of its blocks. The recordings of a commissioned machine's stream add up their evidence; they and the blocks
+have half the rate `false_alarms_per_1000_h` each (`verdicts.STREAM_SHARE`), and other streams' blocks all of it. Nine
+tenths of the blocks' part go to their test for a step, one tenth to that against the baseline
+(`diagnosis/live/priors.toml`).
 """
 
 from __future__ import annotations
@@ -45,10 +46,11 @@ class Alarm:
 
     `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which the alarm was raised and
     last changed; `onset_s`, `returned_s`: begin and end of the leak, None while it lasts; `leak_lpm`: leak flow
-    [L/min]; `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended
-    inspection; `baseline`: version of the healthy baseline; `mark`: last mark of a person ("valid", "invalid" or
-    "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is not announced;
-    `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours.
+    [L/min], None if unknown; `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line;
+    `next_check`: recommended inspection; `baseline`: version of the healthy baseline, 0 while it is being learned;
+    `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
+    `shelved_until_s`: time before which it is not announced; `by_chance_per_1000_h`: most false alarms of this strength
+    that a healthy actuator raises in 1000 operating hours, None if unknown.
     """
 
     id: str
@@ -111,8 +113,8 @@ class AlarmJudge:
 
     `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
     numbers of successive blocks above the thresholds of a warning and of an error, and below the threshold at which the
-    alarm ends; `over_s` [s]: time at which the last alarm ended (`Alarm.active`), or changed after its end; `evidence`:
-    evidence of a leak from the recordings of a stream, 0 without any.
+    alarm ends; `over_s` [s]: time at which the last alarm ended, or was last changed after its end, None if none has
+    ended; `evidence`: evidence of a leak from the recordings of a stream (`add_evidence`), 0 without any.
     """
 
     actuator: str
@@ -129,15 +131,15 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the estimate of one block of samples; return the alarm and the name of the event.
 
-        The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
-        none of these. Returns None if the block is not judged, or if no alarm was active and none is raised. `leak`:
-        leak that the detector has found, or None; `baseline`: version of the healthy baseline; `settings`: thresholds
-        [L/min], and number of successive blocks beyond a threshold before the alarm changes (`debounce_blocks`).
+        `leak`: leak that the detector has found, or None; `baseline`: version of the healthy baseline. An alarm is
+        raised if there is a leak and its flow reaches `warning_lpm` or `error_lpm` of the `settings`. It ends, or an
+        error becomes a warning, when the flow is below `return_share` times the threshold of its level. Each change
+        needs `debounce_blocks` successive blocks. A leak without a flow in L/min is a warning. A leak that comes back
+        before anybody has acknowledged its alarm raises the same alarm again. After a restart of the detector, when
+        `leak` is None, the alarm stays: the leak may last.
 
-        An alarm is raised while a leak is found and its flow reaches the threshold of a warning or an error. It ends,
-        or an error becomes a warning, when the flow is below `return_share` times the threshold of its level. A leak
-        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
-        the same alarm again. After a restart of the detector, when `leak` is None, the alarm stays: the leak may last.
+        The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
+        none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.
         """
         if not estimate.judged:
             return None
@@ -194,7 +196,7 @@ class AlarmJudge:
 
         The open alarm, whose leak has ended, keeps its id and shelving. `findings`: the alarm's other fields, by name.
         """
-        if self.alarm is None:  # not the open alarm, raised again
+        if self.alarm is None:  # otherwise the open alarm is raised again, with the same number
             self.raised += 1
         alarm_id = f"{self.actuator}-{self.raised}"
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
@@ -222,16 +224,16 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the verdict on a whole recording; return the alarm and the name of the event.
 
-        A leak at or above the warning threshold raises an alarm if the verdict on the `earlier` recording (None for
-        none) was `leak`, too, or if the verdict is rare enough by itself (`RecordingVerdict.is_rare`). A leak of
-        unknown size counts as above the threshold. A recording of a stream (`is_stream`) raises an alarm only if the
-        attribute `evidence`, collected from the stream's recordings, reaches 1/alpha, where alpha is the probability of
-        a false alarm that these recordings are allowed. The verdict `no leak`, or a leak below the warning threshold,
-        ends an active alarm, and only then resets `evidence`. `baseline`: version of the healthy baseline; `settings`:
-        thresholds and the allowed rate of false alarms.
+        A leak of unknown size, or of at least the warning threshold, raises an alarm. For a file, the verdict on the
+        `earlier` recording (None for none) must be `leak`, too, or the verdict must be rare enough by itself
+        (`RecordingVerdict.is_rare`). For a stream (`is_stream`), the attribute `evidence`, collected from its
+        recordings, must reach 1/alpha, where alpha is the allowed false-alarm probability of one recording. The alarm
+        is an error if the leak is over the repair limit, by the state in the verdict. The verdict `no leak`, or a leak
+        below the warning threshold, ends an active alarm, and only then resets `evidence`. `baseline`: version of the
+        healthy baseline; `settings`: thresholds and the allowed rate of false alarms.
 
-        The event is "raised", "error" or "warning" (a change of the level), "returned" (the leak has ended), or "" for
-        none of these. Returns None for the verdict `cannot tell`, or if no alarm was active and none is raised.
+        The events are those of `update`. Returns None for the verdict `cannot tell`, or if no alarm was active and none
+        is raised.
         """
         alarm, lpm = self.alarm, verdict.leak_lpm
         is_active = alarm is not None and alarm.active
@@ -245,7 +247,8 @@ class AlarmJudge:
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
         by_chance = verdict.by_chance_per_1000_h
         if is_stream:
-            by_chance = 1.0 / (verdict.allowed_chance(1.0) * self.evidence)  # rate at which the evidence just suffices
+            # the rate at which the evidence just suffices: 1/evidence = alpha = rate x allowed_chance(1)
+            by_chance = 1.0 / (verdict.allowed_chance(1.0) * self.evidence)
         findings: dict[str, Any] = {
             "level": level,
             "updated_s": verdict.end_s,
@@ -291,9 +294,10 @@ class AlarmJudge:
         """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
         `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
-        [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. All marks
-        but a comment also reset the counts of successive blocks beyond a threshold. Raises InputError for an unknown
-        mark or a mark that the alarm has already, if there is no open alarm, or if ``invalid`` has no reason.
+        [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. If its
+        leak has ended, "acknowledged" and "valid" close the alarm. All marks but a comment also reset the counts of
+        successive blocks beyond a threshold, "invalid" and "repaired" the `evidence`, too. Raises InputError for an
+        unknown mark or one that the alarm has already, if there is no open alarm, or if "invalid" has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"the mark of an alarm must be one of {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -323,18 +327,18 @@ class AlarmJudge:
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Sort the summaries of actuators by urgency; add to each the `name` and the open `alarm`, None if there is none.
 
-    The criteria are, in this order: severity of the state; whether the alarm is new; evidence, which is stronger if a
-    healthy actuator raises fewer such alarms by chance; lower end of the leak's interval; leak; and name. `summaries`:
-    by name of the actuator; `alarms`: the open alarms, for each actuator the latest first.
+    The criteria are, in this order: severity of the state; whether the alarm is new; how rarely a healthy actuator
+    raises such an alarm; lower end of the leak's interval; leak; and name. `summaries`: by name of the actuator
+    (`WatchedActuators.summaries`); `alarms`: the open alarms, for each actuator the latest first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
         """Build the sorting key of a summary, the lowest for the most urgent one."""
         low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
-        evidence = math.inf if by_chance is None else by_chance
+        false_alarm_rate = math.inf if by_chance is None else by_chance  # unknown: after the others
         is_new = row["status_word"] & NEW_BIT
-        return -row["state"]["severity"], -is_new, evidence, -low_lpm, -(row["leak_lpm"] or 0.0), row["name"]
+        return -row["state"]["severity"], -is_new, false_alarm_rate, -low_lpm, -(row["leak_lpm"] or 0.0), row["name"]
 
     # of several alarms of an actuator, the first in `alarms` is the latest: reversed, it replaces the others
     by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}

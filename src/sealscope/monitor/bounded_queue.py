@@ -10,7 +10,7 @@ _Item = TypeVar("_Item")
 
 
 class QueueLoad(NamedTuple):
-    """Numbers of blocks and bytes that wait to be stored, and of times that a source waited for room in the queue."""
+    """Load of a monitor's queue: blocks and bytes that wait to be stored, and how often a source waited for room."""
 
     n_blocks: int = 0
     n_bytes: int = 0
@@ -51,7 +51,7 @@ class BoundedQueue(Generic[_Item]):
             return True
 
     def pop(self, max_items: int, timeout: float) -> list[_Item]:
-        """Remove and return up to `max_items` items, waiting up to `timeout` [s] for the first one."""
+        """Remove and return at most `max_items` items, waiting up to `timeout` [s] for the first; [] if none comes."""
         with self._changed:
             self._changed.wait_for(lambda: bool(self._items), timeout)
             items = [self._items.popleft() for _ in range(min(max_items, len(self._items)))]

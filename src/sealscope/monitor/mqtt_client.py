@@ -32,7 +32,8 @@ class MqttLink:
     `client_id`: name of the client at the broker; `password`: for the user in the settings `broker`, None for none.
     `will`: function, called before each connection, that returns topic and payload of the last will, None for no will.
     The broker publishes this message when the connection is lost, and `close` publishes it before it disconnects.
-    `retain`: True if the broker keeps the will for later subscribers; `client`: object of the library paho.
+    `retain`: True if the broker keeps the will for later subscribers; `client`: object of the library paho; `is_open`:
+    True from `open` to `close`, also while the connection is lost.
     """
 
     def __init__(

@@ -64,14 +64,17 @@ class Service:
         stdout: TextIO | None = None,
         sources: Iterable[Source] = (),
     ) -> None:
-        """Lock and open the database, restore the actuators from it, and start the page; `run` starts all else."""
+        """Lock and open the database, restore the actuators from it, and start the page; `run` starts all else.
+
+        Raises InputError if another monitor has locked the database, or if it or the page cannot be opened.
+        """
         self.settings, self.once = settings, once
         self._queue: BoundedQueue[SourceBlock | RefusedMessage | None] = BoundedQueue(_QUEUE_BLOCKS, _QUEUE_BYTES)
         self._unstored: list[SourceBlock | RefusedMessage | None] = []
         self._stdin = stdin or (sys.stdin.buffer if sys.stdin is not None else BytesIO())
         self._extra_sources = [*sources]
         self._refused = self._n_waits = self._n_sources = 0
-        self._is_database_blocked = False  # True while it refuses the blocks that are to be stored
+        self._is_database_blocked = False  # True while the database refuses blocks
         self._resources = ExitStack()
         if "://" not in settings.database:
             if not Path(settings.database).parent.is_dir():
@@ -98,6 +101,7 @@ class Service:
         """Queue a block or a refused message for storage; wait while the queue is full.
 
         A refused message is also counted and logged; the web page draws the samples of a block before they are stored.
+        If the service stops meanwhile, the block is neither stored nor acknowledged to its sender.
         """
         if isinstance(block, RefusedMessage):
             self.count(block.reason)
@@ -126,10 +130,9 @@ class Service:
         return QueueLoad(n_blocks + len(unstored), n_bytes, self._n_waits)
 
     def run(self) -> None:
-        """Store blocks of samples until `stop` is called or, if there is no web page, until all sources have ended.
+        """Start outputs and sources, and store blocks until `stop` is called or, without a page, all sources end.
 
-        Linear algebra runs in one thread: the matrices are small, and on a busy machine several threads would mostly
-        wait.
+        Linear algebra runs in one thread: the matrices are small, and several threads would mostly wait.
         """
         self._resources.enter_context(threadpool_limits(limits=1))
         sources, threads = self._all_sources(), list[threading.Thread]()
@@ -191,7 +194,7 @@ class Service:
         self.stopping.set()
 
     def close(self) -> None:
-        """Release the lock of the database, which another monitor can then open."""
+        """Release the lock of the database, which another monitor can then open, and the limit of `run` on threads."""
         self._resources.close()
 
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
@@ -227,10 +230,10 @@ class Service:
     def _write_events(self) -> None:
         """Write new events of alarms to the output stream.
 
-        The events are read from the database, so its outage ends, unless the database still refuses blocks.
+        If they could be read from the database, its outage ends, unless blocks cannot be written yet.
         """
         self._lines.deliver()
-        if not self._is_database_blocked:  # otherwise the database can be read, but not written
+        if not self._is_database_blocked:
             self._database.end_outage()
 
 

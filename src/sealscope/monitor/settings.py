@@ -104,8 +104,8 @@ class ActuatorSettings(WatchSettings):
     - Files: `folder` of the recordings, and `pattern` of their names.
     - MQTT: `topic` of the messages. Sparkplug: `sparkplug`, as "group/node" or "group/node/device".
     - OPC UA: `nodes`, the node of each channel. Simulation: `simulate`, a simulated rig as the source.
-    - `map`: by channel, the column of the files or the Sparkplug metric; `rate` [Hz]: sampling rate; `units`: by
-      channel, the unit of values whose source does not state it.
+    - `map`: by channel, the column of the files or the Sparkplug metric; `rate` [Hz]: sampling rate, None if the source
+      states it; `units`: by channel, the unit of values whose source does not state it.
     """
 
     name: _Text
@@ -227,7 +227,8 @@ class MonitorSettings(_Table):
 
     `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
     change before a file is read; `keep_days`: days of operation whose estimates are stored;
-    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators; `defaults`: for settings that actuators omit.
+    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators, None if each has its own limit; `defaults`: for
+    settings that actuators omit. Where a table is None, the page, or this input or output, is switched off.
     """
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
@@ -311,7 +312,8 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
     if not actuator.nodes:
         return
     watched, nodes = load_watched(actuator.rig), actuator.nodes.keys()
-    is_recorded = watched.machine is not None and actuator.recording_s > 0.0  # its recordings may need other channels
+    # recordings of the stream, which are judged as a whole, may do with other channels than its blocks
+    is_recorded = watched.machine is not None and actuator.recording_s > 0.0
     ways = ways_to_watch(watched.rig)  # the sets of channels that suffice to watch the actuator by blocks
     if not (is_recorded and nodes >= {"p_A", "p_B"}) and not any(nodes >= {*way} for way in ways):
         raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(nodes)}")

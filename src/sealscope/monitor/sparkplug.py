@@ -117,7 +117,7 @@ def payload_class() -> Any:
 
 
 def encode_payload(payload: SparkplugPayload) -> bytes:
-    """Encode a payload as bytes; each data type must be a constant of this module, or 31 for an array of doubles."""
+    """Encode a payload as bytes; the data type of each metric must be in `_FIELD_OF_TYPE` or `_ARRAYS`."""
     message = payload_class()(timestamp=payload.timestamp, seq=payload.seq)  # protobuf omits fields that are None
     for metric in payload.metrics:
         fields: dict[str, Any] = {name: getattr(metric, name) for name in ("name", "alias", "timestamp", "datatype")}

@@ -34,7 +34,7 @@ _Work = Callable[[], object]
 
 
 class PartAway(Exception):  # noqa: N818 (says what happened)
-    """Raised by a part of the monitor that lacks something it needs; its outage is logged without a traceback."""
+    """Raised by a part of the monitor that lacks something it needs; its text alone is the reason of the outage."""
 
 
 class SupervisedPart:
@@ -93,7 +93,7 @@ class SupervisedPart:
 
         An error begins an outage of the part, or of the database if the error comes from the database. It also begins a
         pause, twice as long as the last one up to a limit. Success ends the outage of the part. `at_once`: True to
-        ignore a pause.
+        ignore a pause. The reason of an outage also states the place in the code, except for PartAway.
         """
         if self.pause_s and not at_once:
             return False
@@ -160,7 +160,7 @@ class Supervisor:
         part = self.part(name)
 
         def work_with_timer() -> None:
-            """Run `work`; once it has run for `_WORKING_S` seconds, end the outage of the part."""
+            """Run `work`, perhaps for as long as the monitor; end the outage of the part after `_WORKING_S` seconds."""
             timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()

@@ -37,7 +37,8 @@ class RecordingVerdict:
     - `file`: name of the file; `verdict`: "leak", "no leak" or "cannot tell", with its `reason` in words;
     - `summary`, `size`, `odds`: texts that state the verdict, the size or bound of the leak, and the fraction of
       healthy recordings that look like this one;
-    - `cause`: cause of the leak or of another event, "" if not named; `state`: state of the machine by NAMUR NE 107;
+    - `cause`: cause of the leak or of another event, "" if not named; `state`: state of the machine by NAMUR NE 107, as
+      plain values (`MachineState.as_dict`);
     - `start_s`, `end_s`: times of the first and last sample; `onset_s`, `onset_interval_s`: start of the leak, None if
       it leaks from the first sample on or not at all;
     - `leak_lpm`, `total_lpm`, `bound_lpm` [L/min]: flows of the leak and of all leakage, with 95 % intervals, and upper
@@ -110,7 +111,10 @@ class RecordingVerdict:
         return bool(self.verdict == NO_LEAK)
 
     def excludes(self, leak_lpm: float | None) -> bool:
-        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if the flow or the bound is not known."""
+        """Return True if a leak of this flow [L/min] is above `bound_lpm`, the upper bound of an undetected leak.
+
+        The result is also True if the flow or the bound is not known: the verdict "no leak" then holds as it is.
+        """
         return self.bound_lpm is None or leak_lpm is None or self.bound_lpm < leak_lpm
 
     @property
@@ -122,22 +126,22 @@ class RecordingVerdict:
         return self.leaks or self.excludes_leak or self.mark != ""
 
     def allowed_chance(self, false_alarms_per_1000_h: float) -> float:
-        """Compute the probability of a false alarm that a rate allows for one recording of this length."""
-        return false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # [s] in 1000 h
+        """Compute the false-alarm probability of one recording of this length at the allowed rate of false alarms."""
+        return false_alarms_per_1000_h * (self.end_s - self.start_s) / 3.6e6  # 3.6e6 s are 1000 h
 
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Return True if so few leak-free recordings get such a verdict that it may raise an alarm by itself.
 
         `chance` must be at most `allowed_chance`. The smallest `chance` that a diagnosis states, `rarest` of
-        `priors.toml`, is always rare enough: otherwise a short recording could never do so. An unknown
-        `chance` (None) counts as rare, so that no leak is missed for lack of it.
+        `diagnosis/decision/priors.toml`, is always rare enough: otherwise a short recording could never raise an alarm.
+        An unknown `chance` (None) counts as rare, so that no leak is missed.
         """
         allowed_chance = self.allowed_chance(false_alarms_per_1000_h)
         return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
 
     @property
     def e_value(self) -> float:
-        """E-value of this verdict: evidence of a leak with a mean of at most 1 over leak-free recordings.
+        """E-value of this verdict: evidence of a leak, whose mean over leak-free recordings is at most 1.
 
         With p = `chance`, at least `rarest` of `priors.toml`, the e-value is (1 - p + p ln p)/(p (ln p)^2), the mean of
         kappa p^(kappa - 1) over kappa from 0 to 1 (V. Vovk, R. Wang, Ann. Statist. 49 (2021) 1736). Without a leak p is
@@ -165,8 +169,8 @@ class RecordingVerdict:
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
         """Replace the leak in the estimate of a block by the leak of the whole recording.
 
-        Before the onset, or without a leak, the block gets no leak. The interval of its leak is then 0 to `bound_lpm`,
-        or None if the bound is unknown.
+        Before the onset, or without a leak, the block gets no leak: `leak_lpm` is None, and its interval is 0 to
+        `bound_lpm`, or None if the bound is unknown.
         """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:

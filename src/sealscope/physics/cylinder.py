@@ -16,7 +16,7 @@ from sealscope.units import P_ATM
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
     """Compute the oil volumes [m^3] of sides A and B at mid-stroke, each with its hose.
 
-    `c`: object with the chamber volume `V` of either side, the volume `V_rod` of the rod in side B, and the hose
+    `c`: object with the volume `V` of a chamber without the rod, the volume `V_rod` of the rod in side B, and the hose
     volumes `V_hose_A` and `V_hose_B`, all in m^3.
     """
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
@@ -104,5 +104,5 @@ def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
 
 
 def mechanical_power(p_A: Any, p_B: Any, v: Any, A_A: float, A_B: float) -> Any:
-    """Compute the power [W] of pressures `p_A`, `p_B` [Pa] on areas `A_A`, `A_B` [m^2] at the velocity `v` [m/s]."""
+    """Compute the power (p_A A_A - p_B A_B) v [W] of the chamber pressures [Pa] on the piston, velocity `v` [m/s]."""
     return (p_A * A_A - p_B * A_B) * v

@@ -55,7 +55,7 @@ _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
 def _vector_type(lanes: Lanes) -> Any:
-    """Return LLVM's vector type for numba's type of a vector of numbers (lanes)."""
+    """Return LLVM's vector type for `lanes`, numba's type of a vector of numbers."""
     return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
 
 
@@ -99,7 +99,7 @@ def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, valu
 
 
 def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the single vector type (lanes) among argument types; None without it, or if another type is no number."""
+    """Find the vector type (lanes) among argument types; None if there is none, if two differ, or for non-numbers."""
     lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
     compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
     return lanes.pop() if compatible else None
@@ -132,7 +132,7 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-    """Build the LLVM instructions that multiply lanes by a number's reciprocal, which a loop computes only once."""
+    """Build the LLVM instructions for lanes / number: a product with the reciprocal, which LLVM moves out of loops."""
     lanes, number_type = sig.args
     number = context.cast(builder, args[1], number_type, types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
@@ -185,17 +185,17 @@ for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
 
 
 def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
-    """Make a decorator for the function that builds the LLVM code of calls of the Python function `function`.
+    """Make the Python function `function` known to numba; return a decorator for the builder of its compiled code.
 
-    It makes `function` callable in compiled code. `arity`: number of its arguments; `infer_type(arg_types)`: returns
-    the type of its result, or None if it does not take arguments of these types. The decorated function takes numba's
-    context, LLVM's builder, and the types and values of the arguments; it returns the value of the result.
+    `arity`: number of arguments of `function`; `infer_type(arg_types)`: returns the type of its result, or None if it
+    does not take arguments of these types. The decorated function builds the LLVM instructions of one call: it takes
+    numba's context, LLVM's builder, and the types and values of the arguments, and returns the value of the result.
     """
 
     @infer_global(function)
     class Template(AbstractTemplate):  # type: ignore[misc]
         def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the function's signature for these types of arguments, None if it does not take them."""
+            """Return the signature of `function` for arguments of the types `args`, None if it does not take them."""
             if len(args) != arity or kws:
                 return None
             result_type = infer_type(args)
@@ -263,7 +263,7 @@ def _float_constant(value_type: Any, value: float) -> Any:
 def nearest_integer(x: Any) -> Any:
     """Round x to the nearest whole number, for |x| < 2^51 (in single precision |x| < 2^22).
 
-    It adds and subtracts a constant so large that its sum with x has no bits for a fraction.
+    A constant is added and subtracted again. It is so large that its sum with x has no bits for a fraction.
     """
     return (x + _ROUNDING_DOUBLE) - _ROUNDING_DOUBLE
 
@@ -340,9 +340,10 @@ def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes, a vector of numbers, to one row of a C-ordered array, in compiled code that `_lower_store` builds.
+    """Write lanes, a vector of numbers, to one row of a C-ordered array.
 
-    Only compiled code can call it, not Python. `array`, `row`: as in `load`; `value`: the lanes.
+    Only compiled code may call it, as for `load`: `_lower_store` builds its instructions. `array`, `row`: as in `load`;
+    `value`: the lanes.
     """
 
 
@@ -360,7 +361,7 @@ def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
 
 
 def broadcast(value: Any) -> Any:
-    """Copy one number into every lane of a vector of doubles, in compiled code that `_lower_broadcast` builds."""
+    """Copy a number into every lane of a vector of doubles; for compiled code, which `_lower_broadcast` builds."""
 
 
 @register_lowering(broadcast, 1, lambda _: LANES)

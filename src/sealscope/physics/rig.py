@@ -8,8 +8,11 @@ of a servo valve's spool. In a rig with clogging filters the last two are the oi
 Without throttles there are no line volumes: the pump is connected to the chambers, p_1 = p_A and p_2 = p_B. With a
 servo valve the pump runs at a constant speed from the return (p_2) to the supply (p_1), and the valve's edges connect
 both to the chambers. With throttles, only their two flows are stiff (microseconds, against milliseconds for the
-rest), so the right-hand side is in two parts: `rates_without_throttles` and `throttle_rates`. The argument `p` is
-always the rig's numbers, `RigNumbers`.
+rest), so the right-hand side is in two parts: `rates_without_throttles` and `throttle_rates`.
+
+The argument `p` is always the rig's numbers, `RigNumbers`. An optional part of the rig (`LAWS`) is an empty tuple in
+`p` if the rig does not have it, so `len(p.valved) > 0` asks for a servo valve. The laws also compile for vectors over
+runs (`lanes`) in place of numbers; `0.0 * v` is a zero of v's type.
 """
 
 from __future__ import annotations
@@ -136,10 +139,10 @@ else:  # plain named tuples, which numba takes apart into their fields
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
     """Compute the throttles' flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "in" is the flow towards the cylinder. Each throttle is in series with a shut-off valve. `v`: the rig's parameters.
-    `exponent`: 1 if a throttle's closed fraction is that of its area (eq. 4.8), 2 if that of its diameter (the thesis's
-    text). `literal`: if False, the flow towards the cylinder is free and the return is throttled on both sides (the
-    text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12) are printed.
+    "in" is the flow towards the cylinder, "out" the return. Each throttle is in series with a shut-off valve. `v`: the
+    rig's parameters. `exponent`: 1 if a throttle's closed fraction is that of its area (eq. 4.8), 2 if that of its
+    diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and the return is throttled
+    on both sides (the text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12) are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
@@ -220,12 +223,11 @@ def pack_numbers(p: RigNumbers) -> Any:
 
 @contracted
 def limit_state(y: State, p: RigNumbers) -> State:
-    """Limit the motor current and a servo valve's spool in the state `y`, after a step of the solver.
+    """Limit the states of motor and spool in `y` after a step of the solver, and set those that no law changes.
 
-    - The current is limited to +-i_max, the spool's position to its stroke, and its speed to +-v_max.
-    - Pressures that are no states of the rig are set: without lines p_1 = p_A and p_2 = p_B; with a servo valve p_2 is
-      the return's pressure.
-    - Other states that no law changes are set to 0, so that the compiler removes them. In `p`, an absent law is ().
+    - The motor current is limited to +-i_max, a servo valve's spool to its stroke, and the spool's speed to +-v_max.
+    - Without lines p_1 = p_A and p_2 = p_B are set; with a servo valve p_2 is the return's pressure.
+    - Other states of parts that the rig does not have are set to 0, so that the compiler removes them.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -242,7 +244,7 @@ def limit_state(y: State, p: RigNumbers) -> State:
 
 @contracted
 def vapour_floor(q: float, p: RigNumbers) -> float:
-    """Compute the pressure [Pa] of an oil volume from its pressure state q [Pa]: q, but at least the vapour pressure.
+    """Compute an oil volume's pressure [Pa gauge]: its pressure state q [Pa gauge], but at least the vapour pressure.
 
     Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
     hold: rho(q) V is the mass of oil in the volume V, with the density rho(q) that follows from the oil's bulk modulus.
@@ -250,7 +252,7 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
-    if len(p.boiling) == 0:  # an empty tuple: the rig's oil does not boil
+    if len(p.boiling) == 0:  # the rig's oil does not boil
         return q
     return max(q, p.p_vap - P_ATM)  # type: ignore[no-any-return]
 
@@ -267,7 +269,7 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 
     The command `u` [V] sets the speed. In a rig with a servo valve the set speed is `omega_P`, that of the supply.
     """
-    if len(p.valved) > 0:  # an empty tuple in a rig without a servo valve
+    if len(p.valved) > 0:  # a rig with a servo valve
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
@@ -276,18 +278,18 @@ def speed_error(y: State, u: float, p: RigNumbers) -> float:
 def pump_difference(y: State, p: RigNumbers) -> float:
     """Compute the pressure difference across the pump [Pa] in the state `y`, port 1 minus port 2."""
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) > 0 or len(p.valved) > 0:  # empty tuples in a rig without lines and servo valve
+    if len(p.throttled) > 0 or len(p.valved) > 0:  # a rig with lines or a servo valve
         return p_1 - p_2
     return p_A - p_B
 
 
 @contracted
 def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, float]:
-    """Compute the friction force [N] on the piston, and the rate [m/s] at which LuGre's bristles deflect.
+    """Compute the friction force [N] on the piston against +x, and the rate [m/s] at which LuGre's bristles deflect.
 
-    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's or LuGre's law; the rate is 0 unless it has
-    LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`. `applied` [N]: sum of
-    all other forces on the piston. In `p`, an optional law such as `sticking` (Karnopp's) is an empty tuple if absent.
+    The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's law (`sticking`) or LuGre's (`bristled`); the
+    rate is 0 unless it has LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`.
+    `applied` [N]: sum of all other forces on the piston along +x.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -295,7 +297,7 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     )
     F_v, breakaway, no_rate = p.F_v, p.K_brk * F_C, 0.0 * v  # 0.0 * v: a zero of v's type, a number or a vector
     if len(p.one_sided) > 0:
-        breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)
+        breakaway = select(applied < 0.0, p.backward * breakaway, breakaway)  # at rest `applied` gives the direction
         side = select(v < 0.0, p.backward, 1.0)
         F_C, F_v = side * F_C, side * F_v
     if len(p.sticking) > 0:
@@ -308,8 +310,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
 
 @contracted
 def filter_resistances(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the resistances [Pa s/m^3] of the filters in lines A and B, which the oil that passes may clog."""
-    if len(p.clogging) == 0:  # an empty tuple: the rig's filters do not clog
+    """Compute the resistances [Pa s/m^3] of the filters in lines A and B, which may rise with the oil passed so far."""
+    if len(p.clogging) == 0:  # the rig's filters do not clog
         return p.R_A, p.R_B
     R_A = restrictors.clogged_resistance(p.R_A, y[PASSED_A], p.k_clog_A, p.n_clog)
     return R_A, restrictors.clogged_resistance(p.R_B, y[PASSED_B], p.k_clog_B, p.n_clog)
@@ -327,9 +329,9 @@ def implicit_flows(
     filter in series with the throttle, which follows from the state `y`, is added to g. With a bypass valve of the
     filter, `filtered_flow` solves the equation.
     """
-    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
+    if len(p.filtered) > 0:  # a rig with filters
         R_A, R_B = filter_resistances(y, p)
-        if len(p.bypassed) > 0:  # an empty tuple in a rig whose filters have no bypass valve
+        if len(p.bypassed) > 0:  # the filters have a bypass valve
             Q_A = restrictors.filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
             return Q_A, restrictors.filtered_flow(
                 total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0
@@ -342,9 +344,9 @@ def implicit_flows(
 
 @contracted
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
-    """Compute the flows [m^3/s, >= 0] through the filters of lines A and B, without the flow in their bypasses."""
+    """Compute the flows [m^3/s] through the filters of lines A and B, >= 0 in either direction, without bypass flow."""
     Q_A, Q_B = throttle_flows(y, p)
-    if len(p.bypassed) == 0:  # an empty tuple: the filters have no bypass valve
+    if len(p.bypassed) == 0:  # the filters have no bypass valve
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
     filter_flow_A = restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass)
@@ -359,7 +361,7 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
-    if len(p.filtered) > 0:  # an empty tuple in a rig without filters
+    if len(p.filtered) > 0:  # a rig with filters
         return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)  # g = 0: the pressures are those of `y`
     # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
     Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
@@ -375,19 +377,19 @@ def volumes_at(x: float, p: RigNumbers) -> tuple[float, float]:
 @contracted
 def bulk_modulus(pressure: float, p: RigNumbers) -> float:
     """Compute the bulk modulus [Pa] of the oil, with the air in it if the rig has any, at `pressure` [Pa gauge]."""
-    if len(p.aerated) == 0:  # an empty tuple: no air in the oil
+    if len(p.aerated) == 0:  # no air in the oil
         return p.K_oil  # type: ignore[no-any-return]
     return effective_bulk_modulus(vapour_floor(pressure, p), p.K_oil, p.air, p.n_air)
 
 
 @contracted
 def density_ratio(pressure: float, reference: float, p: RigNumbers) -> float:
-    """Compute the ratio of the oil's densities at two pressure states, `pressure` and `reference` [Pa gauge].
+    """Compute the density of the oil at the pressure state `pressure` over that at `reference`, both in Pa gauge.
 
     A pressure state may fall below the vapour pressure (`vapour_floor`). There, the density falls with the bulk modulus
     that holds at the vapour pressure.
     """
-    if len(p.aerated) == 0:  # an empty tuple, no air in the oil: one bulk modulus, whether the oil boils or not
+    if len(p.aerated) == 0:  # no air in the oil: one bulk modulus, whether the oil boils or not
         return oil_density_ratio(pressure - reference, p.K_oil)
     liquid_pressure, liquid_reference = vapour_floor(pressure, p), vapour_floor(reference, p)
     ratio = mixture_density_ratio(liquid_pressure, liquid_reference, p.K_oil, p.air, p.n_air)
@@ -406,7 +408,7 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
     carries the same mass, rho_up Q_up = rho_down Q_down, with the oil's densities rho at the pressures `source` and
     `sink` [Pa]. In a rig that balances volumes instead of masses both flows are Q.
     """
-    if len(p.conserving) == 0:  # an empty tuple: the rig balances volumes
+    if len(p.conserving) == 0:  # the rig balances volumes instead of masses
         return Q, Q
     forward = Q > 0.0
     ratio = density_ratio(select(forward, source, sink), select(forward, sink, source), p)
@@ -433,7 +435,7 @@ def makeup_pressure(y: State, p: RigNumbers) -> float:
 
     The state contains the oil volume V_up (`MADE_UP`) [m^3] that the accumulator has delivered.
     """
-    if len(p.polytropic) > 0:  # this law is an empty tuple in a rig whose gas is isothermal
+    if len(p.polytropic) > 0:  # the gas is not isothermal
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
@@ -447,7 +449,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_up = makeup_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) == 0:  # an optional law is an empty tuple in a rig without it, here without lines
+    if len(p.throttled) == 0:  # a rig without lines
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
         makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
@@ -464,10 +466,10 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
 
 @contracted
 def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
-    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and the make-up flow [m^3/s].
+    """Compute the rates of p_A, p_B, p_1, p_2 [Pa/s] by external leakage and make-up, and the rate of V_up [m^3/s].
 
-    The make-up flow is counted where it leaves the accumulator, < 0 if oil returns. The make-up feeds the pump's ports,
-    or the chambers in a rig without lines. Without lines and servo valve p_1 = p_A and p_2 = p_B.
+    The latter is the make-up flow where it leaves the accumulator, < 0 if oil returns. The make-up feeds the pump's
+    ports, or the chambers in a rig without lines. Without lines and servo valve p_1 = p_A and p_2 = p_B.
     """
     V_A, V_B = volumes_at(y[POSITION], p)
     K_A, K_B = bulk_modulus(y[P_A], p), bulk_modulus(y[P_B], p)
@@ -477,8 +479,8 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     # each flow as drawn at the accumulator's pressure, and as it enters the circuit at the pressure of side 1 or 2
     drawn_1, makeup_1 = flows_at_both_ends(makeup_1, p_up, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
     drawn_2, makeup_2 = flows_at_both_ends(makeup_2, p_up, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
-    fed = drawn_1 + drawn_2
-    if len(p.throttled) > 0:  # an optional law is an empty tuple in a rig without it, here without lines
+    fed = drawn_1 + drawn_2  # oil that the accumulator feeds
+    if len(p.throttled) > 0:  # a rig with lines
         rate_1 = cylinder.pressure_rate(makeup_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(makeup_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
@@ -532,12 +534,12 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
     drawn_B, to_B = flows_at_both_ends(Q_PB, p_P, p_B, p)
     from_A, _ = flows_at_both_ends(Q_AT, p_A, p_T, p)
     from_B, _ = flows_at_both_ends(Q_BT, p_B, p_T, p)
-    _, fed = flows_at_both_ends(Q_1, p_T, p_P, p)
+    _, to_supply = flows_at_both_ends(Q_1, p_T, p_P, p)
     relief = external.check_valve_flow(pump_difference(y, p), p.p_set, p.G_set)
     return (
         cylinder.pressure_rate(to_A - from_A, V_A, bulk_modulus(p_A, p)),  # eq. (4.18)
         cylinder.pressure_rate(to_B - from_B, V_B, bulk_modulus(p_B, p)),  # eq. (4.19)
-        (fed - relief - drawn_A - drawn_B) / supply_compliance(p_P, p),
+        (to_supply - relief - drawn_A - drawn_B) / supply_compliance(p_P, p),
         0.0 * p_T,  # a zero of p_T's type: a number, or a vector over runs
     )
 
@@ -547,8 +549,8 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     """Compute the state's rates dy/dt from all physical laws but the throttles' flows.
 
     `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
-    flow coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own; `p`:
-    the rig's numbers, in which an optional law, such as `damped`, is an empty tuple if the rig does not have it.
+    flow coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load over time in addition to the rig's
+    own, which counts only if `p.pushed` is not empty.
     """
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
@@ -594,9 +596,9 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_A = cylinder.pressure_rate(to_1 - p.A_A * v - from_A, V_A, K_A)
         rate_B = cylinder.pressure_rate(-from_2 + p.A_B * v + to_B, V_B, K_B)
         rate_1, rate_2 = rate_A, rate_B
-    fed, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number, or a vector over runs
+    d_V_up, d_x_s, d_v_s = 0.0 * v, 0.0 * v, 0.0 * v  # zeros of v's type: a number, or a vector over runs
     if len(p.open_circuit) > 0:
-        external_part, fed = external_pressure_rates(y, p)  # rates of p_A, p_B, p_1 and p_2; flow of the accumulator
+        external_part, d_V_up = external_pressure_rates(y, p)  # rates of p_A, p_B, p_1, p_2; flow of the accumulator
         rate_A, rate_B = rate_A + external_part[0], rate_B + external_part[1]
         rate_1, rate_2 = rate_1 + external_part[2], rate_2 + external_part[3]
     if len(p.valved) > 0:
@@ -606,7 +608,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     if len(p.clogging) > 0:  # in a rig without a spool, these two states are the oil that has passed each filter
         d_x_s, d_v_s = filter_flows(y, p)
     # in the order of `STATES`; dx/dt = v is eq. (4.13) of the thesis
-    return error, d_i, d_omega, y[OMEGA], v, acceleration, rate_A, rate_B, rate_1, rate_2, fed, dz, d_x_s, d_v_s
+    return error, d_i, d_omega, y[OMEGA], v, acceleration, rate_A, rate_B, rate_1, rate_2, d_V_up, dz, d_x_s, d_v_s
 
 
 @contracted
@@ -617,7 +619,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
     coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
-    if len(p.throttled) > 0:  # an empty tuple in a rig without throttles
+    if len(p.throttled) > 0:  # a rig with throttles
         Q_A, Q_B = throttle_flows(y, p)
         dy = add_to_pressures(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy

@@ -48,7 +48,7 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
     V_A, V_B = p.V_A, p.V_B
-    if len(p.throttled) > 0:  # an empty tuple in a rig without lines; their oil belongs to sides A and B
+    if len(p.throttled) > 0:  # a rig with lines, whose oil belongs to sides A and B
         V_A, V_B = V_A + p.V_1, V_B + p.V_2
     missing_force = force - p.p_charge * (p.A_A - p.A_B)  # [N] that the charge pressure does not carry
     # bulk modulus times the oil volume that moves from side B to A [Pa m^3]; divided by a side's volume, it is the
@@ -150,7 +150,7 @@ def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: R
     `x` [m]: position; `force` [N]: load against +x. Raises InputError if the force would need a chamber pressure that
     is not between those of return and supply, or if the motor cannot drive the supply's pump.
     """
-    m = rig.motor
+    motor = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)
     if not rig.supply.p_return <= min(p_A, p_B) <= max(p_A, p_B) <= p_1:
         raise InputError(
@@ -160,15 +160,15 @@ def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: R
         )
     y[POSITION], y[P_1], y[P_2], y[P_A], y[P_B] = x, p_1, rig.supply.p_return, p_A, p_B
     y[OMEGA] = rig.supply.omega_P
-    y[CURRENT] = pump_torque(p_1 - y[P_2], p.q_b) / m.C_m + m.B_M * y[OMEGA] / m.C_m
-    if len(p.lossy) > 0:  # an empty tuple in a rig without friction of motor and pump
-        y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / m.C_m
-    volts = m.R_c * y[CURRENT] + m.C_e * y[OMEGA]
-    y[INTEGRAL] = volts / m.K_i  # `Rig` checks that K_i > 0 where there is a supply
-    if y[CURRENT] > m.i_max or volts > m.V_max:
+    y[CURRENT] = pump_torque(p_1 - y[P_2], p.q_b) / motor.C_m + motor.B_M * y[OMEGA] / motor.C_m
+    if len(p.lossy) > 0:  # a rig with friction of motor and pump
+        y[CURRENT] += friction_torque(y[OMEGA], p_1 - y[P_2], p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f) / motor.C_m
+    volts = motor.R_c * y[CURRENT] + motor.C_e * y[OMEGA]
+    y[INTEGRAL] = volts / motor.K_i  # `Rig` checks that K_i > 0 where there is a supply
+    if y[CURRENT] > motor.i_max or volts > motor.V_max:
         raise InputError(
             f"the drive must hold the supply at {p_1:.4g} Pa and {y[OMEGA]:.4g} rad/s, which takes {y[CURRENT]:.4g} A "
-            f"at {volts:.4g} V, got at most {m.i_max:g} A and {m.V_max:g} V (motor.i_max, motor.V_max); take a slower "
-            "or smaller pump, or a lower pressure (supply.omega_P, pump.q_b, supply.p_set)"
+            f"at {volts:.4g} V, got at most {motor.i_max:g} A and {motor.V_max:g} V (motor.i_max, motor.V_max); take a "
+            "slower or smaller pump, or a lower pressure (supply.omega_P, pump.q_b, supply.p_set)"
         )
     return y

@@ -11,7 +11,8 @@ INTEGRAL, CURRENT, OMEGA, THETA, POSITION, VELOCITY, P_A, P_B, P_1, P_2, MADE_UP
     len(STATES)
 )
 
-#: Oil [m^3] that has passed the clogging filters in lines A and B. A rig with lines has no spool, whose place it takes.
+#: Oil [m^3] that has passed the clogging filters in lines A and B. A rig with lines has no spool: the same places in
+#: the state serve both.
 PASSED_A, PASSED_B = SPOOL, SPOOL_SPEED
 
 #: Outputs of a run at each output instant: the states and the quantities that follow from them.
@@ -30,7 +31,7 @@ def state_of(y: np.ndarray) -> State:
 
 @contracted
 def add_step(y: State, h: float, dy: State) -> State:
-    """Compute y + h dy, element by element, where `dy` are rates of change, and `y` is a state or also rates."""
+    """Compute y + h dy, element by element: `dy` are rates of change, `y` is a state, or rates in a weighted sum."""
     return (
         y[0] + h * dy[0],
         y[1] + h * dy[1],
@@ -53,7 +54,7 @@ def add_step(y: State, h: float, dy: State) -> State:
 def add_to_pressures(y: State, h: float, s: Pressures) -> State:
     """Add h `s` to the four pressures in the state `y`; return the whole state.
 
-    `s`: rates of p_A, p_B, p_1 and p_2. `y` may also be the rates of a state, of which those of the pressures change.
+    `s`: rates of p_A, p_B, p_1 and p_2 [Pa/s]; `h` [s]: time. With h = 1, `y` may also be rates to which `s` is added.
     """
     p_A, p_B, p_1, p_2 = y[P_A] + h * s[0], y[P_B] + h * s[1], y[P_1] + h * s[2], y[P_2] + h * s[3]
     return y[0], y[1], y[2], y[3], y[4], y[5], p_A, p_B, p_1, p_2, y[10], y[11], y[12], y[13]

@@ -29,6 +29,7 @@ from sealscope.storage.unpacking import max_unpacked_size
 #: `formats.toml`: formats that are read, and formats that are recognised by first bytes or suffix but not read.
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))
 _FORMATS, _PROPRIETARY = _TABLES["read"], _TABLES["proprietary"]
+#: Format, or kind of archive, -> pattern of the first bytes; and pattern -> words for a format that is not read.
 _BEGINS = {kind: re.compile(entry["begins"].encode()) for kind, entry in _FORMATS.items() if "begins" in entry}
 _ARCHIVES = {kind: re.compile(begins.encode()) for kind, begins in _TABLES["archives"].items()}
 _FOREIGN = {re.compile(begins.encode()): words for begins, words in _TABLES["foreign"].items()}
@@ -271,8 +272,7 @@ def write(recording: Recording, path: str | os.PathLike[str]) -> None:
     recording : Recording
         At least one sample of one channel, in SI units or raw counts.
     path : str or path
-        The file to write, atomically. Its suffix gives the format: .nc .nc4 .h5 .hdf5 .csv .tsv .txt .parquet
-        .pq.
+        The file to write, atomically. Its suffix gives the format: .nc .nc4 .h5 .hdf5 .csv .tsv .txt .parquet .pq.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Check that readings can come from a hydraulic machine: no mere noise, no copied channel, no wrong unit of time."""
+"""Check that readings can come from a hydraulic machine: no mere noise, no copied channel, no wrong units."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ def find_implausibility(recording: Recording) -> str | None:
 def _describe_speed_mismatch(recording: Recording) -> str | None:
     """Describe the factor between the motor speed and the rate of the motor angle if a unit seems to be wrong.
 
-    Both are averaged to `readings.rate` of `priors.toml`. Returns None if the least-squares factor is between 1 / m and
-    m, with m = `readings.misfit`. Also None if the two hardly correlate, if either is absent or in raw counts, or if
-    samples are missing or fewer than `readings.samples`.
+    Speed and angle are averaged to `readings.rate` of `priors.toml`. Returns None if the least-squares factor is
+    between 1 / m and m, with m = `readings.misfit`. Also None if the speed hardly correlates with the rate of the
+    angle, if either channel is absent or in raw counts, or if samples are missing or fewer than `readings.samples`.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
         return None

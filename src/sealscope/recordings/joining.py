@@ -71,7 +71,7 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the provenance of a recording; None if it is not stated."""
+    """Find the time of t = 0 [s since 1970], the entry `start_epoch_s` or `start` of the provenance; None without."""
     epoch = recording.provenance.get("start_epoch_s")
     return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
 

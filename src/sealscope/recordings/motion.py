@@ -1,6 +1,6 @@
 """Tests whether a reading moves: constant channels, held values, and changes that are only rounding.
 
-A transducer's noise never stops: a value that stays longer than it allows is clipped, repeated or from a dead channel.
+A transducer's noise never stops: a value that stays unchanged for long is clipped, repeated or from a dead channel.
 """
 
 from __future__ import annotations

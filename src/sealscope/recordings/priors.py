@@ -77,8 +77,8 @@ class UnsignedPriors(PriorTable):
     - `changes` [1/s]: usual number of reversals per second.
     - `least`: smallest ratio of the motion in the less used direction to that in the other.
     - `correlation`: smallest correlation of the magnitude with the absolute piston speed or command.
-    - `unlike`: smallest logarithm of the ratio of the flows per speed in both directions that two areas show.
-    - `passes`: smallest flow at rest, over the mean flow in motion, of a valve in whose supply line the meter is.
+    - `unlike`: smallest logarithm of the ratio of the piston's two areas, i.e. of flow over speed in both directions.
+    - `passes`: smallest flow at rest, over the mean flow in motion, that shows a meter in a valve's supply line.
     - `rests`: largest speed at rest, over the mean speed in motion.
     """
 

@@ -89,7 +89,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
 def _make_finding(
     recording: Recording, code: str, channel: str | None, count: int, first: int, text: str, severity: Severity
 ) -> Finding:
-    """Make a finding on `count` samples; its time is that of the sample `first`, None if this has no time."""
+    """Make a finding on `count` samples; its time is that of the sample with index `first`, None if unknown."""
     t = float(recording.t[first]) if first < recording.t.size else np.nan
     return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
 
@@ -316,9 +316,9 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     With `low_end` False only the high end is examined. An end is clipped in two cases:
 
     - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
-      run of samples with this value (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a long run.
-      This excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly as
-      frequent.
+      run of samples with this value (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a run of 20
+      or more. This excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly
+      as frequent.
     - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
 
     A channel with fewer than three different values has no clipped end.

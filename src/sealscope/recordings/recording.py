@@ -50,7 +50,7 @@ def _freeze(values: Any) -> Array:
 
 @dataclass
 class _CachedResult:
-    """A result that one thread computes, holding the `lock`, while others wait; `known` is True afterwards."""
+    """A result of `compute_once`: one thread computes it and holds the `lock`; `known` is True if `value` is set."""
 
     lock: Lock = field(default_factory=Lock)
     value: Any = None
@@ -80,7 +80,7 @@ class Recording:
     history : tuple of str, optional
         One line for each processing step.
     bridged : array_like of bool, shape (n,), optional
-        Rows whose missing values were interpolated (`recordings.corrections`); None if there are none.
+        Rows whose missing values were filled in (`recordings.corrections.gaps`); None if there are none.
 
     Raises
     ------
@@ -110,7 +110,7 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
     bridged: NDArray[np.bool_] | None = None
-    _results: dict[Hashable, _CachedResult] = field(default_factory=dict, init=False)
+    _results: dict[Hashable, _CachedResult] = field(default_factory=dict, init=False)  # cache of `compute_once`
 
     def __post_init__(self) -> None:
         """Check the arguments and replace them by read-only copies."""
@@ -189,7 +189,7 @@ class Recording:
 
     @property
     def unused(self) -> tuple[str, ...]:
-        """Names of the columns of the file with measured pressures, positions, speeds or flows that no channel uses."""
+        """Names of the file's columns of measured pressures, positions, speeds or flows that no channel uses."""
         return self._names_in_provenance("unused")
 
     @property
@@ -198,7 +198,7 @@ class Recording:
         return self._names_in_provenance("unused_temperatures")
 
     def _names_in_provenance(self, key: str) -> tuple[str, ...]:
-        """Return the list of names that the provenance has under `key`, empty if it has no such list."""
+        """Return the names in the list `key` of the provenance; empty without such a list."""
         names = self.provenance.get(key, ())
         return tuple(map(str, names)) if isinstance(names, list | tuple) else ()
 
@@ -213,10 +213,10 @@ class Recording:
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
     def format_value(self, name: str, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value of a channel, given in its SI unit, in the unit of the log, with `digits` significant digits.
+        """Format a value of the channel `name` in the unit of its log, with `digits` significant digits.
 
-        Without a unit of the log (`unit_in_log`), the SI unit is kept. `is_span`: the value is a difference of two
-        values, to which the offset of a unit does not apply.
+        `value`: in the channel's own unit (`units`), which is kept if the log states none (`unit_in_log`); `is_span`:
+        the value is a difference of two values, to which the offset of a unit does not apply.
         """
         unit = self.units[name]
         display_unit = self.unit_in_log(name) or unit

@@ -188,7 +188,7 @@ def _is_spent() -> bool:
 
 def _serve() -> None:
     """Run requests from standard input, one after the other, and answer to standard output until the input ends."""
-    # answers go to a copy of standard output, which then discards the output of libraries
+    # answers go to a copy of standard output; standard output itself then discards the output of libraries
     responses = os.fdopen(os.dup(1), "wb")
     discard = os.open(os.devnull, os.O_WRONLY)
     os.dup2(discard, 1)

@@ -65,7 +65,7 @@ class Details:
         return self[3] * self[4]
 
     def quantities(self) -> Array:
-        """Stack d1, d2, d3, d4 [unit] and d3d4 [unit^2] as the rows of an array (5, n); needs four levels."""
+        """Stack d1, d2, d3, d4 [unit] and d3d4 [unit^2] as the rows of an array (5, n); there must be four levels."""
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
@@ -151,15 +151,18 @@ def details(
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
-    """Compute the mean squares (k, 5) of d1, d2, d3, d4 and d3d4 in k segments of a transformed signal.
+    """Compute the mean squares (k, 5) of d1, d2, d3, d4 [unit^2] and d3d4 [unit^4] in segments of a transformed signal.
 
-    Segment i has the samples bounds[i] to bounds[i + 1] - 1.
+    `bounds` (k + 1,): segment i has the samples bounds[i] to bounds[i + 1] - 1. The signal must have four levels.
     """
     return segment_means(np.square(transformed.quantities()), bounds).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
-    """Compute the means (r, k) of `values` (r, n) over the columns bounds[i] to bounds[i + 1] - 1 of k segments."""
+    """Compute the means (r, k) of `values` (r, n) in k segments.
+
+    `bounds` (k + 1,): segment i has the columns bounds[i] to bounds[i + 1] - 1.
+    """
     limits = np.asarray(bounds)
     sums = np.add.reduceat(values, limits[:-1], axis=1)
     # reduceat sums the last segment to the end of the row, not to its limit

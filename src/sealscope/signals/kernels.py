@@ -1,7 +1,7 @@
-"""Compiled wavelet filters for many live signals, of which eight share a vector register.
+"""Compiled wavelet filters for many signals, live or simulated, of which eight share a vector register.
 
 Each output sums its taps in the same order, whether it is computed together with seven neighbours or alone. Blocks of
-any size give identical results. Contracted products (`physics.lanes`) agree with `details.details` up to rounding.
+any size give identical results. As multiply-adds are fused, they agree with `details.details` up to rounding only.
 """
 
 from __future__ import annotations
@@ -22,8 +22,9 @@ def filter_rows(
     """Filter eight signals at once: ``out[to + i] = sum_k taps[tap + k] rows[first + stride i - dilation k]``.
 
     i runs from 0 to n - 1, and k from 0 to n_taps - 1. The indices count rows of eight numbers, one for each signal, in
-    `rows`, `taps` and `out`. Successive outputs use rows that are `stride` apart, and successive taps of a filter use
-    rows that are `dilation` apart. Eight outputs are computed at a time, the rest one by one.
+    `rows`, `taps` and `out`. Successive outputs use rows that are `stride` apart. Successive taps use rows that are
+    `dilation` apart, in the other direction if it is negative. Eight outputs are computed at a time, which load each
+    tap once, and the rest one by one.
     """
     i = 0
     while i + 8 <= n:
@@ -61,13 +62,13 @@ def filter_rows(
 def split_levels(
     buffers: Array, start: int, first: int, n: int, low: Array, high: Array, levels: int, capacity: int, details: Array
 ) -> None:
-    """Compute the wavelet details of `n` new samples of one channel, such as a pressure, of eight actuators.
+    """Compute the wavelet details of `n` <= CHUNK new samples of one channel, such as a pressure, of eight actuators.
 
-    `low` and `high` (taps, WIDTH) are the low-pass and high-pass filters, repeated for each actuator. `buffers` has a
-    buffer of `capacity` rows for each level of the channel, stacked from row `start` on; the new samples begin at row
-    `first` of the first buffer. High-pass filtering of a level's buffer gives its detail, and low-pass filtering fills
-    the buffer of the next level. The finer levels, whose filters are shorter, get the delay of the deepest level, so
-    that row i of all levels in `details` (levels, CHUNK, WIDTH) belongs to one sample.
+    `low`, `high` (taps, WIDTH): low-pass and high-pass filter, repeated for each actuator (or simulated run). A row of
+    `buffers` has a number for each. Every level of the channel has a buffer of `capacity` rows, the first one from row
+    `start` on; the new samples begin at row `first` of the first buffer. High-pass filtering of a level's buffer gives
+    its detail, and low-pass filtering fills the buffer of the next level. The finer levels, whose filters are shorter,
+    get the delay of the deepest level: row i of all levels in `details` (levels, CHUNK, WIDTH) belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -103,13 +104,13 @@ def advance_details(
     details: Array,
     out: Array,
 ) -> int:
-    """Compute the wavelet details of the next block of all signals.
+    """Compute the wavelet details of the next block of samples, for some groups of eight actuators (WIDTH).
 
-    `block` (channels, actuators, n): samples; `out` (channels, actuators, levels, n): receives the details. A group has
-    eight actuators (WIDTH), and `groups` is (first, last + 1) of the groups to filter. `buffers` (groups, channels,
-    levels, capacity, WIDTH) have `fill` rows in use, the last `history` of which are needed for later outputs. `low`,
-    `high` (taps, WIDTH): low-pass and high-pass filter; `details` (levels, CHUNK, WIDTH): work array. Returns the
-    number of rows that are in use in each buffer afterwards.
+    `groups`: (first, last + 1) of the groups to filter; `block` (channels, actuators, n): samples of all actuators;
+    `out` (channels, actuators, levels, n): receives the details. `buffers` (groups, channels, levels, capacity, WIDTH)
+    have `fill` rows in use, the last `history` of which are needed for later outputs. `low`, `high` (taps, WIDTH):
+    low-pass and high-pass filter; `details` (levels, CHUNK, WIDTH): work array. Returns the number of rows that are in
+    use in each buffer afterwards.
     """
     channels, actuators, n = block.shape
     levels, capacity = buffers.shape[2], buffers.shape[3]

@@ -11,10 +11,10 @@ TINY = 1e-300
 
 
 def average_over(seconds: float, values: Array, rate: float) -> Array:
-    """Average the known values (..., n) over a window of `seconds` [s] around each sample, to remove noise and ripple.
+    """Average a signal (..., n) over a window of `seconds` [s] around each sample, to remove noise and ripple.
 
-    `rate`: sampling rate [Hz]. The result (..., n) is NaN where a window has no known value. Beyond its ends the signal
-    is continued by its mirror image.
+    `values`: the signal, NaN where a sample is missing; `rate` [Hz]: sampling rate. A mean is over the known samples of
+    its window, and NaN if there are none. Beyond its ends the signal is continued by its mirror image.
     """
     from scipy.ndimage import uniform_filter1d
 

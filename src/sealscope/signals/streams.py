@@ -162,7 +162,7 @@ class DetailStream:
 
     @cached_property
     def _pool(self) -> ThreadPoolExecutor:
-        """Pool of threads by which `update` filters a block, one for each part of the signals."""
+        """Pool of threads with which `update` filters a block, one for each part of the signals."""
         from concurrent.futures import ThreadPoolExecutor
 
         return ThreadPoolExecutor(len(self._parts))

@@ -166,7 +166,7 @@ class RmsStream:
         stream = cls(size, step, skip=require_count(state, "skip"))
         stream._next_end = require_count(state, "next_end")
         stream._n_unused = require_count(state, "ahead")
-        if rest is None and sums is None:
+        if rest is None and sums is None:  # saved before the first block
             return stream
         leading_axes = np.shape(rest)[:-1]
         if rest is None or sums is None or leading_axes != np.shape(sums)[:-1]:

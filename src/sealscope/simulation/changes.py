@@ -279,7 +279,7 @@ def linear_path(size: float, duration: float) -> Wander:
     return Wander((), duration, size)
 
 
-#: Largest change from one block to the next of model parameters that drift in their own unit.
+#: Largest change from one block to the next of model parameters that drift in their own unit, here [N].
 _ABSOLUTE_MAX_CHANGES = {"F_l": 0.2}
 
 
@@ -292,10 +292,9 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    Here value is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of motor, pump,
-    lines, cylinder, friction, oil or make-up, of noise, hum, offset, gain or scale error of a sensor, or `friction`,
-    for all friction forces together. `absolute` must be `is_absolute_drift(parameter)`. Raises InputError for a
-    parameter that cannot drift.
+    Here value is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of the machine, of
+    noise, hum, offset, gain or scale error of a sensor, or `friction`, for all friction forces together. `absolute`
+    must be `is_absolute_drift(parameter)`. Raises InputError for a parameter that cannot drift, such as `cylinder.L`.
     """
 
     parameter: str

@@ -58,9 +58,9 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
 
 
 def throttle_values(closed: float) -> dict[str, str | float]:
-    """Build the parameters of a rig whose throttles both have the closed fraction `closed` of their area, by name.
+    """Build the rig parameters, by name, that close both throttles by the fraction `closed`, 0 to 1.
 
-    Above 0 they include `line.orifices`, which gives the rig throttles. At 0 the rig decides if it has open ones.
+    Above 0 they include `line.orifices`, which gives the rig throttles. At 0 the rig keeps its own choice.
     """
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
     return {**values, "line.orifices": "present"} if closed > 0 else values

@@ -62,7 +62,15 @@ def _parse_number(text: str | None) -> float:
 
 @dataclass(frozen=True)
 class FaultRow:
-    """A kind of fault: an entry of `faults.toml`, whose head explains the fields."""
+    """A kind of fault: an entry of `faults.toml`, whose head explains the fields.
+
+    `name`: the entry's key; `kind`: name under which the fault is counted; `cause`: what a diagnosis should name, ""
+    for none; `pattern`, `words`: regular expression and template of the fault's text. If `factor`, the fault's value
+    multiplies the `parameters`, else it is added to them: divided by the rig's parameter `over` if that is named, or
+    replaced by the rig's parameter `adds`. `needs`: parameter that must be > 0 on the rig, and start of the message;
+    `unit`: unit of a size in the text; `least`, `most`: limits of the value, which `what` and `allowed` state in
+    messages; `when`: form of the times in the text (`_WHEN`).
+    """
 
     name: str
     kind: str

@@ -127,7 +127,10 @@ class RunInputs:
 
 
 def oversampling(experiment: Experiment) -> int:
-    """Compute the number of solver outputs per recorded sample that the anti-alias filter and a controller need."""
+    """Compute the number of solver outputs per recorded sample that the anti-alias filter and a controller need.
+
+    Without a stated step, a step that is usual for the integration method (`DEFAULT_STEP`) is assumed.
+    """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
     controller = experiment.active_controller
@@ -273,8 +276,9 @@ def integrate(
 ) -> Trajectory:
     """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    `x_0` [m]: position at the start; `load`: load in addition to the rig's own; `feedback`: a controller whose voltage
-    replaces the command; `effects`: changes of the model's parameters within the run.
+    `inputs`: command and leakage over time; `x_0` [m]: position at the start; `load`: load in addition to the rig's
+    own; `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters
+    within the run.
 
     A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
     tried until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
@@ -350,9 +354,11 @@ def integrate(
 
 @dataclass
 class _Integration:
-    """The integration of one run with its inputs and settings; `reached` [s]: time last reported to `progress`.
+    """The integration of one run, with inputs and settings as in `integrate`.
 
-    `euler`: True to advance the integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`).
+    `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: True to advance the
+    integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`); `reached` [s]: time last
+    reported to `progress`.
     """
 
     inputs: RunInputs

@@ -67,7 +67,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class Difference:
-    """The change of a quantity `name`, in `unit`, when the step is halved; `tolerance`: its limit, or None."""
+    """The change of a quantity `name`, in `unit`, when the step is halved; `tolerance`: its limit, None for none."""
 
     name: str
     difference: float
@@ -182,7 +182,7 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
 
 
 def _sample_outputs(experiment: Experiment) -> slice:
-    """Select the solver outputs at the times of the recording's samples: one in `oversampling` outputs."""
+    """Build the slice of the solver's outputs at the recording's samples: one in `oversampling` outputs."""
     factor = oversampling(experiment)
     return slice(0, round(experiment.duration * experiment.rate) * factor, factor)
 
@@ -252,8 +252,9 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
     Returns the differences of
 
     - speed, angle, position and velocity, by their rms difference, without a tolerance;
-    - the four pressures, by their rms difference;
-    - the wavelet details d1 to d4 of p_A and p_B, by the change of their RMS, which includes the sensors' noise.
+    - the four pressures, by their rms difference, which is to be at most `PRESSURE_TOLERANCE`;
+    - the wavelet details d1 to d4 of p_A and p_B, by the change of their RMS, which includes the sensors' noise and is
+      to be at most `DETAIL_TOLERANCE` times the RMS.
     """
     from sealscope.signals.details import QUANTITIES, details, mean_squares
     from sealscope.signals.windows import rms

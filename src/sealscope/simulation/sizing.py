@@ -83,7 +83,8 @@ def size_leaks(
     the run with them. `progress` is called with the name of the task and its completed fraction.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
-    leak's flow grows less (`next_coefficient`). Raises SimulationFailed if the search does not converge.
+    leak's flow grows less (`next_coefficient`). The search ends at a relative error of `TOLERANCE`, or after `MAX_RUNS`
+    with the best run. Raises SimulationFailed if that has not at least `SCATTER_TOLERANCE`.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

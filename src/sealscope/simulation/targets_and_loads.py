@@ -73,7 +73,7 @@ class Force:
         return self.signal.volts(t)  # the value of the signal, here in newtons
 
     def tables(self) -> tuple[Array, Array] | None:
-        """Build the load's tables over position and velocity for `piecewise_linear_force`; None if it has neither."""
+        """Build the tables (n, 2) of f and g for `piecewise_linear_force`; None if the load is over time only."""
         if not (self.over_x or self.over_v):
             return None
         no_load: Breakpoints = ((0.0, 0.0),)

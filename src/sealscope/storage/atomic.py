@@ -25,7 +25,7 @@ _MAX_AGE = 86_400.0
 
 
 def _computer_hash() -> str:
-    """Return the first 6 hexadecimal digits of the SHA-256 of this computer's name."""
+    """Compute 6 hexadecimal digits that identify this computer in names of temporary files: a hash of its name."""
     return sha256(platform.node().encode()).hexdigest()[:6]
 
 
@@ -39,9 +39,9 @@ def check_folder(file: Path) -> None:
 def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Write a file atomically: the `with` block fills a temporary file, which then replaces the file `path`.
 
-    The path of the temporary file, in the same folder, is yielded; the file is removed if the block raises an error.
-    File and folder are synced to the disk: a power loss leaves either the old or the new file. A replaced file keeps
-    its permissions. Raises InputError if the folder does not exist or cannot be written.
+    The block gets the path of the temporary file, which is in the same folder and is removed after an error. File and
+    folder are synced to the disk: a power loss leaves either the old or the new file. A replaced file keeps its
+    permissions. Raises InputError if `path` cannot be written, and for any OSError in the block.
     """
     target = Path(path)
     try:
@@ -89,9 +89,9 @@ def _sync(path: Path, flags: int) -> None:
 def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """Remove the temporary files that killed processes have left in a folder.
 
-    `target`: name of the file whose temporary files are removed; None for all files, also in subfolders, except linked
-    ones. A temporary file is removed if its process ran on this computer and has ended, or if the file has not been
-    changed for a day.
+    `target`: name of the file whose temporary files are removed; None for those of all files, also in subfolders except
+    linked ones. A temporary file is removed if its process ran on this computer and has ended, or if the file has not
+    been changed for a day.
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:

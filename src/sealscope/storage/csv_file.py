@@ -20,8 +20,8 @@ _NUMBER = re.compile(r"[+-]?[\d.]+(?:e[+-]?\d+)?|-")
 def guard_cell(value: Any) -> Any:
     """Escape a text that a spreadsheet would execute like a formula, or a terminal like a command.
 
-    A text that begins like a formula and is not a number gets an apostrophe in front; unprintable characters except
-    line feeds are escaped. Other values are returned unchanged.
+    A text that begins like a formula and is not a number gets an apostrophe in front, by which a spreadsheet takes it
+    as text. Unprintable characters except line feeds are escaped. Other values are returned unchanged.
     """
     if not isinstance(value, str):
         return value
@@ -32,7 +32,8 @@ def guard_cell(value: Any) -> Any:
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
     """Write rows, mappings from column to value, as a CSV file with these `columns`; `guard_cell` escapes the texts.
 
-    Raises ValueError if a row has another column, and InputError if the file cannot be written.
+    A missing value gives an empty cell. Raises ValueError if a row has another column, and InputError if the file
+    cannot be written.
     """
     with (
         atomic_write(path) as temporary,

@@ -34,7 +34,7 @@ def make_inner_folder(folder: Path, *names: str) -> Path:
 
 
 def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
-    """Yield those of `paths` that are files in `folder` (it may be a link); skip and log links that lead out of it."""
+    """Yield those of `paths` that are files in `folder`, which may itself be a link; log and skip links out of it."""
     root = folder.resolve()
     for path in paths:
         try:

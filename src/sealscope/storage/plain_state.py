@@ -90,8 +90,8 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 
-    An object with a method `state` is converted by it, arrays, also those in a list, by `plain_array`, and other values
-    by `to_plain`. Keys of the result are the names without leading underscores.
+    A value with a method `state` is converted by this method, an array or a list of arrays by `plain_array`, and any
+    other value by `to_plain`. Keys of the result are the names without leading underscores.
     """
     return {name.lstrip("_"): _save_value(getattr(owner, name)) for name in names}
 
@@ -115,7 +115,7 @@ def restore_attributes(
     - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
       `owner` is a named tuple, its arrays are filled in place. The rule on shapes holds for each array of a list.
     - An attribute with a method `load_state` restores itself.
-    - A saved None leaves an attribute unchanged if its present value is a float or None.
+    - A saved None leaves an attribute unchanged if its present value is a float or None: `to_plain` saves NaN as None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
 
     Raises InputError if an attribute is missing in `state` or breaks one of these rules.
@@ -148,12 +148,12 @@ def _restore_like(present: NDArray[Any], saved: Any, name: str) -> NDArray[Any]:
         length not in (saved_length, 0) for saved_length, length in zip(values.shape, shape, strict=True)
     ):
         raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
-    # the last axis holds the named columns of a structured array
+    # of a structured array the saved values (n, columns) become n records
     return values.view(present.dtype)[:, 0] if present.dtype.names else values
 
 
 class SavedAttributes:
-    """An object whose attributes `SAVED` are saved as plain values for JSON, and restored to the last bit if finite.
+    """An object whose attributes `SAVED` are saved as plain values for JSON; finite numbers are restored exactly.
 
     `SAVED_TYPES`: by name, the types of saved attributes whose first value has another type, such as None.
     """

@@ -52,8 +52,8 @@ def _type_adapter(kind: Any) -> Any:
 def convert_type(kind: type[_T], value: Any, entry_name: Callable[[str], str] = str, context: Any = None) -> _T:
     """Convert plain values to the dataclass, model or other type `kind`; raise ValueError if they do not fit.
 
-    `entry_name`: function that converts the name of the wrong entry for the error, which has one line; `context`: data
-    for the validators of `kind`.
+    `entry_name`: function that converts the first name in the path of the wrong entry for the error (`format_error`);
+    `context`: data for the validators of `kind`.
     """
     from pydantic import ValidationError
 
@@ -73,9 +73,9 @@ _PLAIN_RULES = {
 def format_error(error: ValidationError, entry_name: Callable[[str], str] = str, unit: str = "") -> str:
     """Format one of pydantic's errors in one line, such as "ENTRY must be ..., got ..." or "ENTRY is missing".
 
-    An error about an unknown entry is preferred; otherwise the first error is taken. ENTRY is the path to the wrong
-    entry, such as `line.V_1`. `entry_name`: function that converts the first name of this path, which is "" if the
-    whole value is wrong; `unit`: text that is appended to the broken rule.
+    An error about an unknown entry, perhaps a misspelt name, is preferred; otherwise the first error is taken. ENTRY is
+    the path to the wrong entry, such as `line.V_1`. `entry_name`: function that converts the first name of this path,
+    which is "" if the whole value is wrong; `unit`: text that is appended to the broken rule.
     """
     errors = error.errors(include_url=False)
     chosen = next((detail for detail in errors if _PLAIN_RULES.get(detail["type"]) == "is not known"), errors[0])

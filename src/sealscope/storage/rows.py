@@ -42,7 +42,7 @@ def read_rows(
     `parse`: function that parses a line to plain values; `row_of`: function that converts the plain values to a result,
     or to None to ignore the line; `what`: name of the folder in errors. An incomplete last line is ignored, and a
     missing file holds no results. Raises UnreadableFile if the file cannot be read or a line does not fit, and
-    InputError if the file is a link.
+    InputError for a link, a pipe and the like (`open_inner`).
     """
     path = folder / ROWS
     rows: dict[str, Row] = {}
@@ -82,7 +82,7 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
         for row in rows:
             line = json.dumps(row.as_dict(), allow_nan=allow_nan, sort_keys=True).encode() + b"\n"
             try:
-                while line:  # unbuffered: after an error `file` would write its buffer again when it is closed
+                while line:  # without the buffer of `file`, which after an error would be written again by its close
                     line = line[os.write(file.fileno(), line) :]
                 os.fsync(file.fileno())
             except OSError as error:

@@ -174,7 +174,8 @@ def _check_keys(keys: Collection[str], names: Collection[str], optional: Collect
 def _estimate_memory(text: str) -> int:
     """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed.
 
-    Tables, elements of arrays of tables (`n_rows`), keys and values are counted without parsing the text.
+    Tables, elements of arrays of tables (`n_rows`), keys and values are counted by the punctuation of the text, without
+    parsing it, and multiplied by the memory that each takes (`_TABLE` to `_VALUE`).
     """
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):

@@ -148,7 +148,7 @@ def predicted_sheet(
     scales = np.array([[1.0] * 5, [h.gain_B**2] * 4 + [h.gain_B**4]])
     rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))  # 2: without and with the leak
     for row, condition in enumerate(conditions):
-        # at most 0.99, as a closed throttle would stop the flow
+        # throttle A is closed as in the test, and B at most 0.99, as a closed throttle would stop the flow
         closed = {"line.closed_B": min(0.99, condition.closed_pct / 100.0 + h.extra_closing_B)}
         if condition.group not in leak_free:
             leak_free[condition.group] = noise_free_mean_squares(healthy_rig, condition, x_0=h.x_0, values=closed)

@@ -41,10 +41,10 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 class Condition:
     """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the printed order.
 
-    `command`: text for `parse_command`; `closed_pct`: closing of both throttles [%], which cause no pressure drop in
-    the thesis's model if they are open (section 4.2.1); `mean_leak_lpm`: mean leak [L/min] after the bypass valve was
-    opened; `level`: position of the bypass's needle valve, which does not determine the leak (10 to 16 mL/min for
-    "large", 4 to 14 for "extra-small").
+    `command`: voltage as text, such as "3 sin(4t)"; `closed_pct`: closing of both throttles [%], where open throttles
+    (0 %) cause no pressure drop in the thesis's model (section 4.2.1); `mean_leak_lpm`: mean leak [L/min] after the
+    bypass valve was opened; `level`: position of the bypass's needle valve, such as "large". The level does not
+    determine the leak, which is 10 to 16 mL/min for "large" and 4 to 14 for "extra-small".
     """
 
     number: int
@@ -81,7 +81,8 @@ class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
     `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chamber pressures "p_A" and "p_B" and
-    the wavelet details "d1" .. "d4" [psi] and their product "d3d4" [psi^2]; tests as in `APPENDIX_C`.
+    the wavelet details "d1" .. "d4" [psi] and "d3d4" [psi^2], the product of d3 and d4. The tests are usually those of
+    `APPENDIX_C`, in its order; a sheet simulated with drifting parameters may have them twice.
     """
 
     rms: Mapping[str, Mapping[str, Array]]

@@ -56,7 +56,8 @@ class CampaignCase(CaseInputs):
     """One record to simulate and judge.
 
     `machine_seed`: seed by which its machine is drawn from the plan's profile; `noise_seed`: seed of the sensors'
-    noise. Seeds and `id` follow from a hash of the record's inputs and of all `shared_inputs`.
+    noise. Seeds and `id` follow from a hash of the record's inputs, of `shared_inputs`, and of the content of the
+    machine family and the controller's file that its levels name.
     """
 
     machine_seed: int
@@ -70,7 +71,7 @@ def digest(value: Any) -> str:
 
 
 def profile_key(name: str) -> str:
-    """Compute a hash (hex) of the content of a profile, the distribution from which machines are drawn."""
+    """Compute a hash (hex) of the content of a profile (`name` or file), from which machines are drawn."""
     profile = load_profile(name)
     # the seeds of cases depend on this hash, and so on the profile's name; a renamed profile that must draw the same
     # cases as before states its former name in `seeds`
@@ -136,7 +137,7 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
 
 def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
-    """Reorder the cases of a campaign, with each group of the plan spread evenly over the list.
+    """Reorder the cases of a campaign, with each group of the plan (`RecordGroup`) spread evenly over the list.
 
     If a campaign is ended early, the completed cases are from all groups, in nearly the planned proportions.
     """

@@ -32,13 +32,13 @@ ProgressCallback = Callable[[int, int, int], None]
 
 def _iter_files(plan: RecordedPlan, folder: Path) -> Iterator[tuple[RecordingSet, Path]]:
     """Yield pairs of a set of recordings and one of its files in `folder`; raise InputError if a set has no files."""
-    for recordings in plan.sets:
-        files = iter_inner_files(folder, folder.glob(recordings.files))
+    for recording_set in plan.sets:
+        files = iter_inner_files(folder, folder.glob(recording_set.files))
         paths = sorted(files, key=lambda path: numeric_sort_key(path.name))
-        selected = paths[recordings.first - 1 : recordings.end - 1]  # `first` counts from 1, `end` is excluded
+        selected = paths[recording_set.first - 1 : recording_set.end - 1]  # `first` counts from 1, `end` is excluded
         if not selected:
-            raise InputError(f"a set must have files, got none for {recordings.files!r} ({folder})")
-        yield from ((recordings, path) for path in selected)
+            raise InputError(f"a set must have files, got none for {recording_set.files!r} ({folder})")
+        yield from ((recording_set, path) for path in selected)
 
 
 def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallback | None = None) -> list[CaseRow]:
@@ -52,8 +52,8 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
         if count > 1:
             raise InputError(f"a recording must be in one set only, got {count} sets ({path})")
     rows: dict[str, CaseRow] = {}
-    for number, (recordings, path) in enumerate(files, 1):
-        row = _judge_file(plan, recordings, path, path.relative_to(folder).as_posix())
+    for number, (recording_set, path) in enumerate(files, 1):
+        row = _judge_file(plan, recording_set, path, path.relative_to(folder).as_posix())
         rows[row.id] = row
         if progress is not None:
             progress(number, len(files), sum(row.error is not None for row in rows.values()))
@@ -61,10 +61,10 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as a stroke "out" (p_A higher on average) or "in", or else as "both".
+    """Classify a recording as strokes "out" (p_A higher on average) or "in" (p_B higher), or else as "both".
 
-    In a stroke the |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS. Without both pressures the
-    result is "both".
+    The strokes are of one direction if the |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS.
+    Without both pressures the result is "both".
     """
     if not all(name in recording for name in CHAMBERS):
         return "both"
@@ -73,17 +73,17 @@ def _stroke_direction(recording: Recording) -> str:
     return "both" if abs(mean_over_rms) <= _MIN_ONE_SIDEDNESS else "out" if mean_over_rms > 0 else "in"
 
 
-def _judge_file(plan: RecordedPlan, recordings: RecordingSet, path: Path, name: str) -> CaseRow:
-    """Read and judge one recording; return the row with its results, or with the error that prevented them.
+def _judge_file(plan: RecordedPlan, recording_set: RecordingSet, path: Path, name: str) -> CaseRow:
+    """Read and judge one recording of a set; return the row with its results, or with the error that prevented them.
 
     `name`: path of the recording within the folder, from which the id of the row is computed.
     """
-    levels = {"set": recordings.label or recordings.files, STROKE: "unknown"}  # the stroke is filled in once known
+    levels = {"set": recording_set.label or recording_set.files, STROKE: "unknown"}  # the stroke is not yet known
     make_row = partial(
         CaseRow,
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
-        use=recordings.use,
-        leak_lpm=recordings.size,
+        use=recording_set.use,
+        leak_lpm=recording_set.size,
         levels=levels,
     )
     try:

@@ -27,7 +27,7 @@ _AMBIGUOUS_CAUSES = {
     "piston, pump or external leak": (PISTON_LEAK, "pump leak", "external leak"),
     **joint_causes(),
 }
-#: By detector, the pair of its score, None for `cannot tell`, and the onset [s] that it estimates, None for no onset.
+#: By detector, the pair of its score, None without one (`ranking_score`), and its estimate of the onset [s], or None.
 Scores = Mapping[str, tuple[float | None, float | None]]
 
 
@@ -36,7 +36,7 @@ class Statement:
     """The stored statement of a detector on a record: fields of `Evidence`, None if not stated or not finite.
 
     - `verdict`: `leak`, `no leak` or `cannot tell`
-    - `score`, `threshold`: the detector's statistic, and the value above which the detector reports a leak
+    - `score`, `threshold`: the detector's statistic, and the value above which a change is detected
     - `onset_s`, `onset_interval_s` [s]: time at which the leak began, and its 95 % interval
     - `leak_lpm`, `leak_interval_lpm` [L/min]: flow of the leak, and its 95 % interval
     - `cause`: cause that the detector names, a type of leak or another fault
@@ -64,7 +64,10 @@ class Statement:
 
 @cache
 def expected_cause(fault: str) -> str:
-    """Find the cause that a detector should name for a fault; return the fault's text if none is defined."""
+    """Find the cause that a detector should name for a fault, such as "friction change" for "friction x1.3".
+
+    The result is the text of the fault if no cause is defined for it.
+    """
     try:
         parsed = parse_fault(fault)
     except InputError:  # faults of recordings are free text
@@ -86,7 +89,8 @@ def named_cause(evidence: Evidence | Statement) -> str:
     """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
     With the verdict `leak` it is the evidence's cause if that is in `LEAKS`, otherwise "piston leak". With any other
-    verdict it is the fault that the evidence names, such as an external leak; without one it follows from the verdict.
+    verdict it is the fault that the evidence names, such as an external leak; without a fault it is "cannot tell" for
+    that verdict, and "none" for `no leak`.
     """
     if evidence.verdict == "leak":
         return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
@@ -96,7 +100,10 @@ def named_cause(evidence: Evidence | Statement) -> str:
 
 
 def ranking_score(evidence: Evidence | Statement) -> float | None:
-    """Return a detector's score; None for `cannot tell`, and for a cause not in `LEAKS`, such as a sensor fault."""
+    """Return a detector's score, by which records are ranked (ROC); None if it does not rate a leak.
+
+    That is so for `cannot tell`, and if the detector names a cause that is not in `LEAKS`, such as a sensor fault.
+    """
     return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 

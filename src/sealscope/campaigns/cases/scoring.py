@@ -26,9 +26,10 @@ def judge_record(
 ) -> tuple[Scores, dict[str, Statement]]:
     """Run each detector of a plan on a recording; return, by detector, scores and statements (stored verdicts).
 
-    The scores are pairs of a detector's score and the onset [s] that it estimates. Detectors that only compute a score
-    (scorers) have no statement. `split_s` [s]: time at which scorers split the recording, None for its middle; `rig`:
-    the rig that detectors may assume. Raises InputError if the recording has a defect that rules out any verdict.
+    The scores are pairs of a detector's score and the onset [s] that it estimates, each None if there is none.
+    Detectors that only compute a score (scorers) have no statement. `split_s` [s]: time at which scorers split the
+    recording, None for its middle; `rig`: the rig that detectors may assume. Raises InputError if the recording has a
+    defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)  # `part`: usable samples; `share`: their fraction
     if record.defect is not None:
@@ -52,7 +53,7 @@ def judge_record(
 
 
 def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run a detector that states a verdict, i.e. any but a scorer, on a recording; return its evidence."""
+    """Run a detector that states a verdict, i.e. any but a scorer, on a prepared recording; return its evidence."""
     if detector.base == WATCH:
         return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
     if detector.base == DIAGNOSE:

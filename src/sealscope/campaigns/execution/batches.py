@@ -39,12 +39,12 @@ BATCH_SIZE = 256
 #: Mode of rows from batches. Their noise differs from that of single runs, so the two are not combined.
 IN_BATCHES = "in batches"
 #: The solver's step of a cell (a combination of levels) is chosen on a few "scout" machines: their number, and the
-#: length [s] of their runs, three of the windows in which `integrate_run` checks its error.
+#: length [s] of their runs, which have two of the windows in which `integrate_run` checks its error.
 N_SCOUT_MACHINES, SCOUT_SECONDS = 4, 4.0
 
 
 def scored_bounds(plan: SimulatedPlan) -> IntArray:
-    """Compute the ranges of usable samples before and after the planned onset: (2, 2), rows [begin, end)."""
+    """Compute the usable samples before and after the planned onset: (2, 2), a row [begin, end) for each side."""
     rate = plan.rig.daq.sample_rate
     return split_bounds(round(plan.duration_s * rate), rate, round(plan.onset_s * rate))
 
@@ -55,8 +55,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     - All detectors must be scorers, which need only the RMS of wavelet details before and after the onset.
     - No recordings are kept, and both sides of the onset have usable samples.
     - Each leak has a single law, and no sensor has a fault.
-    - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`), tested on
-      the first case of each combination of levels whose experiment can be built.
+    - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`). This is
+      tested on the first case of each combination of levels, unless its experiment cannot be built.
     """
 
     def refusal(rule: str) -> InputError:
@@ -97,7 +97,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
     """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
-    A row does not depend on the other cases of the batch. `threads`: number of threads of the simulation.
+    The other cases of the batch can change a row a little; `simulate_batch` states how. `threads`: number of threads of
+    the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None
     choose_step = make_step_chooser(plan, profile)
@@ -144,8 +145,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Find the leak coefficients that give the planned mean flows, in short runs; return the completed experiments.
 
-    A solver's step that is unstable with the leak is shortened. If the short runs fail, the error is raised for several
-    experiments; a single one is tried again with a step that `integrate_run` chooses.
+    A solver's step that is unstable with the leak is shortened. If the short runs fail, the error is raised; only a
+    single experiment is tried again, with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]

@@ -40,8 +40,9 @@ def run(
 
     `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
     address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
-    numbers of cases done, of all cases, and of failed ones; `batch`: True to simulate cases side by side, with `jobs`
-    threads; `trust`: True to run controllers that the plan names by file or module, whose code may be hostile.
+    numbers of cases done, of all cases, and of failed ones; `task`: function that runs one case; `batch`: True to
+    simulate cases side by side, with `jobs` threads, instead; `trust`: True to run controllers that the plan names by
+    file or module, whose code may be hostile.
 
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
     and for a plan that batches cannot run.

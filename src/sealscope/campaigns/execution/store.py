@@ -46,7 +46,7 @@ class CampaignProgress:
     """The progress of a campaign.
 
     `done`: number of the plan's `records` that have been run; `failed`: number of these that ended with an error;
-    `seconds`: mean processor time of a record, None if no record has a result.
+    `seconds`: mean processor time of a record [s], None if no record has a result.
     """
 
     records: int
@@ -85,11 +85,11 @@ def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str,
 
 
 def _plug_ins(plan: SimulatedPlan) -> dict[str, str]:
-    """Collect the plug-in detectors that a plan runs, as a mapping of the detector's name to a hash of its source.
+    """Collect the detectors of other distributions that a plan runs: a hash of the source file, by detector.
 
-    A plan with `diagnose` runs all plug-ins.
+    A plan with `diagnose` runs all of them.
     """
-    # all but the scorers, which are no plug-ins
+    # all but the scorers, which are built in
     bases = {detector.base for name in plan.detectors if (detector := parse_detector_name(name)).scorer is None}
     return {
         name: plug_in.fingerprint

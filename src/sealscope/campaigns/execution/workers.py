@@ -33,20 +33,20 @@ def iter_results(
 ) -> Generator[tuple[Item, Result | None], None, None]:
     """Run `task` on each item in several processes, and yield pairs of item and result in the order of completion.
 
-    `jobs`: number of processes to start, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
-    are used instead. An item is taken from `items` when a worker can take it. Items and `task` are pickled. Processes
+    `jobs`: largest number of processes, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
+    are used instead. The next of `items` is taken only when a worker is free. Items and `task` are pickled. Processes
     on this machine ignore the keyboard interrupt; they end with the generator or with the parent process.
 
-    If a process dies, for example for want of memory, its item is run once more, alone, after all others. If it dies
-    again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a cluster is wanted and Dask
-    is not installed, and InputError if no scheduler answers or a worker has another version of Sealscope.
+    If a process dies, for example because memory is short, its item is run once more, alone, after all others. If it
+    dies again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a cluster is wanted and
+    Dask is not installed, and InputError if no scheduler answers or a worker has another version of Sealscope.
     """
     if jobs == 1 and cluster is None:
         yield from ((item, task(item)) for item in items)
         return
     waiting = iter(items)
     lost_items: list[Item] = []  # items whose process died
-    is_retry = False
+    is_retry = False  # True while the lost items are run once more
     idle: list[Executor] = []
     busy: dict[Future[Result], tuple[Executor, Item]] = {}
     with _local_processes(task, jobs) if cluster is None else _cluster_workers(task, cluster) as pools:
@@ -171,6 +171,7 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
             raise InputError(f"the cluster's workers must have Sealscope, got: {error} ({address})") from None
         if keys != {code_key()}:
             raise InputError(f"the cluster's workers must have this machine's Sealscope, got another ({address})")
+        # pure=False: equal items are run each, not taken for one
         pool, max_items = client.get_executor(pure=False), _QUEUED_PER_WORKER * sum(client.nthreads().values())
         yield _Pools(lambda: pool, max_items, lambda pool, item: pool.submit(task, item), dask.KilledWorker)
 

@@ -16,9 +16,9 @@ from sealscope.evaluation.roc import Area, Roc, auc, roc_curve
 class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
-    `curve`: logistic curve fitted to hits and misses, None if it cannot be fitted, for the reason `why`; `proven`:
-    smallest tested size such that, for it and for all larger ones, the lower confidence bound of the detected fraction
-    is at least 90 %; inf if there is none.
+    `sizes`: detected fraction at each tested size; `curve`: logistic curve fitted to hits and misses, None if it cannot
+    be fitted, for the reason `why`; `proven`: smallest tested size such that, for it and for all larger ones, the lower
+    confidence bound of the detected fraction is at least 90 %; inf if there is none.
     """
 
     detector: str

@@ -85,7 +85,7 @@ def judge(
     - `confidence`: probability for the promise "bound", and confidence level of all intervals
     - `limits`: thresholds by detector, in place of all fixed and computed ones
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
-    - `hours`: operating time of a record, None to compute no false alarms per hour
+    - `hours`: operating time of a record [h], None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:

@@ -81,9 +81,10 @@ def _iter_errors(
     estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]],
     confidence: float,
 ) -> Iterator[StatedErrors]:
-    """Yield the errors of one detector's estimates on the records of one planned leak flow [L/min].
+    """Yield one result, the errors of a detector's estimates on the records of one planned leak flow [L/min].
 
-    Yields nothing without an estimate. `estimates`: (estimate, true value, interval) of each record, None if missing.
+    Nothing is yielded without an estimate. `estimates`: (estimate, true value, interval) of each record, where a
+    missing estimate or interval is None.
     """
     values = [math.nan if value is None else value for value, _, _ in estimates]
     if np.isfinite(values).any():

@@ -25,7 +25,8 @@ _PROPORTION = ("count", "of", "fraction", "low", "high")
 class PriorKnowledge:
     """The information that a detector is given before it judges a record.
 
-    `onset`: True if it knows the true onset of the leak; `channels` it may read; `rig` it assumes, or "".
+    `onset`: True if it knows the true onset of the leak; `channels` that it may read; `rig`: name of the rig that it
+    assumes, "" for none.
     """
 
     onset: bool
@@ -39,7 +40,7 @@ class PriorKnowledge:
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
-    """Load each table's layout: flags and an attribute's dotted path, such as "share alarms", for each column."""
+    """Load the tables' layouts: for each column, flags and the dotted path of an attribute, as in "share alarms"."""
     return tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
@@ -86,7 +87,7 @@ def build_tables(
     """
     knowledge = {name: row.as_row() for name, row in (known or {}).items()}
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
-    # by table, the objects that fill its rows; a dictionary names several objects for one row
+    # by table, the objects that fill its rows; a dictionary has several, by the first name in their dotted paths
     rows: dict[str, Iterable[Any]] = {
         "table": (*judgement.table, *judgement.overall),
         "pod": ({"pod": pod, "at": entry} for pod in judgement.pods for entry in pod.sizes),

@@ -28,7 +28,7 @@ class JudgedRow(NamedTuple):
 
     @property
     def size(self) -> float:
-        """Planned mean flow of the true leak, 0 for none: in L/min, or a grade where the plan grades leaks."""
+        """Planned size of the true leak, 0 for none: its mean flow [L/min], or a number in the plan's own `unit`."""
         return self.row.leak_lpm
 
     @property

@@ -26,7 +26,7 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
     """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
 
     `name`: the factor; `duration` [s]: length of a record, for which a target of the piston's position must stay within
-    the rig's stroke. A built-in controller must fit the rig; of others, only the form of the name is checked.
+    the stroke of the `rig`. A built-in controller must fit the rig; of others, only the name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
     if not isinstance(level, str):

@@ -144,6 +144,7 @@ class _JudgedPlan(_Plan):
     - `false_alarm`: wanted false-alarm probability of each detector
     - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
       they keep it with the probability `confidence` (`quantile_threshold`)
+    - `detectors`: names in the forms that the module `plans.detectors` lists
     - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
     - `channels`: channels of the detectors without "@", None for all but the flow meter of the leak
@@ -163,7 +164,7 @@ class _JudgedPlan(_Plan):
     def _load_assumed(self, default: Rig | None) -> Rig | None:
         """Load the rig that detectors assume: `assume` or, if that is None, `default`, with the values `assume_set`.
 
-        If both are None, the values change the rig `thesis`; without values, None is returned.
+        If both are None, the values change the rig `thesis`; if there are no values either, the result is None.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -226,8 +227,8 @@ class RecordingSet(_TomlTable):
     - `files`: pattern of the file names
     - `use`: `calibrate` for healthy recordings from which thresholds are set, `judge` for recordings to be judged
     - `size`: size of the leak in the plan's `unit`, 0 for healthy recordings
-    - `first`, `end`: positions, counted from 1, of the first file that is used and of the first one after it that is
-      not; the files are ordered by the numbers in their names
+    - `first`, `end`: position of the first file that is used, and one past that of the last; the files are ordered by
+      the numbers in their names and counted from 1
     - `label`: name of the set in tables, by default the pattern
     """
 

@@ -75,7 +75,7 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     )
     if isinstance(plan, SimulatedPlan):
         plan = _complete_simulated_plan(plan)
-    elif not any(recordings.use == "judge" for recordings in plan.sets):
+    elif not any(recording_set.use == "judge" for recording_set in plan.sets):
         raise InputError(f"recordings.sets must have one to judge, got none ({place})")
     _check_entry("campaign.assume", place, lambda: plan.assumed)
     for name in plan.detectors:
@@ -88,10 +88,10 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
 
 
 def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
-    """Build a plan from the parsed tables `tree` of its file, without a check of its factors and of the files it names.
+    """Build a plan from the parsed tables `tree` of its file `place`; raise InputError for an unknown or wrong entry.
 
-    Each entry of [campaign] and [recordings] becomes a field of the plan; each other table becomes one field. `place`:
-    the file. Raises InputError, with the name of the entry, if an entry is unknown or has a wrong value.
+    Each entry of [campaign] and [recordings] becomes a field of the plan; each other table becomes one field. Factors,
+    and files that the plan names, are not checked here.
     """
     source = next((name for name in _KINDS if name in tree), "records")  # name of the table that lists the records
     plan_class, tables, source_entries = _KINDS[source]
@@ -112,11 +112,12 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
                 raise InputError(f"{table}.{entry} is not known ({place})")
             full_names[entry] = f"{table}.{entry}"
         entries |= values
+    # an entry without a full name is missing, and is reported as one of [campaign]
     return read_model(entries, plan_class, place, lambda entry: full_names.get(entry, f"campaign.{entry}"))
 
 
 def _check_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
-    """Call `function` for an entry of a plan; add `entry`, such as "campaign.rig", and `place` to an InputError."""
+    """Return the result of `function`; to its InputError, add the plan's `entry`, such as "campaign.rig", and file."""
     try:
         return function()
     except InputError as error:
@@ -129,8 +130,9 @@ def _path_in_plan_folder(name: str, place: str) -> str:
 
 
 def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
-    """Fill in the paths and default onset of a simulated plan, and check it; raise InputError if it is invalid."""
+    """Resolve the paths of a simulated plan, fill in its default onset, and check it; raise InputError if invalid."""
     place = plan.place
+    # "none" and "" mean no profile
     profile = "" if plan.profile == "none" else _path_in_plan_folder(plan.profile, place)
     onset = plan.duration_s / 2 if math.isnan(plan.onset_s) else plan.onset_s
     plan = replace(plan, rig_name=_path_in_plan_folder(plan.rig_name, place), profile=profile, onset_s=onset)
@@ -170,8 +172,8 @@ def _check_factors(plan: SimulatedPlan) -> None:
 def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """List the commands of a plan's records: the levels of the factor `command`, or else the profile's commands.
 
-    With a factor `family`, the profile's commands are those of its levels (families). Without factor `command` and
-    profile, the only command is '3 sin(4t)'.
+    With a factor `family`, only the commands of the families that it lists count. Without factor `command` and profile,
+    the only command is '3 sin(4t)'.
     """
     if COMMAND in plan.factors or not plan.profile:
         return plan.factors.get(COMMAND, ("3 sin(4t)",))

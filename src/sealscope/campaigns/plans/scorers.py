@@ -122,13 +122,13 @@ class Scorer:
 
     @property
     def compares_parts(self) -> bool:
-        """True if the rule compares the parts of a record before and after a time at which it is split."""
+        """True if the rule compares the two parts of a split record, False if it rates the record as a whole."""
         statistics = [_DIRECTIONS[direction][0] for _, _, direction in self.conditions]
         return all(statistic == "change" for statistic in statistics)
 
     @property
     def description(self) -> str:
-        """Description of the score in words, such as "the RMS of d3 of p_A fell over the record, as its logarithm"."""
+        """Description of the score in words, such as "the RMS of d3 of p_A low over the record, as its logarithm"."""
         text = " and ".join(
             f"the RMS of {quantity} of {chamber} {direction}" for quantity, chamber, direction in self.conditions
         )

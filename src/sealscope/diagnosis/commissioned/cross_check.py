@@ -14,7 +14,7 @@ from sealscope.diagnosis.verdict.evidence import LEAK
 
 #: Fewest recordings that are compared with each other, as the scatter of fewer recordings is not known.
 MIN_RECORDINGS = 4
-#: Words that mark the problem of a recording that differs from the other healthy recordings.
+#: Words in the problem of a recording that differs from the other healthy recordings; `summary` counts them.
 BY_OTHERS = "by the others"
 
 

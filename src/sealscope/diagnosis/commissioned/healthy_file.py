@@ -80,6 +80,7 @@ def uniform_table_type(value_type: Any) -> Any:
     """Make a pydantic type for a table of any keys with values of one type; its error names the first wrong value."""
 
     def check_values(table: Any) -> Any:
+        """Return the table unchanged; raise ValueError if it is no table, or if one of its values is not valid."""
         if not isinstance(table, dict):
             raise ValueError(f"must be a table, got {table!r:.60}")
         for name, value in table.items():
@@ -113,7 +114,7 @@ def _check_statistic(value: Any) -> Any:
 
 
 def _check_sums(summary: Any) -> Any:
-    """Return the summary of a recording's volume balance if it is consistent; raise ValueError otherwise.
+    """Return the `summary` by a volume balance (`_BALANCE`) if it is consistent; raise ValueError otherwise.
 
     The array `sums` (E, m, m) has for each of E balances the sums of products of its m columns: the `terms`, which must
     include the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey
@@ -155,10 +156,10 @@ def _check_sums(summary: Any) -> Any:
 
 
 def _check_levels(summary: Any) -> Any:
-    """Return a summary of wavelet details unchanged; raise ValueError if its arrays are not valid.
+    """Return the `summary` of wavelet details (`_RMS`) if its arrays are valid; raise ValueError otherwise.
 
-    `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) those of the quantities `DUTY`.
-    All are finite and below `_MAX_LOGARITHM` in magnitude.
+    `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) the features `DUTY`: three
+    logarithms and a ratio. All are finite and below `_MAX_LOGARITHM` in magnitude.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -183,6 +184,7 @@ def _check_octaves(values: Any) -> Any:
     return values
 
 
+# types of values; `_BALANCE` and `_RMS` are those of the summaries by `VolumeBalance.learn` and `RmsChange.learn`
 _Array = Annotated[Any, AfterValidator(_check_array)]
 _Statistic = Annotated[Any, AfterValidator(_check_statistic)]
 _Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]

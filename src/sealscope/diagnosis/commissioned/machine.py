@@ -85,7 +85,10 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Path of the file that a machine was loaded from, and hashes of its parts, to detect changes by others."""
+    """Path of the file that a machine was loaded from, and hashes of its parts (`machine_file._hash_parts`).
+
+    By the hashes, changes that others make to the file are detected.
+    """
 
     path: Path
     parts: frozenset[bytes]
@@ -109,11 +112,11 @@ class CommissionedMachine:
     rig : Rig, optional
         Stated parameters of the machine, None if nothing is stated.
     channel_map : mapping of str to str, or "auto", optional
-        Column of its logs for each channel.
+        Column of its logs for each channel; "auto" to find the channels by the columns' names.
     rate : float, optional
         Sampling rate [Hz] of logs without a time column.
     limit : str, optional
-        Smallest leak that calls for a repair, such as "5 mL/min".
+        Smallest leak that calls for a repair, such as "5 mL/min"; None for the default (`RepairLimit.parse`).
     left_out : tuple of str, optional
         Recordings that could not be used, each with the reason.
     alarms : tuple of JudgedAlarm, optional
@@ -183,7 +186,7 @@ class CommissionedMachine:
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Return a copy as `with_healthy` does, without testing the new recording for a leak."""
+        """Return a copy as `with_healthy` does, untested for leaks; raise InputError if it is a copy or not trusted."""
         rig, _ = assumed_rig(self.rig, recording)
         summarised = summarise_healthy(recording, rig, file, checksum)
         if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
@@ -410,6 +413,7 @@ def commission(
         read(files[0], map=stated_map, rate=rate)  # raises the error of the map, without which the others were read
 
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
+        """Diagnose a healthy recording against others; its samples are read again unless they were kept in memory."""
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 

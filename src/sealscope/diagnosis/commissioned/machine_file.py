@@ -259,6 +259,7 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     """
 
     def hash_value(value: Any) -> bytes:
+        """Compute the first 16 bytes of the SHA-256 of a value as JSON."""
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     statements = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}

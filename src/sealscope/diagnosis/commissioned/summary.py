@@ -51,7 +51,8 @@ class SmallestLeak(NamedTuple):
 
     lpm: float | None  # flow of the leak [L/min], None if the machine's sizes are not stated
     share: float  # flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move
-    halved_by: int | None  # factor on healthy recordings and days that halves this leak, None if none is enough
+    # factor on the number of healthy recordings, and of their days, that halves this leak; None if no tried one does
+    halved_by: int | None
 
     def __str__(self) -> str:
         share = f"{100.0 * self.share:.2g} % of the pump's flow"
@@ -266,17 +267,18 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
     `balance` is the detector that made the `summaries` of the healthy recordings, and `channels` are the recorded
-    channels. The leakage of a recording is compared with the healthy mean by Student's t test. A leak that is detected
-    with the probability `power` (`priors.toml`) raises the leakage by
+    channels. The leakage of a recording is tested for a rise over that of the healthy ones (`predict_rise`). A leak
+    that is detected with the probability `power` (`priors.toml`) raises the leakage by
 
         rise = (threshold of the test + normal quantile of `power`) * deviation,
 
-    where `deviation` is the standard deviation of a healthy recording's leakage from the healthy mean. More healthy
-    days lower the threshold and the error of the healthy mean, but not the scatter between recordings.
+    where `deviation` is the standard deviation of a healthy recording's leakage from its prediction. More healthy days
+    lower the threshold and the error of the prediction, but not the scatter between recordings.
     """
     from scipy.special import ndtri
 
-    def smallest_rise(n_repeats: int) -> float:  # conductance [m^3/(s Pa)] with `n_repeats` times the healthy days
+    def smallest_rise(n_repeats: int) -> float:
+        """Compute the rise of the conductance [m^3/(s Pa)] for `n_repeats` times as many healthy days."""
         rise = balance.predict_rise(summaries, channels, n_repeats)
         return float((rise.threshold(FALSE_ALARM_PROBABILITY) + ndtri(_PRIORS.power)) * rise.deviation)
 

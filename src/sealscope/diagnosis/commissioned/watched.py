@@ -41,9 +41,10 @@ class WatchedMachine:
     channel_map, rate : mapping of str to str, float or None
         Column of the actuator's logs for each channel, and sampling rate [Hz] of logs without a time column.
     limit_lpm : float or None
-        Leak at which the machine must be repaired [L/min], None if that needs a piston area that is not stated.
+        Leak at which the machine must be repaired [L/min], None for the file of a rig, or if it follows from a creep
+        speed and a piston area that is not stated.
     machine : CommissionedMachine or None
-        Machine with the healthy recordings that a file of the actuator is compared with, None if there are none.
+        Machine with the healthy recordings that recordings of the actuator are compared with, None if there are none.
     healthy : HealthyLevel or None
         Leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
     """
@@ -105,12 +106,12 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 
 
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
-    """Estimate mean, range and deviation of the leakage conductance of pump and piston over healthy recordings.
+    """Estimate mean, range and deviation of the leakage conductance [m^3/(s Pa)] over healthy recordings.
 
-    `rig` states the sizes of the machine. The lower end of the range is at least the largest conductance divided by
-    `oil.warmest` of `priors.toml`, the factor by which the warmest oil raises the leakage. The machine is known to be
-    healthy until the start of the last recording (`known_s`), 0 if no recording has a date. The result is None if fewer
-    than two recordings have an estimate.
+    The conductance is that of pump and piston together. `rig` states the sizes of the machine. The lower end of the
+    range is at least the largest conductance divided by `oil.warmest` of `priors.toml`, the factor by which the warmest
+    oil raises the leakage. The machine is known to be healthy until the start of the last recording (`known_s`), 0 if
+    no recording has a date. The result is None if fewer than two recordings have an estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:

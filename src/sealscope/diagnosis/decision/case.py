@@ -1,4 +1,7 @@
-"""Grounds of a decision: the report of the judging detector, other explanations, and the tests for a leak."""
+"""Grounds of a decision: the report of the judging detector, other explanations, and the tests for a leak.
+
+An observable is the result of a detector's test of one quantity for a change (`inference.observable`).
+"""
 
 from __future__ import annotations
 
@@ -68,7 +71,7 @@ class Case:
 
     @property
     def rarest_observable(self) -> Observable:
-        """The test result (observable) of the judging detector with the smallest p-value, as the detector states it."""
+        """The observable of the judging detector with the smallest p-value, as stated by the detector."""
         return min(self.judge.observables, key=lambda observable: observable.chance)
 
     @cached_property
@@ -100,8 +103,9 @@ class Case:
         """Return True if the rise over healthy recordings alone does not exclude that the leak is an external one.
 
         That is so if L_external / (L_external + L_leak) > 1 - `sure` (`[explanation]` of `priors.toml`), with the
-        likelihoods L of both descriptions. Priors, such as that a large external leak would have been seen, do not
-        count. The result is False for an `alarm` by other data, or if rivals are not weighed.
+        likelihoods L of the rise by either leak (`Observable.log_ratio_to_leak`). Priors, such as that a large external
+        leak would have been seen, do not count. The result is False for an `alarm` by another test than the comparison
+        with healthy recordings, or if rivals are not weighed.
         """
         if not self.weigh_rivals or self._data_kind(alarm) != RISE:
             return False
@@ -113,7 +117,7 @@ class Case:
         )
 
     def shows_leak(self, alarm: LeakTest) -> bool:
-        """Return True if a leak probably caused an alarm, or if a leak and an external leak cannot be distinguished.
+        """Return True if a leak probably caused an alarm, or if an internal and an external leak cannot be separated.
 
         `alarm` is the test that raised the alarm. The result is True in two cases, with the limits `leak`, `named` and
         `sure` from the table `[explanation]` of `priors.toml`:
@@ -132,8 +136,8 @@ class Case:
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) from which the test `alarm` was computed.
 
-        It is `RISE` for a comparison of measured leakage with healthy recordings. Otherwise it is the kind of the
-        judging detector's first test result.
+        It is `RISE` for a comparison of measured leakage with healthy recordings, otherwise the kind of the judging
+        detector's first observable.
         """
         if alarm.name == AGAINST and self.leak is not None:
             return RISE
@@ -158,11 +162,15 @@ class Case:
     def has_onset_within(self) -> bool:
         """True if a leak that began within the recording is a better explanation than an older leak.
 
-        Log Bayes factors are compared. That of a leak that began within the recording is the factor of a step (a sudden
-        increase) plus that of the rise over healthy recordings by this step. That of an older leak, which was there
-        from the first sample on, is the larger of two: the factor of a rise of any size, and the factor of a leak whose
-        size follows from how its flow bends over the pressure. The result is True without measured leakage or healthy
-        recordings, or if the times in which valves hold the load show when the rise began (`rise_onset` is not None).
+        An older leak was there from the first sample on. Compared are the log Bayes factors
+
+            began within:    B(step) + step_log_ratio,
+            older:           max(B(rise over healthy recordings), older_leak_gain + older_log_ratio).
+
+        B is the largest one that the p-value of a test allows (`log_bayes_factor`); the log ratios are those of
+        `LeakRise`. The last sum is for a leak whose size follows from how its flow bends over the pressure. The result
+        is True without measured leakage or healthy recordings, or if the times in which valves hold the load show when
+        the rise began (`rise_onset` is not None).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
@@ -178,8 +186,8 @@ class Case:
 
         After an alarm by comparison with healthy recordings, this is the flow of the rise over them; after an alarm by
         the limit in the rig's file, the total leakage. After an alarm by a step within the recording, it is the step's
-        flow. If an older leak explains the step better (`has_onset_within` is False) and the flow of this leak is
-        known, the flow of the older leak is returned instead.
+        flow or, if an older leak explains the step better (`has_onset_within` is False) and its flow is known, that of
+        the older leak.
         """
         leak = self.leak
         if leak is None:
@@ -195,7 +203,7 @@ class Case:
 
         The observables are tried in the order of their p-values, as long as these are below the allowed probability of
         naming an event by mistake. For each observable, single causes are tried before groups of inseparable causes
-        (`joint_causes`).
+        (`joint_causes`); the first that may be named (`_probability_of_causes`) is returned.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -222,11 +230,11 @@ class Case:
         return None
 
     def _probability_of_causes(self, causes: Sequence[str], data_kind: str) -> float | None:
-        """Compute the probability that one of the causes changed a kind of data, against other causes and chance.
+        """Compute the probability that one of the causes changed a kind of data; None if they must not be named.
 
-        The result is None if the causes must not be named. They may be named if three limits of `priors.toml` are
+        The alternatives are other causes and chance. The causes may be named if three limits of `priors.toml` are
         exceeded: `happened` by this probability, `named` by the probability against other causes only, and 1 - `sure`
-        by the probability of each single cause.
+        by the latter probability of each single cause.
         """
         limits = DECISION.explanation
         by_cause = [probability_of(self.explanations, causes=[cause], data_kind=data_kind) for cause in causes]
@@ -239,12 +247,13 @@ class Case:
         """Describe in words the most probable event with a given cause that changes a kind of data."""
 
         def probability(event: Event) -> float:
+            """Compute the probability of the event, given that this kind of data has changed."""
             return probability_of(self.explanations, event.name, data_kind=data_kind)
 
         return max(self._events_of(cause, data_kind), key=probability).description
 
     def _events_of(self, cause: str, data_kind: str) -> list[Event]:
-        """Return the events with a given cause that change a kind of data (`Observable.data`)."""
+        """List the events with a given cause that change an observable of a kind of data (`Observable.data`)."""
         tests = [observable for observable in self.observables if observable.data == data_kind]
         return [event for event in load_events() if event.cause == cause and any(map(event.changes, tests))]
 
@@ -298,10 +307,10 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    Of the test results that a leak changes, the one with the smallest p-value gives the score and the calibrated
-    p-value (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. The
-    threshold is therefore computed as the score with a calibrated p-value equal to the allowed false-alarm probability,
-    assuming that scores are proportional to the logarithm of the detector's p-value.
+    Of the observables that a leak changes, the one with the smallest p-value gives the score and the calibrated p-value
+    (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. The threshold
+    is therefore computed as the score with a calibrated p-value equal to the allowed false-alarm probability, assuming
+    that scores are proportional to the logarithm of the detector's p-value.
     """
     leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
     affected = [observable for observable in case.judge.observables if leak.affects(observable)]

@@ -85,8 +85,9 @@ def decide(
 def _decide_without_leak(case: Case) -> Evidence:
     """Decide between `no leak` and `cannot tell`, given that no test has found a leak.
 
-    The verdict is `no leak` if an undetected leak can only be small. If another event explains a rare change, the
-    evidence states the event's cause. If leakage is measured, it also states the upper bound of an undetected leak.
+    The verdict is `no leak` if an undetected leak can only be small (`_bound_and_limit`). If another event explains a
+    rare change, the evidence states the event's cause. If leakage is measured, it also states the total leakage and the
+    upper bound of an undetected leak.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
@@ -138,9 +139,9 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a leak that the test `alarm` detected, such as "piston or pump leak".
 
-    The detector's cause names the parts that its data cannot tell apart. The pump is not named if a separate test makes
-    a pump leak improbable. The outside is named, too, if this test does not exclude that oil leaves the circuit, or if
-    the data alone cannot tell (`Case.resembles_external`).
+    The detector's cause names the parts that its data cannot tell apart. The pump is left out if it was tested by
+    itself, and its leak has a probability below `RAREST`. The outside is added if an external leak has a probability
+    above 1 - `sure` (`priors.toml`), or if the data alone, without priors, cannot tell (`Case.resembles_external`).
     """
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST

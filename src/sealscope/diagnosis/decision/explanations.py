@@ -9,9 +9,9 @@ two events, which do not compete. The Bayes factor of a change is at most 1 / (-
 of the change in a healthy recording, or 1 for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy
 recordings (`null`).
 
-A term of the volume balance describes a change only to within a fraction. Therefore the logarithms of the Bayes factors
-of the same data are divided by 1 + 2 m B, with the largest of them, B, and the misfit m (`priors.toml`). Alternative
-explanations then do not differ by more than the terms are known.
+A term of the volume balance describes a change only to within a fraction, the misfit m (`priors.toml`). Therefore the
+logarithms of the Bayes factors of the same data are divided by 1 + 2 m B, where B is the largest of them. Alternative
+explanations then differ no more than this accuracy allows.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
 """
@@ -103,8 +103,8 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
         log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
     Healthy recordings show how rare the best description is, but are too few to show which term is the best. Only the
-    judged recording shows this. `log_factors` has each observable with its calibrated log Bayes factor. Factors of
-    other kinds of data are returned unchanged.
+    judged recording shows this. `log_factors` has each observable with its log Bayes factor, calibrated and corrected
+    for the misfit. Factors of other kinds of data are returned unchanged.
     """
     likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
     volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
@@ -195,13 +195,15 @@ def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are test results (observables) with the log Bayes factors of a change. The event affects observables
-    freely, or by a common scale of both pressures, on which the observables must agree (`_agree_on_scale`). The
-    affected observable with the largest factor gives the time of the event. Others count if they may have changed at
-    that time. Side effects on other kinds of data count only if an affected observable supports the event. Their
-    factors are limited to the largest one of the affected observables, as a much clearer side effect has another cause.
-    For each kind of data the largest factor is returned, with the log odds from the prior on the event's size added. If
-    the event affects no observable, the result is empty.
+    `factors` are test results (observables) with the log Bayes factors of a change. For each kind of data the largest
+    factor is returned, with the log odds from the prior on the event's size added, of
+
+    - observables that the event affects freely, or by a common scale of both pressures (`_agree_on_scale`). The one
+      with the largest factor gives the time of the event; only changes that may be of that time count (`_coincide`).
+    - side effects (`Event.may_disturb`) on other kinds of data, if an affected observable supports the event. Their
+      factors are limited to the largest one of the affected observables: a much clearer one has another cause.
+
+    If the event affects no observable, the result is empty.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
@@ -252,10 +254,10 @@ def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[O
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of a change of an observable from its p-value `chance`.
 
-    A quantity such as an external leakage may describe the same change as a leak. It then seems to rise if the leakage
-    rises above that of healthy recordings (`rise`). The observable of such a quantity states `log_ratio_to_leak`, the
-    log likelihood ratio of its description of the change to the description by a leak. Its log factor is limited to the
-    log factor of the rise plus this ratio, but not below 0.
+    A leak also raises the estimates of similar quantities, such as an external leakage. The observable of such a
+    quantity states `log_ratio_to_leak`, the log likelihood ratio of its description of the change to that by a leak.
+    Its log factor is limited to that of the leakage's rise over healthy recordings (`rise`) plus this ratio, but not
+    below 0.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -273,7 +275,7 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if two observables may have changed at the same time: an onset is unknown, or both are near.
+    """Return True if two observables may have changed at the same time: an onset is unknown, or the two are near.
 
     Two onsets are near if they differ by at most half the sum of the widths of their 95 % intervals.
     """

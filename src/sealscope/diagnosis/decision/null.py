@@ -68,7 +68,7 @@ class HealthyNull:
         return float(np.exp(-surprisal))
 
     def _inflation(self, key: str) -> tuple[Array, Array]:
-        """Return weights and values (k,) of lambda (`_inflation_posterior`) for the test with this `key`."""
+        """Return posterior weights and values (k,) of lambda for the test with this `key` (`_inflation_posterior`)."""
         if key not in self._posteriors:
             self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
         return self._posteriors[key]
@@ -95,7 +95,7 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
 
 
 def null_key(observable: Observable) -> str:
-    """Return the key under which `HealthyNull` stores an observable, such as "noise: noise of the pressures".
+    """Return the key of an observable in `HealthyNull.surprisals`, such as "noise: noise of the pressures".
 
     Observables without an onset are comparisons with healthy recordings, and share one key for their kind of data.
     """
@@ -103,5 +103,5 @@ def null_key(observable: Observable) -> str:
 
 
 def comparison_key(data: str) -> str:
-    """Return the key under which `HealthyNull` stores comparisons of a kind of data, such as "details: against"."""
+    """Return the key of comparisons of a kind of data in `HealthyNull.surprisals`, such as "details: against"."""
     return f"{data}: against"

@@ -167,16 +167,16 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation of an `alarm` other than a leak, and the way to tell it from a leak.
 
     The stated probability is that of all explanations without a leak. If the explanation has several events, only the
-    first one is described. If this event has no cause, it is a change of the operating point: the text then states only
-    its time, the onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no
-    explanation without a leak.
+    first one is described. If this event has no cause to name, such as a start, the text states only its time, the
+    onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no explanation
+    without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
     if best is None:
         return ""
     event = best.events[0]
-    if event.cause is None:  # a change of the operating point, not a fault: no cause to name
+    if event.cause is None:  # mostly a change of the operating point, not a fault
         onset = None if case.leak is None or case.leak.step is None else case.leak.step.onset()
         return "" if onset is None else text_of("doubt", "regime", seconds=onset.value)
     clearest = max(

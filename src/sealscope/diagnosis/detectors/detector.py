@@ -36,7 +36,7 @@ class Detector(Protocol):
     name: str
 
     def usable(self, recording: Recording) -> str | None:
-        """Return None if the detector can use the recording, else a line of text with the reason why not."""
+        """Return the reason, in one line, why the detector cannot use the recording; None if it can."""
         ...
 
     def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
@@ -52,9 +52,10 @@ Factory = Callable[["Rig"], Detector]
 
 
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
-    """Return the reason, in one line, why a detector cannot use a recording; None if it can.
+    """Ask a detector for the reason, in one line, why it cannot use a recording; None if it can.
 
-    Raises TypeError if the detector's `usable` returns neither a text nor None.
+    Line breaks of the detector's text are replaced by blanks. Raises TypeError if `usable` returns neither a text nor
+    None.
     """
     reason: Any = detector.usable(recording)
     if reason is None:

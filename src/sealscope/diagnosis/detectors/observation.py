@@ -1,6 +1,7 @@
 """Run detectors on recordings, and collect the surprisals of the changes that they find in healthy recordings.
 
-The surprisal of a change is -log(chance), where chance is the p-value that the detector states for the change.
+The surprisal of a change is -log(chance), where chance is the p-value that the detector states for the change. An
+observable (`inference.observable`) is the result of one such test.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from sealscope.recordings.recording import Recording, compute_once
 
 #: Key of the surprisals of a recording's observables in its cache (`compute_once`).
 SURPRISALS = "surprisals"
-#: Prefix of the keys of surprisals of the volume balance if valves cut the pump off at rest.
+#: Prefix of the keys of surprisals from a volume balance that assumes that valves cut the pump off at rest.
 SHUT = "shut, "
 #: Minimum number of healthy recordings to compare each with all others.
 MIN_COMPARED = 3
@@ -140,13 +141,13 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
 
-    These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance. The pressure response
-    is tested, too, if there is no balance, or if no flow is recorded, as a control loop may then hold the load by
-    replacing the oil that leaks.
+    These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance, once for each
+    assumption on the valves at rest that the recording allows. The pressure response is tested, too, if there is no
+    balance, or no channel from which the flow to the cylinder can be computed (`flow_source`).
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
-    reports: Mapping[bool, Observed] = {}  # reports by whether the pump is cut off at rest
+    reports: Mapping[bool, Observed] = {}  # key: True if valves are assumed to cut the pump off at rest
     if unusable_reason(balance, recording) is None:
         try:
             with np.errstate(all="ignore"):
@@ -179,10 +180,10 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
     """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
 
-    `chance` is the p-value that a detector states, assuming `rig`. A test for a change within a recording has one value
-    from each recording. Comparisons between recordings share one list for each kind of data (`Observable.data`): each
-    recording is compared with all others, and the largest surprisal counts. With `shut`, the volume balance assumes
-    that valves cut the pump off at rest.
+    `chance` is the p-value that a detector states, assuming `rig`. Each test for a change within a recording has a list
+    (`null_key`) with one value from each recording. Comparisons with other recordings share one list for each kind of
+    data (`comparison_key`): each recording is compared with all others, and the largest surprisal counts. With `shut`,
+    the volume balance assumes that valves cut the pump off at rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:

@@ -81,7 +81,8 @@ def detectors() -> Mapping[str, Factory]:
 def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
     """Find the detectors of other installed packages, in the order of their names; the result is cached.
 
-    A detector is left out, with the reason logged, if it cannot be loaded, or if its name is not valid or taken.
+    A detector is left out, with the reason logged, if it cannot be loaded, or if its name is not valid or taken, such
+    as one of `built_in_names`.
     """
     plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):

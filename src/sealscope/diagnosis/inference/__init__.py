@@ -1,1 +1,1 @@
-"""Estimation of leakage from recordings: volume balances in weak form, likelihoods in blocks, and tests of both."""
+"""Estimation of leakage from recordings by volume balances in weak form: likelihoods in blocks of time, and tests."""

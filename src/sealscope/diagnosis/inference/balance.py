@@ -1,4 +1,10 @@
-"""Blocks of a volume balance from the samples of a recording or of a stream, with identical results."""
+"""Blocks of a volume balance from the samples of a recording or of a stream, with identical results.
+
+A block is a few seconds of samples, reduced to Gram matrices of a linear regression (`blocks.Blocks`). Each row of the
+regression is the volume balance (`equations.terms`), integrated with one test function of the weak form
+(`rows.weak_form`). `BlockStream` computes the blocks of a live stream, `recorded_blocks` those of a whole recording,
+for valves that are open or shut while the pump rests (`regimes`).
+"""
 
 from __future__ import annotations
 
@@ -89,7 +95,8 @@ class BlockStream(SavedAttributes):
     offset : float
         Sensor offset [Pa] that is subtracted from p_A - p_B.
     left_signs : tuple of float
-        Sign of each balance's left side, 1 or -1; empty to estimate them from the first blocks.
+        Factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty to estimate
+        the factors from the first blocks.
     on_samples : callable, optional
         Called with the start time [s] and the samples of each block before the block is computed.
     """
@@ -149,8 +156,8 @@ class BlockStream(SavedAttributes):
 
         `samples`: arrays by channel name, NaN where missing, or empty to add none; `last`: true if no samples follow.
         The first `n_first` blocks are returned together, once all of them are complete. A block is complete when it is
-        followed by the samples on which its rows, speeds and rests depend. With `last` true, only the rows count, and
-        fewer than `n_first` blocks suffice.
+        followed by the samples on which its rows, speeds and rests depend. With `last` true, the samples for its rows
+        suffice, and even fewer than `n_first` blocks are returned.
         """
         if samples:
             self._pieces.append(samples)
@@ -187,8 +194,8 @@ class BlockStream(SavedAttributes):
     def state(self) -> dict[str, Any]:
         """Return the state of the stream as plain values for JSON, from which `load_state` continues.
 
-        The state consists of the samples that later blocks need, the values that the first samples determined (absolute
-        minus gauge pressures, signs of the flows), and weighted sums over all blocks.
+        The state contains the samples that later blocks need, the values that the first samples determined (such as
+        signs of the flows and absolute minus gauge pressures), and weighted sums over all blocks.
         """
         return {
             **super().state(),
@@ -328,8 +335,9 @@ class BlockStream(SavedAttributes):
         if self._drops_rests:
             reach = SPAN * self._stride  # length of a test function, on either side of motion [samples]
             is_moving = signals.moving(self._balances[0].left) > 0.0
-            is_far = ~extend_flags(is_moving, 2 * reach + 1)[reach:-reach]
+            is_far = ~extend_flags(is_moving, 2 * reach + 1)[reach:-reach]  # extended to either side
             time_far = np.asarray(is_far[without_margins] * signals.dt)
+            # a row counts if its test function contains no interval far from motion
             is_counted &= weak_form_rows([time_far], self._rate).values[:, 0] == 0.0
         return rows, row_weights, is_counted, mean_flow, pressures
 
@@ -414,11 +422,11 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n,) in which the piston moves for a time although the pump rests.
 
-    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside: the volume
-    that the piston displaces is none of the pump's. A load that sinks by a leak is slower; the piston must move by
-    more than the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion. `pump_volume`, `x_step` (n,):
-    increments of the pump's volume [m^3] and of the position [m], of which the former may be NaN; `rate`: sampling rate
-    [Hz].
+    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside: the oil that
+    the piston displaces does not come from the pump. A load that sinks by a leak is slower, so the piston must be
+    faster than the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, for `MIN_REST` or longer. The
+    flags extend by `AVERAGING_TIME` to either side. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3]
+    and of the position [m], of which the former may be NaN; `rate`: sampling rate [Hz].
     """
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
     is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
@@ -543,8 +551,8 @@ class RecordedBlocks(NamedTuple):
     """Blocks of a recording under both assumptions on the valves while the pump rests (`regimes`).
 
     `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the machine never rests or the
-    balance does not allow this case; `odds`: log odds that valves cut it off. `sign_log_odds` (E,): log odds of each
-    balance that the recorded flow has the right sign; the blocks have the more probable sign.
+    balance does not allow this case; `odds`: log odds that valves cut it off, 0 if `shut` is None. `sign_log_odds`
+    (E,): log odds of each balance that the recorded flow has the right sign; the blocks have the more probable sign.
     """
 
     open: RegimeBlocks
@@ -659,10 +667,14 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
-    If the flow is that of a meter (`q_pump`), it alone decides. Below the fraction `rest.moves` (`priors.toml`) of its
-    mean in motion, the valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is
-    then `NEVER`: the piston never counts as resting. In a balance with terms of its own at rest
-    (`is_separate_at_rest`) the piston alone decides, with the same fraction of its mean speed, and short stops count.
+    Both are those of `max_rest_rate`, with two exceptions:
+
+    - In a balance with terms of its own at rest (`is_separate_at_rest`) the piston alone decides, with the fraction
+      `rest.moves` (`priors.toml`) of its mean speed in motion, and short stops count.
+    - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
+      valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is then `NEVER`: the
+      piston never counts as resting.
+
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
     pump or of the meter.
     """

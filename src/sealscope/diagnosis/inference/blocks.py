@@ -169,7 +169,7 @@ class Blocks:
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
-        """Estimate the root mean square (rms) of the pressure that drives the flow of a leak or another `term` [Pa].
+        """Estimate the root mean square (rms) [Pa] of the pressure that drives the flow of a leak or another `term`.
 
         This pressure is p_B, for example, for a leak out of side B. `term`: name of the term; `names`: names of the
         columns of `gram`. The result is
@@ -248,10 +248,10 @@ class ColumnRoles:
     def level_deviations(self, total: Array) -> Array:
         """Compute the prior standard deviations (m - 1,) of the constant parts of all coefficients.
 
-        Those of a pump's flow offset and of the delay of the position depend on the recording: a pump that always moves
-        the piston at one speed and pressure determines neither beside the piston's area. The offset is `level.bias`
-        (`priors.toml`) times the rms flow, and the delay is at most some `level.lag`. `total` (m, m): Gram matrix of
-        the recording.
+        They are those of `level_deviation`, with two exceptions: a piston that always moves at one speed and pressure
+        does not separate a pump's flow offset, or the delay of the position, from its area. The deviation of the flow
+        offset is therefore `level.bias` (`priors.toml`) times the rms flow, that of the delay's term `level.lag` [s]
+        times the area. `total` (m, m): Gram matrix of the recording.
         """
         deviations, energies = self.level_deviation.copy(), np.diag(total)
         piston = [k for k in self.motion if self.names[k].startswith("motion")]
@@ -318,10 +318,11 @@ class ColumnRoles:
     def offset_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
 
-        The error is in Pa for a laminar leak, in Pa^0.5 for an orifice, and 0 if no pressure drives the column's term.
-        It also counts as 0 in an equation without flow offset, since the column of the flow offset is needed to remove
-        the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the mean of
-        abs(p_A - p_B) over `blocks`: pressures recorded in counts are much smaller numbers.
+        The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice, and
+        0 if no pressure drives the column's term. It also counts as 0 in an equation without flow offset, since the
+        column of the flow offset is needed to remove the error (`_shift_offset`). The prior standard deviation of the
+        sensor's offset [Pa] is limited to the mean of abs(p_A - p_B) over `blocks`: pressures recorded in counts are
+        much smaller numbers.
         """
         # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
         driver = self.drivers[column] if column < self.left and self.bias is not None else ""
@@ -405,8 +406,9 @@ def information(
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
     For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
-    The likelihoods of the equations are multiplied. `test`: index of the coefficient's column, or of the left side for
-    a change of the left side's scale; `left_out`: another column to omit.
+    The likelihoods of the equations are multiplied. `columns`: roles of the columns of each equation; `test`: index of
+    the coefficient's column; `left_out`: another column to omit; `with_expansion`: add the errors of the coefficient by
+    an imperfect model of the oil's expansion (`_expansion_errors`).
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
@@ -415,7 +417,7 @@ def information(
     The nuisance columns are those of the other coefficients. N is the diagonal matrix of the tested column's sums of
     squares in each block, n contains its products with the left side, and C those with the nuisance columns. G is the
     Gram matrix of the nuisance columns and b their products with the left side. P / s^2 is the prior precision of their
-    coefficients, and mu the prior mean. `with_expansion` adds the errors of the oil's expansion (`_expansion_errors`).
+    coefficients, and mu the prior mean.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
@@ -518,7 +520,7 @@ def _build_normal_equations(
 
 
 class _Prior(NamedTuple):
-    """Prior standard deviations of c nuisance coefficients: of their constant parts, `level`, and of their drifts.
+    """Prior standard deviations of c nuisance coefficients: `level` of their constant parts and `drift`, (c,) each.
 
     The last coefficient is the error [Pa] that remains of the sensor offset of p_A - p_B. The prior standard deviation
     of the whole offset is `offset` [Pa]. `current_offset` [Pa] is already subtracted, so that the remaining error has
@@ -570,7 +572,7 @@ class _EquationFit(NamedTuple):
 
     - `nuisance`: indices of the nuisance columns; `polynomials` (K, n): those of their drifts;
     - `normal`: normal equations after subtracting `offset` [Pa], which is relative to the one already removed;
-    - `coefficients` (c,): n for each nuisance column, the constant first, and last for the offset's error;
+    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the offset's error [Pa];
     - `prior_precision` (c,): prior precision times `variance`; `prior_moment` (c,): its product with the prior mean;
     - `variance`: variance of a row's residual, inflated for overlapping rows.
     """

@@ -1,15 +1,16 @@
 """Test whether a quantity of a recording differs from its values in healthy recordings, whose scatter is unknown.
 
 *Without a prior on the scatter* (`compare_with_healthy`): n healthy values are normal about an unknown mean with an
-unknown standard deviation, at least the error e of a single value (Jeffreys prior). With their mean and standard
-deviation s, the next value y then follows Student's t with n - 1 degrees of freedom,
+unknown standard deviation (Jeffreys prior). With their mean and standard deviation s, the next value y then follows
+Student's t with n - 1 degrees of freedom. The standard error e of a single value is added, since values may agree by
+chance:
 
     t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
 
 Five values that agree to a thousandth thus show that a sixth differs by a few thousandths; two show next to nothing.
 
-*With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean
-mu by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
+*With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean mu
+by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
 recordings whose scatter is s_0. The errors may be too small or too large by a factor k, which is 1 or has a log-uniform
 prior. With k > 1, imprecise values such as those of a day with few strokes may differ by more; with k < 1, the errors
 also contain what all recordings of the machine have in common. On a grid of s and k, with the weights
@@ -73,12 +74,12 @@ def compare_with_healthy(
 ) -> Observable | None:
     """Test a value by Student's t for a difference from the values of healthy recordings.
 
-    - `name`, `data`: name of the quantity and its kind of data, for the result;
+    - `name`, `data`: name of the quantity and its kind of data, for the result (`Observable`);
     - `error`: standard error of a single value;
     - `above`: count only a value above the healthy ones;
-    - `prior_change`: standard deviation of a true change, infinite if unknown. If it is known, the p-value is at least
-      the inverse of the Bayes factor of such a change to no change. It is 1 if such a change explains the value no
-      better than scatter does.
+    - `prior_change`: standard deviation of a true change, infinite if unknown. With the Bayes factor B of such a change
+      to no change, the p-value is at least 1/B, and 1 if B < 1: a true change then explains the value no better than
+      scatter does.
 
     The observable's size is the difference from the healthy mean, its score the square of t (with `above`, 0 for a
     value below the mean), and its chance the p-value. Return None for fewer than `MIN_HEALTHY` healthy recordings, or

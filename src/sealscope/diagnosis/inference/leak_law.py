@@ -9,6 +9,9 @@ A rise g, i.e. the conductance above that of the healthy recordings, is the regr
 p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
 coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. The
 flow of a leak that began within the recording follows in `volumes/leak_flow.py`.
+
+The arguments `blocks` and `columns` are Gram matrices of the volume balance in K blocks of the recording, and for each
+equation the roles of their columns (`blocks.ColumnRoles`).
 """
 
 from __future__ import annotations
@@ -65,9 +68,9 @@ def law_flows(blocks: Blocks) -> dict[float, Array]:
 
 
 def law_priors() -> Array:
-    """Return the prior probability of each exponent in `EXPONENTS`, the power of |p_A - p_B| that a leak follows.
+    """Return the prior probability of each leak law, i.e. of each exponent in `EXPONENTS`, shape (3,).
 
-    Laminar flow has the probability `size.laminar` (`priors.toml`); the other exponents are equally probable.
+    Laminar flow (e = 1) has the probability `size.laminar` (`priors.toml`); the other exponents are equally probable.
     """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
@@ -75,12 +78,12 @@ def law_priors() -> Array:
 
 
 def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
-    """Return `leak`, the likelihood of the conductance, with a prior for a turbulent part of the healthy leakage.
+    """Add a prior for a turbulent part of the healthy leakage to `leak`, the likelihood of the conductance in K blocks.
 
-    This part flows as through an orifice, so that it adds an unknown constant times `shape` (K,) to the conductance in
-    K blocks. `shape` is the apparent conductance of an orifice (`apparent_conductances`), scaled to the mean 1. The
-    prior standard deviation of the constant is the fraction `healthy.turbulent` (`priors.toml`) of the mean leakage.
-    `leak` is returned unchanged if the blocks contain no information on it.
+    This part flows as through an orifice, so that it adds an unknown constant times `shape` (K,) to the conductance.
+    `shape` is the apparent conductance of an orifice (`apparent_conductances`), scaled to the mean 1. The prior
+    standard deviation of the constant, `Information.disturbance`, is the fraction `healthy.turbulent` (`priors.toml`)
+    of the mean conductance. `leak` is returned unchanged if the blocks contain no information on the conductance.
     """
     shape = apparent_conductances(blocks, columns)[0.5]
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
@@ -96,10 +99,10 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
     A step is tested for each exponent of `EXPONENTS`. The p-value (`chance`) of each test is divided by the prior
-    probability of the exponent, and the test with the smallest quotient is returned. With an exponent other than 1 the
-    apparent conductance varies with the pressure; its mean over the blocks, weighted by their information, changes by
-    the size of the step. `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of
-    the leak's coefficient in the blocks. Return None if too few blocks determine this coefficient.
+    probability of the exponent, and the test with the smallest quotient is returned. For an exponent other than 1 the
+    step of the apparent conductance varies with the pressure; the size of the step is then its mean over the blocks,
+    weighted by their information. `leak`: likelihood of the leak's coefficient in the blocks. Return None if too few
+    blocks determine this coefficient.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -113,11 +116,11 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
 
 
 def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
-    """Compute the log likelihood ratio of a leak older than the recording, from changes of the leakage within it.
+    """Compute the log likelihood ratio of a leak older than the recording to no leak, for each exponent of `EXPONENTS`.
 
-    Unless the flow of such a leak is laminar, its apparent conductance changes with the pressure. The result has, for
-    each exponent of `EXPONENTS`, the log likelihood ratio of an older leak to none (`constant_log_ratio`). `leak`:
-    likelihood of the leak's coefficient in the blocks.
+    Only changes of the leakage within the recording count (`constant_log_ratio`): unless the flow of an older leak is
+    laminar, its apparent conductance changes with the pressure. `leak`: likelihood of the leak's coefficient in the
+    blocks.
     """
     shapes = apparent_conductances(blocks, columns)
     return np.array(
@@ -161,9 +164,9 @@ def estimate_older_flow(
     rise over healthy recordings (`rise_flows`) and, for e < 1, also from its curvature over pressure (`bend_flows` of
     `estimate_bend_flows`); the two are averaged with their precisions as weights.
 
-    The weight of an exponent in the result is its prior probability. For e < 1 it is multiplied by the probability
-    density of the difference between the two flows, and by the largest likelihood ratio in `log_ratios` (those of
-    `older_log_ratios`).
+    The weight of an exponent in the result is its prior probability. For e < 1 it is multiplied by exp(-d^2 / (2 v)),
+    where d is the difference between the two flows and v its variance, and by the largest likelihood ratio in
+    `log_ratios` (those of `older_log_ratios`).
     """
     log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
     weights, flows = list[float](), list[Estimate]()

@@ -45,8 +45,8 @@ class Observable:
     log_ratio_to_leak : float, optional
         Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
     pressure_scale : Estimate, optional
-        Logarithm of the factor by which both pressures would have to be scaled to cause this change by itself; None if
-        it is unknown, or if none would.
+        Logarithm of a factor on both recorded pressures that would cause this change without a change of the machine;
+        None if it is unknown, or if no factor would.
     """
 
     name: str

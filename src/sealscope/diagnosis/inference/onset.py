@@ -65,7 +65,7 @@ UPPER_95 = round(NormalDist().inv_cdf(BOUND_PROBABILITY), 3)
 MIN_BLOCKS = 5
 #: Number of possible onsets per block, and number of blocks at either end of a recording without a possible onset.
 PARTS, EDGE = 5, 2
-#: Grid of the variance q of the random walk over the variance of the noise, from 0 (no walk).
+#: Grid of the variance q of the random walk, in units of `_Whitening.unit`, from 0 (no walk).
 WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
 #: Log likelihood by which an allowed walk may be less likely than the best one: 99.7 % of chi square(1).
 ALLOWED = 4.5
@@ -143,7 +143,7 @@ class StepTest:
     fitted : Estimate
         Step at the best onset and its standard error, with the walk's variance as fitted together with it.
     walk, noise : tuple of two floats
-        Variance q of the walk and variance kappa of the noise, each without a step and with the best one.
+        Variance q of the walk over that of the noise, and the latter, kappa, each without a step and with the best one.
     law : NullLaw
         Distribution of the score under the null.
     sign : float
@@ -344,12 +344,12 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
 
 
 def constant_log_ratio(information: Information, shape: Array) -> float:
-    """Compute the log likelihood ratio of a leak older than the recording, from a coefficient's changes within it.
+    """Compute the log likelihood ratio of an older leak to no leak, from a coefficient's changes within the recording.
 
-    Such a leak adds to the coefficient a constant times `shape` (K,), its apparent coefficient in each block. `shape`
-    varies with the pressure unless the flow is laminar. The result is the log likelihood ratio of the best positive
-    constant to no such leak, each with the random walk that fits best. It is at least 0, and 0 if `shape` hardly
-    varies or too few blocks have information.
+    A leak that is older than the recording adds to the coefficient a constant times `shape` (K,), its apparent
+    coefficient in each block. `shape` varies with the pressure unless the flow is laminar. The result is the log
+    likelihood ratio of the best positive constant to no constant, each with the random walk that fits best. It is at
+    least 0, and 0 if `shape` hardly varies or too few blocks have information.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
@@ -399,9 +399,9 @@ def step_sizes(
 class _StepFits(NamedTuple):
     """Least-squares fits of a step up to whitened values z (n,), for each of o onsets and w variances of the walk.
 
-    The variances are those of `WALKS`. `weight` (w, n): variance of the noise over that of each z; `total` (w,):
-    weighted sum of squares of z; `moments`, `energies` (w, o): products of the steps with z and themselves;
-    `residual_squares` (w, o): sum of squares that remains after the fit.
+    The variances are those of `WALKS`. `weight` (w, n): variance of the noise over that of each z. Sums with these
+    weights: `total` (w,): squares of z; `moments`, `energies` (w, o): products of the steps with z and with themselves;
+    `residual_squares` (w, o): squares that remain after the fit.
     """
 
     weight: Array

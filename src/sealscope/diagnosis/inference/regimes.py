@@ -49,9 +49,11 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
     - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
       (`BIAS`), as in `balances.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
       load, remains if some hold lasts for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set
-      to zero. If all holds are short and the pump is off at other times, the machine is a press whose pump builds up
-      the pressure through open valves. If its valves are certainly shut at rest (`is_certain`), its holds count as
-      motion: the column `HOLDING` is added to the column `TURNING` before it is set to zero.
+      to zero.
+
+    If all holds are short and the pump is off at other times, the machine is a press, whose pump builds up the pressure
+    through open valves in these holds. If its valves are certainly shut at rest (`is_certain`), holds count as motion:
+    the column `HOLDING` is added to the column `TURNING` before it is set to zero.
     """
     names = (*roles.names, "left")  # the last column is the left side of the balance
     if not shut:
@@ -145,7 +147,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     rest_variance = float(rest_covariance[0, 0] + INFERENCE.rest.compliance**2 * (by_compliance @ by_compliance))
     rest_variance += float(sensitivity @ covariance[np.ix_(shared, shared)] @ sensitivity)
     motion_variance = float(covariance[np.ix_(in_motion, in_motion)].sum())
-    common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))
+    common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))  # covariance of r and g
     motion = float(coefficients[in_motion].sum())
     difference_variance = rest_variance + motion_variance - 2.0 * common
     if not (rest_variance > 0.0 and difference_variance > 0.0):
@@ -161,8 +163,8 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
         log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
 
     `rest_variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
-    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances [m^3/(s
-    Pa)], or all are flows [m^3/s]. The result is limited to +-`rest.most`.
+    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
+    [m^3/(s Pa)], or all are flows [m^3/s]. The result is limited to +-`rest.most`.
     """
     prior = INFERENCE.rest
     if_shut = normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)

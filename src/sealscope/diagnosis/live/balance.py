@@ -127,9 +127,9 @@ def _estimate_leak(
     `gram` (m, m) are the products of all m columns, summed over the `n_equations` equations of the block, and
     `column_order` (n + 2,) the indices of the columns to use: n terms other than the leak (nuisances), the leak, the
     left side. With `updates_model`, the block is added to the sums in `model`, from which the nuisances' coefficients
-    are computed. Returns (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from
-    g to keep the series of estimates continuous while the nuisances' coefficients still change, and the variance V of g
-    due to errors of the nuisances. Shift and last coefficients in `model` are updated in any case.
+    are computed. Returns (w, w g, w s, w^2 V): g is the estimate, and w its precision. The shift s, to be subtracted
+    from g, keeps the series of estimates continuous while the nuisances' coefficients still change. V is the variance
+    of g due to errors of the nuisances. Shift and last coefficients in `model` are updated in any case.
     """
     load_block(model, gram, column_order)
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
@@ -316,7 +316,7 @@ class LiveBalance(SavedAttributes):
         return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop the coefficients, and learn new ones from stored or future blocks that begin at `since` [s] or later."""
+        """Drop the coefficients, and learn new ones from stored and later blocks that begin at `since` [s] or later."""
         for model in self._models:
             for values in model:
                 values[:] = 0.0

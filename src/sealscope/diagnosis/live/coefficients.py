@@ -214,8 +214,8 @@ def estimate_leak(model: Any, rows: float, is_learned: bool) -> tuple[float, flo
 
     `model` is a `Coefficients`, whose `block` holds the products of the block's columns, and `rows` is the block's
     number of equations. With `is_learned`, the block is also added to the sums over earlier blocks in `model`. Returns
-    (w, w g, w s, w^2 V) with the estimate g, its precision w, the shift s that is subtracted from g to keep the series
-    continuous while the other coefficients (nuisances) improve, and the variance V of g due to errors of the nuisances.
+    (w, w g, w s, w^2 V): g is the estimate, and w its precision. The shift s, to be subtracted from g, keeps the series
+    continuous while the other coefficients (nuisances) improve. V is the variance of g due to errors of the nuisances.
     """
     block, n, numbers = model.block, len(model.matrix), model.numbers
     # C: normal matrix of the n nuisances c; b: products of the leak's column (index n) with theirs in this block; b_u:

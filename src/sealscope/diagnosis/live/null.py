@@ -2,8 +2,8 @@
 
 The detector of steps (`sequential`) assumes that a healthy conductance follows a random walk. Starts after a rest, oil
 that warms and other duties depart from it, and raise the evidence M of a step. While the baseline is learned, the
-largest M of each `WINDOW` blocks is therefore stored, as the statistics of healthy recordings are, and the same
-posterior of an inflation (`decision.null`) turns them into the chance that M rises as high once more.
+largest M of each `WINDOW` blocks is therefore stored. As for healthy recordings, the posterior of an inflation
+(`decision.null`) turns these values into the chance that M rises as high once more.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _LOG_WINDOW = math.log(WINDOW)
 class StepNull(SavedAttributes):
     """Largest evidence of a step in each window of a healthy machine, and the threshold of the alarm that follows.
 
-    In a window, P(max M > A) <= `WINDOW` / A if the random walk is right, so that the surprisal of a window is
-    u = log max M - log `WINDOW`, or 0 if that is negative.
+    If the random walk is right, P(max M > A) <= `WINDOW` / A in a window. The surprisal of a window is therefore u =
+    log max M - log `WINDOW`, or 0 if that is negative.
     """
 
     SAVED = ("_count", "_surprisal", "_highest", "_blocks")
@@ -35,9 +35,9 @@ class StepNull(SavedAttributes):
         self._highest, self._blocks = 0.0, 0  # largest log M and number of blocks in the present window
 
     def add(self, log_e: float) -> None:
-        """Add `log_e`, the log M of the evidence M of a step, after a block of a healthy machine.
+        """Add log M (`log_e`), the evidence of a step after a block of a healthy machine.
 
-        When `WINDOW` blocks are complete, the largest value is added as a window (`add_window`).
+        When `WINDOW` blocks are complete, the largest log M is added as a window (`add_window`).
         """
         self._highest = max(self._highest, log_e)
         self._blocks += 1
@@ -53,9 +53,8 @@ class StepNull(SavedAttributes):
     def log_threshold(self, probability: float) -> float:
         """Compute the threshold of log M, the log e-value of a step, for a false-alarm `probability` per block.
 
-        With at least `_MIN_WINDOWS` windows of healthy blocks, it is fitted to the log e-values that these show, as a
-        window of `WINDOW` blocks has `WINDOW` times this probability. It is at least -log(probability), its value for
-        fewer windows.
+        With `_MIN_WINDOWS` windows or more it follows from their surprisals by `HealthyNull`, for the probability of a
+        window: `WINDOW` times `probability`. It is at least -log(probability), which is the result for fewer windows.
         """
         return _find_threshold(self._count, self._surprisal, probability)
 
@@ -68,6 +67,6 @@ def _find_threshold(count: int, surprisal: float, probability: float) -> float:
     """
     if count < _MIN_WINDOWS:
         return -math.log(probability)
-    null = HealthyNull({STEP: [surprisal / count] * count})
+    null = HealthyNull({STEP: [surprisal / count] * count})  # of the surprisals, only sum and number matter
     chance = null.uncalibrated_chance(STEP, min(WINDOW * probability, 0.5))
     return max(_LOG_WINDOW - math.log(chance), -math.log(probability))

@@ -147,7 +147,7 @@ class Watch:
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
         """Settings with which the baseline is learned.
 
-        These are the rig, the methods with a flag that is True if they state L/min, and the time to learn [h].
+        These are the rig, a flag for each method that is True if it states L/min, and the time to learn [h].
         """
         return self._rig, self._litres, self.learn_hours
 
@@ -194,8 +194,9 @@ class Watch:
         """Convert the detected `leak` to a LeakMeasure, from which `decide_on_stream` decides the verdict.
 
         If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
-        the 95 % upper bound of an undetected leak. The flow per conductance is the mean pressure of a laminar leak; the
-        flow factors are the least and the largest flow over that. `estimator` states the uncertainty of flows.
+        the 95 % upper bound of an undetected leak. Flows are those of a laminar leak, conductance times mean pressure;
+        `flow_factors` are the ratios of the smallest and the largest possible flow to these. `estimator` states the
+        uncertainty of flows.
         """
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
@@ -491,8 +492,9 @@ class Watch:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance up to `block`.
 
         `reason` is the text of the alarm, and `threshold` the test's threshold. `before` is the conductance before the
-        onset, by default its mean over the last blocks before the onset, at most `GROUP`. `cause` is by default the
-        estimator's. An earlier alarm keeps its time and its conductance before the onset.
+        onset: by default its mean over the last blocks before the onset, at most `GROUP`, or that of `block` less the
+        rise if none is stored. `cause` is by default the estimator's. An earlier alarm keeps its time and its
+        conductance before the onset.
         """
         raised_s = block.end
         if self.leak is not None:

@@ -4,29 +4,30 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class FalseAlarmPriors(PriorTable):
-    """Probability of the verdict "leak" on a leak-free recording."""
+    """Allowed probability of the verdict "leak" on a leak-free recording."""
 
-    probability: float  # default value
-    # limits of the values that a caller may choose
+    probability: float  # default
+    # limits for a caller; smaller p-values than `rarest` are not stated
     rarest: float
     largest: float
 
 
 class NullPriors(PriorTable):
-    """Prior on the error of the p-values that a detector states for the scores of healthy recordings.
+    """Prior on the error of the p-values that a detector states for healthy recordings (`decision.null`).
 
-    If they are wrong, their mean surprisal, -log(p-value), is larger than 1 by a factor.
+    Wrong p-values are too small: their mean surprisal, -log(p-value), is 1 times an inflation factor > 1.
     """
 
-    fails: float  # fraction of machines on which the p-values of a statistic are wrong
-    inflation: float  # exponential scale of the logarithm of the factor
+    fails: float  # fraction of machines on which the p-values of a test are wrong
+    inflation: float  # scale of the exponential prior on the logarithm of the factor
     largest: float  # largest factor
 
 
 class QuestionPriors(PriorTable):
     """Division of the false-alarm probability of a diagnosis among its tests."""
 
-    # fraction for the test within the recording; without healthy recordings, for that by the limit in the rig's file
+    # fraction of the test for a change within the recording if there are healthy recordings, and without these of the
+    # test by the limit in the rig's file
     within: float
 
 
@@ -34,12 +35,12 @@ class ExplanationPriors(PriorTable):
     """Thresholds on the probability of an explanation, above which a verdict states it, and errors of explanations."""
 
     heading: float  # allowed probability of naming another event by mistake, over that of a false leak
-    leak: float  # probability from which a change is called a leak
-    named: float  # probability, among all causes of the change, from which a cause other than a leak is named
-    happened: float  # as `named`, where the change may also be pure chance
-    sure: float  # a leak is excluded if its probability is below 1 - `sure`
+    leak: float  # probability above which a change is called a leak
+    named: float  # probability, among all causes of the change, above which a cause other than a leak is named
+    happened: float  # the same if the change may also be pure chance; both limits must be exceeded
+    sure: float  # a leak, or another event, is excluded if its probability is below 1 - `sure`
     combined: float  # smallest logarithm of the Bayes factor with which an event is combined with others
-    misfit: float  # smallest relative error with which a term of the model is assumed to describe the data
+    misfit: float  # relative error with which a term of the model describes the data, by which evidence is limited
     scale: float  # relative error of a common factor on both pressures, as computed from leakage, friction or noise
 
 

@@ -21,7 +21,7 @@ class DifferencePriors(DriftPriors):
 
     The fields have no unit. They are those of `DriftPriors` and another one.
 
-    - `speed`: flow that the pump loses in proportion to its speed.
+    - `speed`: flow that the pump loses in proportion to its speed, a term of this comparison only.
     """
 
     speed: float
@@ -37,25 +37,25 @@ class LevelPriors(PriorTable):
 
 
 class BlockPriors(PriorTable):
-    """Division of a recording into blocks, and the lowest sampling rate [Hz] at which it is divided."""
+    """Division of a recording into blocks."""
 
     # [s] limits of a block's length
     longest: float
     shortest: float
-    slowest: float  # lowest sampling rate
+    slowest: float  # [Hz] lowest sampling rate of a recording that is judged
     blocks: int  # number of blocks of a recording, unless their length would be outside these limits
     coarse: int  # largest number of blocks in tests for changes other than leaks
     expansion: float  # relative error of the volume by which oil and air expand within a block
 
 
 class ScatterPriors(PriorTable):
-    """Scatter of the leakage between recordings of one machine, divided by the pump's mean flow."""
+    """Scatter of the leakage between recordings of one machine; leakages are divided by the pump's mean flow."""
 
     between: float  # factor by which all standard deviations of `DifferencePriors` together may be wrong
-    freedom: float  # degrees of freedom of the prior on the scatter of the motion's coefficients
+    freedom: float  # degrees of freedom of the prior on the scatter of conductances (`student_rise`)
     estimate: float  # smallest scatter, over the standard error that a recording states for its leakage
     finest: float  # smallest scatter of the leakage
-    leak: float  # standard deviation of the leakage between recordings
+    leak: float  # usual scatter of the leakage, a standard deviation
     largest: float  # largest scatter of the leakage
     relative: float  # largest scatter of the leakage's logarithm
     unlike: float  # fraction of days whose unrecorded oil temperature is unlike that of all others
@@ -64,10 +64,11 @@ class ScatterPriors(PriorTable):
 
 
 class ConditionPriors(PriorTable):
-    """Effect of operating conditions (load, speed, oil in K) that differ from those of the healthy recordings."""
+    """Effect of operating conditions (load, speed, oil temperature) that differ from those of healthy recordings."""
 
-    ratio: float  # logarithm of load or speed over those of the healthy days, a standard deviation
-    oil: float  # change of the oil temperature within a day
+    # a condition is unusual if it lies outside the range of the healthy recordings by more than this
+    ratio: float  # logarithm of the ratio of loads, or of speeds
+    oil: float  # [K] difference of the oil temperatures
     motion: float  # exponent of load and speed in the ratio of displaced to pumped volume, a standard deviation
     leak: float  # exponent of load and speed in a leak's conductance, a standard deviation
 
@@ -87,7 +88,7 @@ class OilPriors(PriorTable):
     friction_session: float
     friction_changes: float
     drop_tells: float  # probability that a change of the viscous drop is due to the oil, not to load and speed
-    drop_misleads: float  # probability that something other than the oil changed the drop of the judged recording alone
+    drop_misleads: float  # probability that something else, such as worn seals, changed the judged recording's drop
 
 
 class SizePriors(PriorTable):
@@ -98,17 +99,17 @@ class SizePriors(PriorTable):
     laminar: float  # prior probability of a laminar leak
     usual: float  # scale of the prior on the flow of a leak, over the pump's flow
     present: float  # prior probability that there is a leak in a recording
-    readings: int  # number of independent values by which a recording tells the leak's law
+    readings: int  # number of independent residuals by which a recording tells the leak's law
     meter: float  # scale of a flow meter
     area: float  # piston area
-    creep: float  # flow of a leak by which a held load creeps
+    creep: float  # flow of a leak, estimated from the creep of a held load
 
 
 class RepeatPriors(PriorTable):
-    """Differences of the flow that the same motion needs on another day, as relative standard deviations."""
+    """Relative differences, between days, of the flow that the same motion needs."""
 
-    scatter: float  # scatter between days
-    recordings: float  # the prior on the scatter weighs as much as this number of recordings
+    scatter: float  # standard deviation between days
+    recordings: float  # the prior on this scatter weighs as much as this number of recordings
     inflation: float  # largest factor by which the standard errors of the recordings may be too small
 
 
@@ -134,18 +135,19 @@ class StepSize(PriorTable):
 
 
 class SensePriors(PriorTable):
-    """Probabilities that a sign of the recorded flow looks wrong for another reason than wrong wiring."""
+    """Probabilities of causes by which the sign of a recorded flow looks wrong, or has become wrong."""
 
+    # the sign looks wrong for another reason:
     work: float  # the load gives back more work than it takes
-    leak: float  # offsets of sensors, compressed oil and losses of the pump look like a negative leak
+    leak: float  # offsets of sensors, compressed oil or losses of the pump look like a negative leak
     sides: float  # the sides A and B are exchanged in the log
-    rewired: float  # a recording has another sign than the healthy recordings before it
+    rewired: float  # the sign is wrong, as the sensor was reversed since the healthy recordings
 
 
 class HeldOilPriors(PriorTable):
-    """Holds, i.e. times in which shut valves enclose the oil in both sides of a cylinder (in Pa and 1/Pa)."""
+    """Holds, i.e. times in which shut valves enclose the oil in both sides of a cylinder."""
 
-    # relative compression per pressure, and the standard deviation of its logarithm
+    # [1/Pa] relative compression per pressure, and the standard deviation of its logarithm
     compressibility: float
     deviation: float
     # dead volume over the recorded stroke's volume: usual value, smallest value, relative standard deviation
@@ -155,12 +157,12 @@ class HeldOilPriors(PriorTable):
     # logarithm of the piston areas' ratio, high pressure side over the other; its standard deviation
     sides: float
     sides_deviation: float
-    sides_told: float  # probability that the pressures tell which side carries, whatever the offsets of the sensors
+    sides_told: float  # probability that the pressures tell which side carries the load, despite offsets of the sensors
     unlike: float  # largest plausible ratio of the two piston areas
-    right: float  # probability that the holds are right about a leak's flow if they disagree with the whole recording
+    right: float  # probability that the holds state the right flow of a leak if the whole recording states another
     scatter: float  # relative standard deviation of a leak's flow in holds, beyond the errors of its fit
-    agrees: float  # standard deviation of the logarithm of the ratio of the conductances from holds and whole recording
-    rare: float  # p-value of a rise of the leakage in the holds, below which they give the flow of the leak
+    agrees: float  # ratio of the conductances from holds and whole recording, the standard deviation of its logarithm
+    rare: float  # p-value below which a rise of the leakage in the holds counts for the flow of the leak
     settles: float  # [s] time in which valves shut
     before: float  # [s] time before a hold in which the flow shows the leakage of the pump
     pump_session: float  # relative standard deviation of this leakage between sessions with the same oil
@@ -171,11 +173,11 @@ class HeldOilPriors(PriorTable):
     misfit: float  # fraction of the compressed volume that this model of the oil does not describe
     from_start: float  # fraction of the leaks that exist from the start of a recording
     gain: float  # relative difference between the gains of two pressure sensors
-    charge: float  # relative margin above the charge pressure from which no check valve feeds a side
-    tank: float  # standard deviation of the gauge pressure in a line to the tank
+    charge: float  # above the charge pressure by this fraction of it and `resolved`, no check valve feeds a side
+    tank: float  # [Pa] gauge pressure in a line to the tank, a standard deviation
     open: float  # probability that the side without the load is open to the charge line
     above: float  # usual fraction of a hold in which an open side is above the charge pressure
-    resolved: float  # further margin, within which a sensor cannot tell a pressure from the charge pressure
+    resolved: float  # [Pa] difference of pressures that a sensor hardly resolves
     steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
     # volume fraction of free air in the oil, and the standard deviation of its logarithm
     air: float
@@ -192,28 +194,28 @@ class ZeroPriors(PriorTable):
     """Error of p_A - p_B [Pa] at equal pressures, which the zeros of both pressure sensors cause together."""
 
     pressure: float  # standard deviation of the error of two usual sensors
-    far: float  # standard deviation of the error if the sensors are far off
-    odds: float  # probability that they are far off
+    far: float  # standard deviation of the error of two sensors that are far off
+    odds: float  # probability that two sensors are far off
 
 
 class HealthyPriors(PriorTable):
-    """Standard deviations of the leakage conductances of a healthy machine, in m^3/(s Pa) or as a fraction."""
+    """Standard deviations of the leakage of a healthy machine."""
 
-    outside: float  # leakage to the outside
-    piston: float  # leakage past the piston
-    turbulent: float  # part of the leakage that flows as through an orifice, as a fraction
+    outside: float  # [m^3/(s Pa)] conductance to the outside
+    piston: float  # [m^3/(s Pa)] conductance past the piston
+    turbulent: float  # fraction of the leakage that flows as through an orifice
 
 
 class HeldPriors(PriorTable):
-    """A piston without a recorded position, which a control loop holds or returns: times in s, speeds in m/s."""
+    """A piston without a recorded position, which a control loop holds or returns."""
 
-    half: float  # half the width of a test function (weight of samples in one equation) of a held piston
-    settles: float  # time in which pressures settle after a motion
+    half: float  # [s] half the width of a test function (weight of samples in one equation) of a held piston
+    settles: float  # [s] time in which pressures settle after a motion
     slow: float  # largest speed of a held piston over its highest speed
-    averaged: float  # time over which the speed is averaged
+    averaged: float  # [s] time over which the speed is averaged
     share: float  # smallest leakage of a pump over its mean flow
     elsewhere: float  # fraction of a test function's weight in which noise may change the sign of p_A - p_B
-    creep: float  # largest speed of a load that shut valves hold
+    creep: float  # [m/s] largest speed of a load that shut valves hold
 
 
 class RestPriors(PriorTable):
@@ -221,18 +223,20 @@ class RestPriors(PriorTable):
 
     averaged: float  # [s] time over which the flow is averaged
     least: float  # [s] shortest rest
-    share: float  # largest averaged flow at rest
+    share: float  # largest flow at rest, averaged over `averaged`
     lasting: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
     holding: float  # mean flow of a pump that holds a load
-    moves: float  # smallest mean flow of the pump in a block that counts as motion, and smallest flow by a flow meter
+    # smallest mean flow of a block in motion; also the largest flow of a meter, or speed over the mean speed, at rest
+    moves: float
     lowers: float  # smallest speed, over the mean speed, of a load that a valve lowers while the pump rests
     shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
     open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
     compliance: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation
-    valves: float  # log odds, before any recording, that valves cut the pump off
-    most: float  # limit of the log odds, from a healthy recording, that valves cut the pump off
-    alone: float  # the same limit for a judged recording
-    locked: float  # mean log odds of healthy recordings from which valves surely hold the pressures
+    # log odds that valves cut the pump off
+    valves: float  # before any recording
+    most: float  # limit of the log odds that the rests of a recording give
+    alone: float  # narrower limit, for the judged recording alone and in sums over healthy recordings
+    locked: float  # mean over the healthy recordings above which the valves surely hold the pressures
 
 
 class InferencePriors(PriorTable):

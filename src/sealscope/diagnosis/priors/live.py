@@ -6,7 +6,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class SampleClock(PriorTable):
     """Clock of the samples of a running machine."""
 
-    # limits of the time between successive samples over the interval; nearer: a copy, farther: a gap
+    # (low, high): time between successive samples, over the sampling interval; below it is a copy, above it a gap
     follows: tuple[float, ...]
     rate: float  # relative error of a stated sampling rate
 
@@ -16,7 +16,7 @@ class LiveBlocks(PriorTable):
 
     seconds: float  # [s] length of a block
     learned: int  # number of blocks before the first estimate
-    tells: float  # smallest precision, over a usual block's, with which a block at standstill is used
+    tells: float  # smallest precision of a block at standstill that is used, over that of a usual block
     standstill: float  # a machine stands still if the mean square of its motion is below this fraction of the usual one
     wakes: int  # the machine is learned anew after this number of blocks with far more motion than ever before
 
@@ -50,9 +50,9 @@ class WatchPriors(PriorTable):
     """Comparison of the blocks of a running machine with its baseline."""
 
     pause: float  # [s] longest pause across which blocks are compared
-    margin: float  # logarithm by which pressure and flow may lie outside the range of the baseline
-    damped: float  # logarithm by which a leak may lower the pressure difference
-    inside: float  # smallest fraction of a leak, as estimated from the pressures, that flows past the piston
+    margin: float  # pressure and flow may exceed the range of the baseline by this logarithm
+    damped: float  # the pressure may fall below the range by this logarithm, as a leak lowers it
+    inside: float  # smallest part of a leak that flows past the piston, over its flow as estimated from the pressures
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
     step: float  # fraction of the false alarms for the test for a step
@@ -78,7 +78,7 @@ class RiseExplanationPriors(PriorTable):
 
 
 class LiveResponse(PriorTable):
-    """Fit of a model of the pressure response to the blocks of a running machine; times are in blocks or s."""
+    """Fit of a model of the pressure response to the blocks of a running machine."""
 
     seconds: float  # [s] length of a block
     begins: float  # [s] length of the first fit

@@ -12,12 +12,12 @@ Parameter = Literal[
 
 
 class ResponseBlocks(PriorTable):
-    """Division of a recording into blocks: times in s, rate in Hz."""
+    """Division of a recording into blocks."""
 
     most: int  # largest number of blocks
-    shortest: float  # shortest block
-    wander: float  # time for which other priors state the change of a parameter
-    slowest: float  # lowest sampling rate
+    shortest: float  # [s] shortest block
+    wander: float  # [s] time for which other priors state the change of a parameter
+    slowest: float  # [Hz] lowest sampling rate
 
 
 class MachineScale(PriorTable):
@@ -28,48 +28,48 @@ class MachineScale(PriorTable):
 
 
 class MainsPriors(PriorTable):
-    """Hum of the electric mains [Hz] in the pressures."""
+    """Hum of the electric mains in the pressures."""
 
-    lines: tuple[float, ...]  # frequencies of the grids
+    lines: tuple[float, ...]  # [Hz] frequencies of the grids
     within: float  # relative error of these frequencies
     harmonics: int  # highest harmonic
 
 
 class ConductancePriors(PriorTable):
-    """Leakage conductance past the piston [m^3/(s Pa)]."""
+    """Leakage conductance past the piston."""
 
-    wander: float  # its change in 90 s, a standard deviation
-    level: float  # its standard deviation between recordings of one machine
+    wander: float  # [m^3/(s Pa)] its change in 90 s, a standard deviation
+    level: float  # [m^3/(s Pa)] its standard deviation between recordings of one machine
     orifice: float  # mean flow through an orifice, over that of the laminar leak with the same effect on the pressures
 
 
 class FrictionLaw(PriorTable):
-    """Parameters of a law of friction for the contact of piston and seal [m/N, m/s]."""
+    """Parameters of a law of friction for the contact of piston and seal."""
 
-    # displacement per force before sliding: centre, standard deviation, change in 90 s
+    # [m/N] displacement per force before sliding: centre, standard deviation, change in 90 s
     give: tuple[float, float, float]
-    creep: float | None = None  # largest speed of creep; None to use the value of the rig
+    creep: float | None = None  # [m/s] below this speed the contact creeps; None to use the rig's `friction.v_th`
 
 
 class FollowPriors(PriorTable):
-    """Fits of the pressure response along a recording: times in s or in periods of the ringing."""
+    """Fits of the pressure response along a recording."""
 
     window: float  # [s] length of the first fit
     beginning: float  # [s] length of the beginning, fitted first to find initial values
     block: float  # [s] length of a block of the beginning
     settling: float  # [s] time in which the drive starts
     centring: float  # [s] time constant of the mean position, from which the load's spring force is counted
-    slow: float  # [periods] width of the Gaussian filter that removes the ringing
-    unexplained: float  # jumps are tried above this chi square of a block, in standard deviations
+    slow: float  # [periods of the ringing] width of the Gaussian filter that removes the ringing
+    unexplained: float  # jumps are tried above this chi square of a block, in standard deviations from its mean
     explained: float  # largest fraction of the variance of p_A - p_B that a valid fit leaves unexplained
 
 
 class PressureResponsePriors(PriorTable):
     """All tables of `inference/pressures/priors.toml`, for machines that are judged by pressures and command.
 
-    Three of them are mappings from the name of a parameter. `response` gives centre, standard deviation and change in
-    90 s. `start` gives the middle of the values from which fits start, and the factor from it to the largest one.
-    `jump` gives the same for values after a jump.
+    Three of them are mappings from the name of a parameter, whose values are over the rig's own or in the unit that the
+    file states. `response` gives centre, standard deviation and change in 90 s. `start` gives the middle of the values
+    from which fits start, and the factor from it to the largest one. `jump` gives the same for values after a jump.
     """
 
     blocks: ResponseBlocks

@@ -4,12 +4,12 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class WalkPriors(PriorTable):
-    """Random walk of the logarithm of the RMS, with the scale of its change in 90 s (unit "1 in 90 s")."""
+    """Random walk of the logarithm of the RMS within a recording and between recordings."""
 
-    # half-Cauchy scales of its change in `time`: of the machine, of noise, of a duty that does not repeat
-    machine: float
-    noise: float
-    duty: float
+    # half-Cauchy scales of its change in the time `time`
+    machine: float  # of the machine's ringing
+    noise: float  # of the noise
+    duty: float  # of the ringing in a duty that does not repeat
     tried: int  # number of rates of the walk between recordings that are tried
     time: float  # [s] time for which the scales are stated
     least: float  # smallest fraction of a wavelet detail's energy that is due to the machine
@@ -18,10 +18,10 @@ class WalkPriors(PriorTable):
 class DutyExponents(PriorTable):
     """Prior standard deviations of the exponents with which the RMS of a wavelet detail grows with motion and load."""
 
-    command: float  # RMS of the command
-    rate: float  # RMS of the command's rate of change
-    load: float  # RMS of the pressure difference
-    direction: float  # mean pressure difference over its RMS
+    command: float  # exponent of the RMS of the command
+    rate: float  # exponent of the RMS of the command's rate of change
+    load: float  # exponent of the RMS of the pressure difference
+    direction: float  # factor of the mean pressure difference over its RMS, in the logarithm of the detail's RMS
 
 
 class LevelScatter(PriorTable):
@@ -30,9 +30,9 @@ class LevelScatter(PriorTable):
     scatter: float  # standard deviation between recordings of one session
     session: float  # standard deviation between sessions
     pause: float  # [s] time without a recording that separates sessions
-    error: float  # standard error of a recording
+    error: float  # standard error of a recording's value
     freedom: float  # degrees of freedom of the prior on the scatter
-    worth: float  # size of a change that is worth finding
+    worth: float  # change of the logarithm that must not remain undetected for the verdict "no leak"
 
 
 class RmsBlockPriors(PriorTable):

@@ -6,7 +6,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class LevelDeviation(PriorTable):
     """Scatter of a machine's leakage level (conductance or log RMS of wavelet details) between its recordings."""
 
-    volume_balance: float  # standard deviation over the usual level, for the volume balance
+    volume_balance: float  # standard deviation of the conductance, over its usual level
     ringing: float  # standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing)
     nodes: int  # number of values of the standard deviation, on a grid, over which results are averaged
     freedom: float  # degrees of freedom of the prior
@@ -18,10 +18,11 @@ class LevelError(PriorTable):
     """Errors of the leakage level (conductance or log RMS of wavelet details) of a single recording."""
 
     ringing: float  # standard error of the logarithm of the RMS of the pressures' wavelet details (their ringing)
-    # largest relative difference of displacement over area between neighbours, in order of size, that are compared
+    # recordings are compared if their ratios of displacement to area, sorted by size, differ between neighbours by at
+    # most `scale` (relative), plus `scatter` times the median difference if there are at least `fewest` differences
     scale: float
-    scatter: float  # further difference of the logarithms, over the median difference of neighbours
-    fewest: int  # smallest number of differences with such a median
+    scatter: float
+    fewest: int
 
 
 class ChangeScales(PriorTable):

@@ -4,9 +4,9 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 
 
 class RepairPriors(PriorTable):
-    """Default repair limit [mm/min]."""
+    """Default repair limit."""
 
-    creep: float  # creep speed of the piston with its lines shut
+    creep: float  # [mm/min] creep speed of the piston with its lines shut
     watch: float  # fraction of the limit under which a leak only has the level "monitor"
 
 

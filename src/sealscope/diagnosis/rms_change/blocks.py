@@ -1,8 +1,9 @@
 """Cut a recording into comparable blocks, and compute for each the RMS of the wavelet details and features of the duty.
 
-The duty is how the machine is moved and loaded, measured by the command and p_A - p_B. A block is a whole fraction of
-the command's cycle, so that blocks of the same phase differ only by noise and by changes of the machine. Without a
-cycle, a block is a window of fixed length.
+The details are those of each chamber pressure, d1 to d4 with the wavelet db8 (`signals.details`). The duty is how the
+machine is moved and loaded, measured by the command and p_A - p_B. A block is a whole fraction or multiple of the
+command's cycle, so that blocks of the same phase differ only by noise and by changes of the machine. Without a cycle, a
+block is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -32,17 +33,17 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 
 @dataclass(frozen=True)
 class RmsBlocks:
-    """Logarithm of the RMS of every wavelet quantity (`QUANTITIES`) in n blocks of a recording.
+    """Log RMS of every wavelet quantity (`QUANTITIES`) and features of the duty, in n blocks of a recording.
 
-    The mean differences between the phases, the blocks of a cycle, are removed from `log_rms` and `duty`.
+    If the command repeats, the mean differences between the phases, the blocks of a cycle, are removed from both.
     """
 
     edges: Array  # (n + 1,): start of each block and end of the last one [s]
     log_rms: Array  # (n, 5 per chamber): logarithm of the RMS of each quantity
-    # (n, 4): log RMS of the command, of its rate of change and of the pressure difference dp, and mean(dp)/RMS(dp)
+    # (n, 4), see `DUTY`: log RMS of the command, of its rate and of the pressure difference dp, and mean(dp)/RMS(dp)
     duty: Array
     chambers: tuple[str, ...]  # names of the chamber pressures
-    phases: int  # number of blocks per cycle of the command
+    phases: int  # number of blocks per cycle of the command; 1 if a block is a whole cycle or longer, or without one
     cycle: float | None  # period of the command [s], None if nothing repeats
     frozen: str | None = None  # description of the first block with a stuck pressure reading, if any
     n_left_out: int = 0  # number of blocks that were left out because samples are missing
@@ -81,7 +82,7 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Return the recorded chamber pressures that are not mostly clipped; all of them if all are mostly clipped."""
+    """Name the recorded chamber pressures that are not mostly clipped, or all of them if all are mostly clipped."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
@@ -89,8 +90,8 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
 
-    `RmsBlocks` describes both. The ends of the recording are left out, as the wavelet transform depends on padding
-    there.
+    They are a row of `RmsBlocks.log_rms` and of `RmsBlocks.duty`, for the whole recording as one block. Its ends are
+    left out, as the wavelet transform depends on padding there.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -101,8 +102,8 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
-    `RmsBlocks` describes both. `transformed` are the wavelet details of each chamber, and `bounds` (n + 1,) the sample
-    indices of the blocks' ends. The load is p_A - p_B or, for a single chamber, its pressure minus the mean.
+    `RmsBlocks` describes both. `transformed` are the wavelet details of each judged chamber, and `bounds` (n + 1,) the
+    sample indices of the blocks' ends. The load is p_A - p_B or, for a single chamber, its pressure minus the mean.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):

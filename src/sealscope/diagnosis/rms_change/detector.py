@@ -47,7 +47,7 @@ class RmsChange:
         """Create the detector; `rig` is ignored, as the method needs no assumption on the machine."""
 
     def usable(self, recording: Recording) -> str | None:
-        """Return the reason why a recording cannot be judged; None if its pressures are long enough and vary."""
+        """Return the reason why a recording cannot be judged: no chamber pressure, too short or constant; else None."""
         if missing := describe_missing_chambers(recording):
             return missing
         if len(recording) < min_samples():
@@ -58,9 +58,9 @@ class RmsChange:
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
 
-        The summary's `levels` (5 per chamber,) are the `log_rms` of `RmsBlocks`, and `duty` (4,) is as there.
-        `chambers` are the pressures that are not mostly clipped, to which `levels` belong, and `recorded` all chamber
-        pressures; `rate` is the sampling rate [Hz], and `start_s` the start time [s since 1970], None if unknown.
+        The summary's `levels` (5 per chamber,) and `duty` (4,) are those of `measure_levels`. `chambers` are the
+        pressures that are not mostly clipped, to which `levels` belong, and `recorded` all chamber pressures; `rate` is
+        the sampling rate [Hz], and `start_s` the start time [s since 1970], None if unknown.
         """
         levels, duty = measure_levels(recording)
         return {
@@ -102,7 +102,8 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
-    likelihoods, weights = change_information(blocks)  # of the log RMS; fractions of energy that is not noise
+    # of the change g of the ringing, i.e. of the log RMS without noise; fractions of energy that is not noise
+    likelihoods, weights = change_information(blocks)
     for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
@@ -163,7 +164,7 @@ def compare_summaries(
 
     `judged` and `summaries` are summaries (`RmsChange.learn`) of the judged and the leak-free recordings, and
     `chambers` the pressures to compare. Returns an observable for each detail and chamber, and the 95 % upper bound of
-    an undetected change of the log RMS: the smallest of the bounds by the judged details d2 to d4.
+    an undetected change g of the ringing (log RMS without noise): the smallest of those by the judged details d2 to d4.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
@@ -171,7 +172,7 @@ def compare_summaries(
     levels = np.array([_summary_levels(summary, chambers) for summary in summaries])
     judged_levels, judged_duty = _summary_levels(judged, chambers), np.asarray(judged["duty"], dtype=float)
     observables, bounds = list[Observable](), list[float]()
-    # changes of the ringing, and fractions of energy that is not noise
+    # changes g of the ringing, and fractions of energy that is not noise
     rises, weights = estimate_rises(judged_levels, judged_duty, levels, duties, times)
     for name, rise, weight in zip(column_names(chambers), rises, weights, strict=True):
         change = rise._replace(value=abs(rise.value))  # a fall is tested like a rise of the same size

@@ -1,8 +1,8 @@
 """Estimate how the ringing of a machine changes, from the RMS of wavelet details, with the noise removed.
 
-A detail d_j has the energy E_j = (1 + g)^2 S_j + E_1. S_j is the mean energy of the machine's ringing in d_j, g the
-relative change of the ringing's amplitude, and E_1 the energy of white noise, which is equal in every detail; d1 is
-almost only noise. To first order g follows from
+The ringing is an oscillation of the pressures, which a leak damps. A detail d_j has the energy E_j = (1 + g)^2 S_j +
+E_1. S_j is the mean energy of the machine's ringing in d_j, g the relative change of the ringing's amplitude, and E_1
+the energy of white noise, which is equal in every detail; d1 is almost only noise. To first order g follows from
 
     y = log RMS d_j - log sqrt(S_j + E_1) = w g + error,    w = S_j / (S_j + E_1),
 
@@ -56,8 +56,8 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
     g = log(RMS / mean RMS) of the pressures' wavelet details, after noise (`subtract_noise`) and the effect of the duty
-    were subtracted. Returns a normal likelihood of g over the blocks (`Information`) for each column of
-    `blocks.log_rms`, and the mean fraction of energy that is not noise, (columns,).
+    were subtracted. Returns for each column of `blocks.log_rms` a normal likelihood of g over the blocks
+    (`Information`), and the mean fraction w (columns,) of energy that is not noise: the log RMS itself changes by w g.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
@@ -66,7 +66,7 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     walks = RMS_PRIORS.walk
-    # convert scales for the time `walk.time` to the recording's length: a random walk grows with the root of the time
+    # convert scales for `walk.time` to the length of all blocks: a random walk grows with the root of the time
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()

@@ -76,11 +76,11 @@ class LeakReading:
     problem : str
         Reason why there is no level, else "".
     pump : float
-        Mean flow of the pump [m^3/s]; by the volume balance only while the machine moves. nan for the basis "ringing".
+        Mean flow of the pump [m^3/s], by the volume balance only while the machine moves; nan for the basis "ringing".
     size_error : float
         Relative standard error of flows due to the machine's sizes (displacement, piston area).
     sums, terms : RecordingSums or None, tuple of ColumnRoles
-        Sums of the volume balance, None without a balance, and its terms.
+        Sums of the volume balance, None without a balance, and the roles of its columns, one entry for each equation.
     ringing : Summary or None
         Summary of the pressures' ringing (RMS of their wavelet details); None if the channels do not allow it.
     """
@@ -119,7 +119,7 @@ def estimate_reading(
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
     part = inspection.part  # corrected samples that can be used
-    has_difference = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0
+    has_difference = len(chambers_of(part)) == len(CHAMBERS) and len(part) > 0  # p_A - p_B is known
     reading = LeakReading(
         file=file or str(recording.provenance.get("file", "recording")),
         start=start_seconds(recording, file),
@@ -198,8 +198,8 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     """Make the prior on the standard deviation of a healthy machine's leakage level between recordings.
 
-    The level (`LeakReading.level`) is estimated by the method `basis`. The scale of the prior is proportional to the
-    typical level `usual` for the volume balance, and constant for other methods.
+    The level (`LeakReading.level`) is estimated by the method `basis`. The scale of the prior, in the level's unit, is
+    proportional to the typical level `usual` for the volume balance, and constant for other methods.
     """
     between = TREND.between
     if basis == "pressure response":
@@ -275,12 +275,15 @@ def build_timeline(
 
 
 def _group_scales(scales: Sequence[float | None]) -> list[int]:
-    """Assign a number to each group of readings with nearly the same ratio of displacement to area, by appearance.
+    """Find the group of each reading, of readings with nearly the same ratio of displacement to area.
 
-    `scales`: the ratios. Sorted by size, neighbours are of one group if their logarithms differ by no more than log(1 +
-    `reading.scale`) (`priors.toml`) plus `reading.scatter` times the median difference of neighbours: where the
-    recordings of a machine do not determine the ratio well, it scatters. The median counts from `reading.fewest`
-    differences on. A ratio of None is of the first group.
+    `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; None has the group
+    0. Sorted by size, neighbouring ratios are of one group if their logarithms differ by at most
+
+        log(1 + `reading.scale`) + `reading.scatter` * median difference of neighbours    (`priors.toml`).
+
+    The second term is for a machine whose recordings do not determine the ratio well, so that it scatters. It counts if
+    there are at least `reading.fewest` differences.
     """
     known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
     gaps = np.diff(np.log(known))
@@ -288,6 +291,7 @@ def _group_scales(scales: Sequence[float | None]) -> list[int]:
     limit = math.log1p(prior.scale)
     if len(gaps) >= prior.fewest:
         limit += prior.scatter * float(np.median(gaps))
+    # by ratio, the number of its cluster, counted from the smallest ratio
     clusters = dict(zip(known, np.concatenate([[0], np.cumsum(gaps > limit)]).tolist(), strict=True)) if known else {}
     numbers: dict[int | None, int] = {}  # number of the group of each cluster
     groups = []

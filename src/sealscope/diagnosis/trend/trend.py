@@ -54,7 +54,7 @@ class Trend:
     basis : str or None
         Method by which the levels were estimated: "volume balance", "pressure response" or "ringing".
     unit, pressure : str, float or None
-        ``L/min`` at this pressure difference [Pa], or ``%`` of the first recordings if the sizes are not known.
+        ``L/min`` at this pressure difference [Pa], or ``%`` of the healthy recordings' mean if the sizes are not known.
     points : tuple of TrendPoint
         The recordings in the order of their times.
     groups : tuple of str
@@ -131,7 +131,7 @@ class Trend:
     def leak(self) -> Interval | None:
         """Increase of the flow past pump and piston over that of the healthy machine, in the trend's unit.
 
-        None if the decision states no leak and no change was found.
+        None if the decision states no flow of a leak and the test has found no change.
         """
         value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and interval is not None:
@@ -349,7 +349,10 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Return a trend's points with values from the converted `levels` added, and its findings with outliers added."""
+    """Add values with 95 % intervals from the converted `levels` to a trend's points, and outliers to its findings.
+
+    Returns the new points and findings.
+    """
     points, findings = [*trend.points], [*trend.findings]
     _, excess = outlier_excess(levels)  # part of each level beyond the limit of outliers
     outliers = np.flatnonzero(excess)

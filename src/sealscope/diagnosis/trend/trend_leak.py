@@ -43,7 +43,7 @@ def decide_trend(
 ) -> Evidence:
     """Decide from the comparable recordings since the last repair if the leakage of a machine has increased.
 
-    `points` are in the order of time; `episode` is the result of `find_episodes` for them. `trend_units_per_level` is
+    `points` are in the order of time; `episode` is what `find_episodes` found for them. `trend_units_per_level` is
     the factor from `LeakReading.level` to the unit of the trend; `pressure` [Pa] is the pressure difference for which a
     trend in L/min is stated, None for a trend in %; `interval` [days] is the median time between two recordings. Points
     of the basis `ringing` are judged by the change of the ringing, without an estimate of the leakage. The allowed
@@ -70,11 +70,10 @@ def _measure_leak(
 ) -> LeakMeasure:
     """Describe the increase of the leakage since the last repair, from the recordings (`points`) since then.
 
-    `chance` is the probability of such an increase in a healthy machine, `trend_units_per_level` the factor from a
-    level (leakage over pressure of a recording) to the unit of the trend, in which the result states flows, and
-    `pressure` the pressure difference at which they are stated [Pa], None if that unit is %. The flow of the leak is
-    proportional to p^k, with k from `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the
-    mean over these laws.
+    `chance` is the probability of such an increase in a healthy machine. `trend_units_per_level` is the factor from a
+    level (`LeakReading.level`) to the unit of the trend, in which the result states flows. `pressure` is the pressure
+    difference at which they are stated [Pa], None if that unit is %. The flow of the leak is proportional to p^k, with
+    k from `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -102,9 +101,10 @@ def _measure_leak(
 
 
 def _normal_rise(wear: Wear, chance: float) -> Rise | None:
-    """Describe the increase of the leakage by a normal distribution that is negative with the probability `chance`.
+    """Describe the increase of the leakage as a normal estimate whose p-value is `chance`.
 
-    Its mean is the estimated increase or, if that is 0, its upper bound. None for a chance >= 0.5 or a bound <= 0.
+    The estimate is the median increase (`Wear.leak`) or, if that is 0, its upper bound; the standard deviation follows.
+    The result is None for a chance >= 0.5 or a bound <= 0.
     """
     from scipy.special import ndtri
 
@@ -129,7 +129,8 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
 def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing (RMS of their wavelet details) since the last repair.
 
-    `chance` is the probability of such a decrease in a healthy machine. No upper bound of a leak is stated.
+    `chance` is the probability of such a decrease in a healthy machine. With an onset, the report states the number of
+    recordings before it (`ringing`); it states no upper bound of a leak.
     """
     size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
     # a score is twice the logarithm of a likelihood ratio, here of 1 / chance

@@ -190,9 +190,10 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Build the single hypothesis of a growth since the first recording.
+        """Build the single hypothesis of a change since the first recording, which counts as a growth.
 
-        `profile` (n,) is its effect on each recording for unit size, and `scale` the prior scale of the size.
+        `profile` (n,) is its effect on each recording for unit size, and `scale` the prior scale of the size, in units
+        of tau.
         """
         first = np.zeros(1, dtype=np.int64)
         return cls(
@@ -424,7 +425,8 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
     `change_begin` is the index of the first recording after the change that the test has found. If it is None, an even
     growth or decrease over all recordings is estimated, with a wide prior. If the recordings span less than a day,
-    growth and time are NaN. For a single recording the rise (`leak`) has an infinite interval.
+    growth and time are NaN with unlimited intervals. For a single recording the rise (`leak`) is 0 with an infinite
+    interval.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -488,9 +490,9 @@ def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
 class Episode(NamedTuple):
     """A period between two repairs of a machine, and the result of the test for a leak in it."""
 
-    begin: int  # first of the compared recordings in the period
-    end: int  # index after the last one
-    alarm: int | None  # index at which the test raised an alarm, None if it did not
+    begin: int  # index of the first recording of the period, among all compared recordings
+    end: int  # index after its last recording
+    alarm: int | None  # index of the first recording at which the test raised an alarm, None if it did not
     log_days: float  # logarithm of the largest mean time to a false alarm [days] with which the test raises an alarm
     wear: Wear  # state after the last recording
     fell: bool  # True if the period began with a repair, i.e. a fall of the level

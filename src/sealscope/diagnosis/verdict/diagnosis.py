@@ -130,19 +130,18 @@ class Diagnosis(Evidence):
 
     @property
     def repair_lpm(self) -> float | None:
-        """Repair limit [L/min] to draw in the plot of the leak over time (`course`).
+        """Repair limit [L/min] to draw in the plot of the leak over time (`course`); None without a plot.
 
         If the plot shows the leak alone, this is `limit_lpm`. If it shows the total leakage, the leakage of the healthy
-        machine is added. This is the median of the plotted flow before the onset or, for a leak that was open from the
-        start, the median over the recording minus the leak. The result is None without a plot or if the limit or the
-        healthy leakage is unknown.
+        machine is added: the median of the plotted flow before the onset or, for a leak that was open from the start,
+        the median over the recording minus the leak. The result is also None if the limit or this leakage is unknown.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
             return None
         if not course.whole:  # the plot shows the leak alone
             return limit
-        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
+        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s  # inf: none
         lpm_before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         if not lpm_before.size:
             return None
@@ -176,9 +175,10 @@ class Diagnosis(Evidence):
     def _condition(self) -> str:
         """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
 
-        The verdict `no leak` has four conditions. If the leakage is known to be healthy, the condition is "no leak" for
-        a recording that may serve as a baseline, else "no leak found". Otherwise only a change within the recording was
-        excluded: the condition is "no change of RMS" if the detector of RMS changes decided, else "no change".
+        The verdict `no leak` has four conditions. If the leakage is known to be healthy (`known_healthy`), the
+        condition is "no leak" for a recording that may serve as a baseline, else "no leak found". Otherwise only a
+        change within the recording was excluded: the condition is "no change of RMS" if the detector of RMS changes
+        decided, else "no change".
         """
         if self.verdict != NO_LEAK:
             return self.verdict
@@ -344,6 +344,7 @@ class Diagnosis(Evidence):
         """Return the diagnosis as an HTML table for notebooks."""
 
         def format_figure(value: float | None, interval: tuple[float, float] | None = None) -> str:
+            """Format a number with its interval, if any, to 4 digits; "" for None."""
             ends = "" if interval is None else f" ({interval[0]:.4g} to {interval[1]:.4g})"
             return "" if value is None else f"{value:.4g}{ends}"
 

@@ -104,10 +104,10 @@ class RelativeLeak:
     Attributes
     ----------
     pump_share, pump_share_interval : float and pair of floats, or None
-        Leak as a fraction of the pump's mean flow, and its 95 % interval; None if the pump's motion is not recorded.
+        Leak as a fraction of the pump's mean flow, and its 95 % interval; None if the pump's flow is 0 or unknown.
     creep, creep_interval : float and pair of floats, or None
         Speed at which the leak would let the piston creep with its lines shut (leak over piston area), and its 95 %
-        interval [m/s]; None if the position has no unit.
+        interval [m/s]; None if the piston's area is unknown.
     """
 
     pump_share: float | None = None
@@ -151,7 +151,7 @@ class Evidence:
     usable : bool
         Whether the recording had the channels and the length that the detector needs.
     chance : float, optional
-        Probability that a leak-free recording scores as high, by the detector's own null distribution.
+        p-value: probability that a leak-free recording scores as high, judged by healthy recordings if there are any.
     relative : RelativeLeak, optional
         The leak relative to other quantities of the recording; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
@@ -206,12 +206,12 @@ class Evidence:
 
     @property
     def stated_chance(self) -> float | None:
-        """The `chance` to display, at least `RAREST`, as smaller ones cannot be trusted; None if it is unknown."""
+        """The p-value (`chance`) to display, at least `RAREST`, as smaller ones cannot be trusted; None if unknown."""
         return None if self.chance is None else max(RAREST, self.chance)
 
     @property
     def odds(self) -> str | None:
-        """The stated `chance` in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown.
+        """The p-value (`chance`) in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown.
 
         For the verdict `no leak` without an alarm, the words are "shows as much change" instead of "looks like this".
         """

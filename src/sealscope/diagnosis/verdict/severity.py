@@ -20,8 +20,6 @@ from sealscope.units import LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE, pars
 Level = Literal["repair", "plan", "monitor"]
 #: A figure with its 95 % interval, (value, low, high); None if the figure is not known.
 _Figure = tuple[float, float, float] | None
-
-
 #: Letter before the power of ten in a number such as 5e-6, which must not be taken for a unit.
 _EXPONENT = re.compile(r"(?<=[\d.])[eE](?=[+-]?\d)")
 
@@ -152,8 +150,8 @@ def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMach
     """Convert a leak in L/min to a fraction of the pump's mean flow and to a creep speed of the piston.
 
     The flow of the pump follows from its mean speed in the `recording` and the displacement of the `machine`, and the
-    creep speed from the machine's piston area. The result is None if the `evidence` states no leak in L/min. The
-    fraction in it is None if the pump stands still, or if neither its speed nor its angle is recorded in SI units.
+    creep speed from the machine's piston area. Returns None if the `evidence` states no leak in L/min. The fraction
+    alone is None if the pump stands still, or if neither its speed nor its angle is recorded in SI units.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None

@@ -22,7 +22,7 @@ _LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
-    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return their two numbers.
+    """Write all alarms and estimates of a monitor to `alarms.csv` and `estimates.csv`; return both counts.
 
     The estimates from the start of an alarm's onset interval until the alarm's last mark are labelled: `leak` if the
     mark is `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.

@@ -42,7 +42,7 @@ _ATTEMPTS = 10
 class StoredRows:
     """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
 
-    - `estimates`, `pending` (samples since the last checkpoint), `events`: new rows.
+    - `estimates`, `pending` (samples that a restart needs), `events`: new rows.
     - `alarms` by id, `actuators` (checkpoints) and `summaries` by actuator: rows that are new or replace stored ones.
     - `first_kept`: by actuator with a new checkpoint, the running number before which pending samples are deleted.
     - `old_blocks`, `old_estimates`: by actuator, the running number up to which old rows are deleted.
@@ -71,7 +71,7 @@ class StoredRows:
     def add_pending(
         self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
     ) -> None:
-        """Add a block of samples that must be judged again if the monitor restarts before the next checkpoint.
+        """Add a block of samples that a restart must judge again, or collect again for a recording that has not ended.
 
         `number`: running number of the block among all blocks of the actuator; `follows`: False if there is a gap
         before these samples; `verdict`: verdict on the recording that ends with the samples, None for none.
@@ -122,7 +122,10 @@ class StoredSamples(NamedTuple):
 
 
 class StoredCheckpoint(NamedTuple):
-    """The stored checkpoint of an actuator: its settings as JSON, its state, and the samples that arrived after it."""
+    """The stored checkpoint of an actuator: its settings as JSON, its state, and the pending samples.
+
+    Pending samples arrived after the checkpoint, or before it and belong to a recording that has not ended.
+    """
 
     settings: str
     state: dict[str, Any]
@@ -130,7 +133,7 @@ class StoredCheckpoint(NamedTuple):
 
 
 class MonitorStore:
-    """The database of a monitor: a file of SQLite, or a URL. Raises InputError if it cannot be opened."""
+    """The database of a monitor, from which outputs and the page read; `tables`: module with its tables."""
 
     def __init__(self, database: str) -> None:
         """Open the database, a file of SQLite or a URL, and create missing tables; raise InputError if that fails."""
@@ -200,7 +203,7 @@ class MonitorStore:
             return connection.execute(query).all()
 
     def _value(self, query: Any) -> int:
-        """Execute a query for a single number, and return the number; return 0 if the query gives none."""
+        """Execute a query for a single number, and return it as an integer; return 0 if the query gives none."""
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
@@ -312,7 +315,7 @@ class MonitorStore:
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
-        """Read the checkpoint of an actuator with the samples since then; return None if there is no checkpoint."""
+        """Read the checkpoint of an actuator with its pending samples; return None if there is no checkpoint."""
         states, pending = tables.actuators, tables.pending
         samples = (
             select(pending.c.number, pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
@@ -323,7 +326,7 @@ class MonitorStore:
         return None if row is None else StoredCheckpoint(row.settings, json.loads(row.checkpoint), blocks)
 
     def last_samples(self, actuator: str) -> list[Recording]:
-        """Read the samples of an actuator since its last checkpoint, one recording for each block."""
+        """Read the pending samples of an actuator (`StoredCheckpoint`), one recording for each block."""
         checkpoint = self.checkpoint(actuator)
         return [] if checkpoint is None else [block.samples for block in checkpoint.pending]
 
@@ -347,7 +350,7 @@ class MonitorStore:
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
     def events_since(self, number: int, max_events: int = 1000) -> list[tuple[int, dict[str, Any]]]:
-        """Read the events with a running number above `number`, as pairs (number, event) in ascending order."""
+        """Read up to `max_events` events with a running number above `number`, as pairs (number, event) in order."""
         columns = tables.events.c
         query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(max_events)
         return [(row.number, _event_from_row(row)) for row in self._rows(query)]
@@ -429,7 +432,10 @@ def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict |
 
 @lru_cache(maxsize=64)
 def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the first line of packed samples as JSON; `units`: pairs (channel, unit); `follows`: False after a gap."""
+    """Format the first line of packed samples as JSON; it is cached, since many blocks have the same line.
+
+    `units`: pairs (channel, unit); `rate`: sampling rate [Hz]; `follows`: False after a gap.
+    """
     return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
 
 
@@ -447,6 +453,7 @@ def _unpack_samples(number: int, data: bytes) -> StoredSamples:
 
 def _event_from_row(row: Any) -> dict[str, Any]:
     """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after this event."""
+    # `row.t` would be a method of SQLAlchemy's rows
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
     return {**values, "alarm": json.loads(row.alarm)}
 

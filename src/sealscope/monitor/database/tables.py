@@ -33,12 +33,12 @@ def _table(name: str, columns: str, *indexes: Index) -> Table:
     return Table(name, metadata, *table_columns, *indexes)
 
 
-#: Single values by name: the version of the tables, and how far each output has come.
+#: Single values by name: the version of the tables, and the numbers of `MonitorStore.write_position`.
 facts = _table("facts", "name 40 key, value text")
 #: Blocks that are stored, by identity.
 _block_order = Index("blocks_in_order", "actuator", "number")
 blocks = _table("blocks", "actuator 120 key, identity 120 key, number int", _block_order)
-#: Samples since the checkpoint, which a restart judges again.
+#: Samples since the checkpoint, which a restart judges again, and those of a stream's recording that has not ended.
 pending = _table("pending", "actuator 120 key, number int key, samples bytes")
 #: State of the detector and of the alarm at the checkpoint, in JSON.
 actuators = _table("actuators", "actuator 120 key, settings text, checkpoint text")

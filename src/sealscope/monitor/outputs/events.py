@@ -1,6 +1,7 @@
 """Send the events of alarms as JSON lines to a stream and as POST requests to a web address, in order.
 
-The database stores how far each output has come. Only after a crash an event may be sent again, with its number.
+The database stores how far each output has come. After a crash, or an answer that is lost, an event is sent again, with
+the same number.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
 
 
 class EventLines:
-    """Writes the events in the database `store` to a text stream, each as a line of JSON, never cut off or repeated."""
+    """Writes the events in the database `store` to a text stream (None if it is closed), each as one line of JSON.
+
+    After an error the rest of a line is written, so that no line is cut off or repeated.
+    """
 
     def __init__(self, store: MonitorStore, stream: TextIO | None) -> None:
         self._store, self._stream = store, stream
@@ -38,8 +42,8 @@ class EventLines:
     def _write_line(self, event: dict[str, Any]) -> bool:
         """Write an event as one line of JSON if it is to be announced (`is_announced`), and return True.
 
-        Raises PartAway if the stream refuses the line or a part of it; the next call writes the rest. The line is not
-        buffered, because a buffer would keep lines that a full disk refuses.
+        Raises PartAway if the stream refuses the line or a part of it; the next call, for the same event, writes the
+        rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
         """
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]

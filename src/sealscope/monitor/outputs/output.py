@@ -30,7 +30,8 @@ class Output(Protocol):
     """An output of alarms; `part`: name under which the page, the log and the metrics show its outages.
 
     `deliver` is called again and again; `end` is called once, at the end. Both send the new events by
-    `MonitorStore.deliver`, which stores how far the output has come, and raise PartAway if that fails.
+    `MonitorStore.deliver`, which stores how far the output has come. An error begins an outage of the output; of
+    PartAway only the text is logged.
     """
 
     part: str

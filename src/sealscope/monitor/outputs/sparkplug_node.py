@@ -2,7 +2,7 @@
 
 Birth messages state all metrics. Data messages state each event of an alarm at once and in order, and every few seconds
 the other metrics that have changed. The death message is the last will of the connection. Its number bdSeq increases
-with each connection, also after a restart. Messages have QoS 0: a host that misses one requests a birth.
+with each connection, also after a restart. The other messages have QoS 0: a host that misses one requests a birth.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class SparkplugNode:
         return cls(actuators.store, actuators.summaries, actuators.count, broker, table, password)
 
     def deliver(self) -> None:
-        """Send births that are due, new events of alarms and, every few seconds, changed values to the Sparkplug host.
+        """Send births that are due, new events of alarms and, every few seconds, changed values to the broker.
 
         A birth message states all metrics. The first call connects to the broker; without a connection nothing is sent.
         """
@@ -122,8 +122,8 @@ class SparkplugNode:
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the death message, which the broker publishes when the next connection is lost.
 
-        Death and birth of a connection have the same number bdSeq (0 to 255), one more than that of the last birth.
-        This number is stored as `_connection_birth_number`.
+        Death and birth of a connection have the same number bdSeq (0 to 255), one more than that of the last birth sent
+        before. It becomes `_connection_birth_number`.
         """
         self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
@@ -156,10 +156,10 @@ class SparkplugNode:
     def _send_event(self, event: dict[str, Any]) -> bool:
         """Send an event and its alarm as a data message of the actuator's device; return False if that fails.
 
-        The event of an actuator that is not in the settings is skipped, and True is returned.
+        The event of an actuator without a birth, which is not in the settings, is skipped, and True is returned.
         """
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
-        if alarm["actuator"] not in self._sent_values:  # no birth was sent: it is not in the settings
+        if alarm["actuator"] not in self._sent_values:
             return True
         metrics = _build_metrics("alarm", _metric_values("alarm", alarm), timestamp)
         metrics += _build_metrics("event", _metric_values("event", event), timestamp)

@@ -29,9 +29,9 @@ BACKLOG = 64
 class Admission:
     """The check of the token by which a page admits visitors; it delays a client's IP address after wrong tokens.
 
-    After `_FREE_ATTEMPTS` wrong tokens the next token from the same address, right or wrong, is checked only after a
-    pause of `_FIRST_PAUSE_S`. Each further wrong token doubles the pause, up to `_MAX_PAUSE_S`. An IPv6 network (/64)
-    counts as one address. `token`: the valid token; `now`: function that returns a monotonic time [s].
+    After `_FREE_ATTEMPTS` wrong tokens the next token from the same address, right or wrong, must wait for a pause of
+    `_FIRST_PAUSE_S` (`pause_s`). Each further wrong token doubles the pause, up to `_MAX_PAUSE_S`. An IPv6 network
+    (/64) counts as one address. `token`: the valid token; `now`: function that returns a monotonic time [s].
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
@@ -121,7 +121,7 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
         def check_silence(self) -> None:
             """Close the connection if it has been silent for too long; otherwise schedule the next check.
 
-            A connection that waits for an answer, or whose client reads one, counts as active.
+            A connection is silent if no answer is under way, or if its client leaves the answer unread.
             """
             if self.transport.is_closing():
                 return

@@ -1,4 +1,4 @@
-// The last seconds of the chosen actuator: its pressures, and their details, as the stream of events brings them.
+// The last seconds of the chosen actuator: its pressures and their wavelet details, from the stream of events.
 "use strict";
 
 let news = null;
@@ -9,7 +9,7 @@ let latest = null;
 const drawing = { pressure: "p_A", drawn: "rms" };
 const plots = {};
 
-// one stream for what has changed and for the samples of who is looked at; none while nobody looks
+// one stream for changes and for the samples of the chosen actuator; none while the page is hidden
 function listen() {
   const query = new URLSearchParams();
   if (chosen !== null && !paused) {
@@ -28,7 +28,7 @@ function listen() {
   }
   const stream = news;
   stream.onmessage = () => {
-    // not before: the monitor keeps the samples of an actuator while somebody looks at it
+    // not before: the monitor keeps the samples of an actuator only while a stream asks for them
     if (stream === news) closeReplaced();
     soon();
   };

@@ -137,10 +137,11 @@ class LiveSamples:
         return 0 if window is None else window.version
 
     def curves(self, name: str, pressure: str = "p_A", detail_form: str = "rms") -> dict[str, Any]:
-        """Compute the curves that the page draws of a viewed actuator, as plain values with None for a missing one.
+        """Compute the curves that the page draws of a viewed actuator, as plain values for JSON.
 
         `pressure`: channel whose wavelet details are computed; `detail_form`: "details", or "rms" for their RMS in
-        windows of `WINDOW_SIZE` samples. Among the returned values are:
+        windows of `WINDOW_SIZE` samples. Numbers that are not finite become None, and curves that are not recorded are
+        left out. Among the returned values are:
 
         - `t`: time of the last sample [s], None if there are no samples; the times of the curves are relative to it;
         - `pressures`: the chamber pressures [bar]; `details`: the wavelet details d1 to d4 [kPa], or their RMS;
@@ -166,17 +167,18 @@ class LiveSamples:
 
 
 def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
-    """Round numbers to `digits` decimals, and replace those that are not finite by None, as JSON needs."""
+    """Round an array (n,) to `digits` decimals, and list its numbers, with None for those that are not finite."""
     rounded_values = np.round(values, digits)
     return [value if math.isfinite(value) else None for value in rounded_values.tolist()]
 
 
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
-    """Reduce series of samples (n,) to the minimum and maximum in each bin, in the order in which they occur.
+    """Reduce series of samples (n,) at times `t` (n,) [s] to the minimum and maximum in each bin, for a chart.
 
-    A bin is a group of successive samples; there are at most `_BINS` bins of equal size, and the first samples are left
-    out if they do not fill a bin. Series with at most two samples per bin are not reduced. `t` (n,) [s]: times. Returns
-    the times of the bins' first and middle samples as "t", and the reduced series by name, rounded.
+    A bin is a group of successive samples. There are at most `_BINS` bins of equal size, and the first samples are left
+    out if they do not fill a bin. Series that would have at most two samples per bin are not reduced. Returns lists of
+    rounded numbers: "t" with the times of each bin's first and middle sample, and by name each bin's minimum and
+    maximum, in the order in which they occur.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
@@ -197,15 +199,16 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
-    `signal` [Pa]: the pressure over the times `t` [s], None if it is not recorded; `pressure`: its name; `detail_form`:
-    "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has` in the result)
-    than the wavelet transform and a window of the RMS need (`needs`), or if numbers overflow, there are no curves.
+    `signal` (n,) [Pa]: the pressure at the times `t` (n,) [s], None if it is not recorded; `pressure`: its name;
+    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has`
+    in the result) than the wavelet transform and a window of the RMS need (`needs`), or if numbers overflow, there are
+    no curves, and "t" is empty.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
     first = missing_indices[-1] + 1 if missing_indices.size else 0
     samples = samples[first:]
-    # needs: one window of samples whose details do not depend on padding at the ends of the signal
+    # `needs`: one window of samples whose details do not depend on padding at the ends of the signal
     header: dict[str, Any] = {"of": pressure, "drawn": detail_form, "needs": min_samples() + WINDOW_SIZE - 1}
     if samples.size < header["needs"]:
         return {**header, "t": [], "has": int(samples.size)}

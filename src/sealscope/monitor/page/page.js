@@ -22,13 +22,13 @@ function flow(value, interval) {
   return `${litres(Math.max(value, 0))}${range} L/min`;
 }
 
-// the leak of an actuator, or what none is above
+// the leak of an actuator, or the upper bound of an undetected one
 function leakOf(row) {
   if (row.leak_lpm !== null) return `${litres(Math.max(row.leak_lpm, 0))} L/min`;
   return row.bound_lpm === null || row.bound_lpm === undefined ? "" : `< ${Number(row.bound_lpm.toPrecision(2))} L/min`;
 }
 
-// the local time as ISO 8601 writes it, whatever the browser's language; of files the time that they state
+// the local time in the form of ISO 8601, whatever the browser's language; for files the time that they state
 function isoTime(t, byFiles) {
   const zone = byFiles ? 0 : new Date(t * 1000).getTimezoneOffset() * 60000;
   const local = new Date(t * 1000 - zone);
@@ -88,7 +88,7 @@ function onceIn(rate) {
   return length >= 1e4 ? `10 000 ${unit}` : `${Number(length.toPrecision(2))} ${unit}`;
 }
 
-// healthy actuators of the whole fleet raise alarms as strong as this one so seldom
+// how seldom the whole fleet, if healthy, would raise an alarm as strong as this one
 let fleetCount = 1;
 const byChance = (alarm) =>
   alarm.by_chance_per_1000_h === null || alarm.by_chance_per_1000_h === undefined

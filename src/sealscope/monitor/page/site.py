@@ -130,7 +130,7 @@ class _Pages:
     def actuator(self, request: Request) -> Response:
         """Answer with the summary, history, events and alarms of one actuator, as JSON.
 
-        Query: `name` of the actuator; `hours`: length of the history [h], all of it if missing.
+        Query: `name` of the actuator; `hours`: length of the history [h], all of it if missing or no number.
         """
         name, hours = request.query_params.get("name", ""), request.query_params.get("hours", "")
         summary = self._actuators.summaries().get(name)
@@ -199,8 +199,8 @@ class _Pages:
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
         """Yield the server-sent events of `changes`, as text, until the client disconnects or the monitor ends.
 
-        `name`: actuator whose curves are sent, "" for none; `pressure`: pressure whose wavelet details are drawn;
-        `detail_form`: "rms" or "details". If too many actuators are viewed already, an event "live" states this error.
+        `name`: actuator whose curves are sent, "" for none; `pressure`, `detail_form`: as `pressure` and `drawn` of
+        `changes`. If too many actuators are viewed already, an event "live" states this error.
         """
         live, actuators = self._live, self._actuators
         with ExitStack() as contexts:

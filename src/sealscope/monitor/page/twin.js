@@ -42,13 +42,13 @@ function showTwin(live) {
     }
     twin.reach = Math.max(twin.reach, ...(motion.x || []).filter((value) => value !== null).map(Math.abs));
     const newest = live.t, first = live.t + motion.t[0];
-    // what is over a second behind is passed over
+    // outside the recorded span the drawing goes on 1.5 s before the newest sample
     if (!(twin.at >= first && twin.at <= newest)) twin.at = Math.max(first, newest - 1.5);
     if (still.matches) twin.at = newest;
   }
   byId("twin-missing").textContent = missing.join(" ");
   byId("twin-scale-most").textContent = `${twin.most} bar`;
-  // what is said and what is drawn change together, not the drawing a frame later
+  // the text and the drawing change together, not the drawing a frame later
   cancelAnimationFrame(twin.frame);
   moved(performance.now());
   described();
@@ -68,7 +68,7 @@ function state() {
   const speed = value("v");
   const rpm = value("rpm");
   const machine = twin.machine;
-  // oil into chamber A where it is positive: what the piston swept, else what the pump turned
+  // flow into chamber A [L/min], by the speed of the piston, else by that of the pump
   const litresAMinute = !machine ? null : speed !== null ? speed * machine.area : rpm !== null && !machine.valve ? rpm * machine.displacement : null;
   return { x: value("x"), p_A: value("p_A"), p_B: value("p_B"), rpm, flow: litresAMinute };
 }
@@ -111,7 +111,7 @@ function moved(now) {
   if (twin.at < newest) twin.frame = requestAnimationFrame(moved);
 }
 
-// for who does not see the drawing: what it shows, once for each time that samples come
+// describe the drawing to screen readers, each time that samples come
 function described() {
   const is = state();
   const parts = ["The actuator as it moves"];

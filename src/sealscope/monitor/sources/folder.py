@@ -128,7 +128,7 @@ class WatchedFolder:
     def _is_due(self, file: _FoundFile) -> bool:
         """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted.
 
-        A file that could not be read before is due only when it can no longer be unfinished.
+        A file that could not be read before is due only when it can no longer be unfinished (`_may_be_incomplete`).
         """
         is_incomplete = file.identity in self._unreadable and self._may_be_incomplete(file)
         if is_incomplete or self._unchanged_s(file) < self.settle_s:
@@ -171,7 +171,8 @@ class WatchedFolder:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
         After a restart, the time of the last stored sample replaces the start of the newest recording. An earlier
-        recording is accepted if it states only the day of the newest one, or if the newest is dated in the future.
+        recording is accepted if it states only the day of the newest one, by a start at midnight, or if the newest one
+        is dated in the future. A new recording that is dated in the future is logged.
         """
         if samples is None:
             return ""

@@ -79,20 +79,19 @@ class ValueGatherer:
         """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
-        is an unknown value. Values without a finite time, and too many at once, are dropped. If the time jumps forward
-        by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it jumps back by
-        as much, the clock was set, and all earlier values are discarded. The first value of a channel is an exception:
-        it may have such an old time if it has not changed since, and counts as the present value.
+        is an unknown value. Values without a finite time, and too many at once, are dropped and counted. If the time
+        jumps forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it
+        jumps back by as much, the clock was set, and all earlier values are discarded. Only the first value of a
+        channel may be so old, dated by its last change; it counts as the present value.
         """
         # sample numbers up to 2^52 are exact as doubles
         if not math.isfinite(t) or abs(t * self.rate) > 2**52 or not 0 < len(values) <= MAX_SAMPLES:
             self._count("values without a clock, or too many")
             return []
         first = round(t * self.rate)
-        lead = 0 if self._newest is None else first - self._newest
+        lead = 0 if self._newest is None else first - self._newest  # [samples], of the first new one over the newest
         target = self._channels[channel]
         if lead < -self._max_lead and target.last_value() is None:
-            # the channel's first value, dated by its last change long ago: it has not changed since
             target.previous, target.arrival = values[-1], self._now()
         else:
             old_channels = self._channels
@@ -127,9 +126,10 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the blocks for which every channel has values.
+        """Remove and return the complete blocks, up to whose end every channel has values.
 
-        A channel that has been silent for `SILENT_S` [s] counts as constant; if all channels are silent, no block ends.
+        The first block begins where every channel has a value. A channel that has been silent for `SILENT_S` [s] counts
+        as constant; if all channels are silent, no block ends.
         """
         channels = self._channels.values()
         if self._start is None:

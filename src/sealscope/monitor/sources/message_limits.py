@@ -170,8 +170,8 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
 def _scan_items(data: Any) -> tuple[int, int, int]:
     """Check the number, depth and types of the items of a CBOR message, given as bytes (n,), in one pass.
 
-    Returns the index in `_RULES` of the broken rule (0 for none), the index of the byte at which the fault or the end
-    of the message lies, and the number of key-value pairs before it.
+    Returns the index in `_RULES` of the first broken rule (0 for none), the index of the byte at which the fault or the
+    end of the message lies, and the number of key-value pairs before it.
     """
     # for the container at each depth: `n_left` is the number of items still to come, negative if unknown; `role` is 0
     # in a list, 1 before a key and 2 before a value of a mapping; `n_items` is the number of items so far

@@ -65,7 +65,7 @@ class BlockReceiver(Protocol):
         """Add `number` to the counter called `reason`, usually the reason why messages or blocks are dropped."""
 
     def summaries(self) -> dict[str, dict[str, Any]]:
-        """Return the last summary of each actuator, by name."""
+        """Return the last summary of each actuator, by name (`WatchedActuators.summaries`)."""
 
 
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
@@ -111,7 +111,7 @@ REASONS = (
 
 @contextmanager
 def raising_refused_message() -> Iterator[None]:
-    """Convert an unexpected error in the decoding of a message to RefusedMessage, which does not end the decoder."""
+    """Convert an unexpected error within the context to RefusedMessage: a damaged message must not end the decoder."""
     try:
         yield
     except (RefusedMessage, MissingExtra):
@@ -274,7 +274,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
     `units`: unit by channel.
     """
     if name in SLOW and isinstance(values, (int, float)) and not isinstance(values, bool):
-        values = [values]  # a slow channel may be a single number
+        values = [values]
     dtype = _ARRAY_DTYPES.get(getattr(values, "tag", None) or 0)  # None unless `values` is a typed array of CBOR
     try:
         if dtype is not None:

@@ -296,9 +296,8 @@ class SparkplugHost:
         the clock, and for the first samples of an actuator.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
-        # rounding explains up to `_LATE_S`
         if abs(expected_start - t) < 3.0 * _LATE_S:
-            # the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected start
+            # by rounding the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected
             possible_start = min(max(expected_start, t - _EARLY_S), t + _LATE_S)
             shift, max_shift = possible_start - expected_start, _MAX_SHIFT / rate
             start = expected_start + min(max(shift, -max_shift), max_shift)
@@ -313,8 +312,8 @@ def _simultaneous_samples(
 
     `group`: these metrics by channel; `channel_of`: channel by name of its metric. If a value is an array, all must be
     arrays of the same length n, and channels without a value are left out. Otherwise n is 1: `birth` stores the values,
-    and a fast channel that is not in the group repeats the last single value stored there; None becomes NaN. Raises
-    RefusedMessage if the values are not numbers, or arrays of different lengths.
+    and a channel that is not in the group repeats the last single value stored there, unless it is slow (`SLOW`). None
+    becomes NaN. Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}

@@ -1,7 +1,7 @@
 """Cut the samples of a running actuator into recordings, to be judged like the files of a folder.
 
-Holds, the law of a leak, and the comparison with healthy recordings show in minutes, not in single blocks of some
-seconds. So the monitor also judges the last minutes of a commissioned machine's stream.
+Holds (standstill under load), the law of a leak, and the comparison with healthy recordings show in minutes, not in
+single blocks of some seconds. So the monitor also judges the last minutes of a commissioned machine's stream.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _MAX_BYTES = 32_000_000
 
 @dataclass
 class StreamRecorder(SavedAttributes):
-    """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s`.
+    """Collect the blocks of one actuator's stream, and cut them into recordings of `duration_s` [s].
 
     A recording also ends at `_MAX_BYTES`, and before a gap, a clock set back, or a change of channels, units or rate.
     Recordings shorter than the first of `recording.lengths` (`priors.toml`) are dropped. The first recording of all,
@@ -87,7 +87,8 @@ class StreamRecorder(SavedAttributes):
     def _full_duration(self) -> float:
         """Compute the length at which the present recording ends [s].
 
-        It is `duration_s`, or less for the first recording of all or after a gap; at least `_MIN_DURATION_S`.
+        It is `duration_s`, times 1/2 to 1 (by a hash of the actuator's name) for the first recording of all or after a
+        gap; at least `_MIN_DURATION_S`.
         """
         digest = blake2b(self.actuator.encode(), digest_size=4).digest()
         fraction = 1.0 if self.follows else 0.5 + 0.5 * int.from_bytes(digest) / 2**32
@@ -98,7 +99,7 @@ class StreamRecorder(SavedAttributes):
         self.first, self.follows, self.blocks = 0, False, []
 
     def refill(self, number: int, samples: Recording) -> None:
-        """Collect the stored block with the running `number` again, if it belongs to the present recording."""
+        """Collect a stored block again after a restart, if by its running `number` it is of the present recording."""
         if 0 < self.first <= number and len(samples):
             self.blocks.append(samples)
 

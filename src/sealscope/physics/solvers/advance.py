@@ -18,7 +18,7 @@ IMPLICIT: Implicit = (True,)
 
 
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
-    """Compute the times within a step of `h` [s] at which the integration method needs its inputs, shape (nodes,).
+    """Compute the times (nodes,) [s] within a step of `h` [s] at which the integration method needs its inputs.
 
     `implicit`: the method, `IMPLICIT` or `EXPLICIT` (an empty tuple). The first and the last time lie just inside the
     step: if an input jumps between two steps, its values there are those of this step.
@@ -82,8 +82,8 @@ def advance_closed(
 
     - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `euler_integral`: as in `advance`.
     - `y` (14,): the state, changed in place. `h` [s]: the step; there is an output before each `every`-th step.
-    - `G`, `C`, `F` (n, nodes): leakage coefficients of the piston, laminar and of an orifice, and additional load [N],
-      at the times (nodes) within each of n steps that the method needs; without a load `F` has the shape (0, 0).
+    - `G`, `C`, `F` (n, nodes): leakage coefficients of the piston [m^3/(s Pa)] and [m^3/(s Pa^0.5)], and additional
+      load [N], at the times within each of n steps that the method needs (`step_nodes`); `F` is (0, 0) without a load.
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
       in rows[0], counted from the beginning of the run.
 

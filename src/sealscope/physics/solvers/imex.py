@@ -71,11 +71,12 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve one implicit stage of a step; return its state, and the pressure rates [Pa/s] due to the throttles.
 
-    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. If bulk moduli and densities
-    depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In the body, r [Pa/m^3] is the
-    pressure rate of an oil volume per unit flow, total [Pa] the pressure difference of a throttle if nothing flowed in
-    the stage, and g [Pa s/m^3] the fall of this difference over the stage per unit flow. Boiling oil keeps its
-    pressure, so its r is 0. In `p`, an optional law such as `boiling` is an empty tuple if the rig does not have it.
+    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. On each side the throttle's
+    flow Q and its pressure drop d [Pa] at the end of the stage satisfy d + g Q = total (`implicit_flows`): total is the
+    drop if nothing flowed in the stage, and g = GAMMA h (r_chamber + r_line) [Pa s/m^3], where r [Pa/m^3] is the
+    pressure rate of an oil volume per unit flow. Boiling oil keeps its pressure, so its r is 0. If bulk moduli and
+    densities depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In `p`, an optional law
+    such as `boiling` is an empty tuple if the rig does not have it.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h

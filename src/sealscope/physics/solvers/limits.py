@@ -25,8 +25,8 @@ def _longest_mode_step(damping: float, stiffness: float) -> float:
     """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
     `damping` [1/s], `stiffness` [1/s^2]. Modes that oscillate may advance by one radian a step: 1/sqrt(stiffness). If
-    they decay, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the Runge-Kutta method of
-    order four. The result is infinite if they do neither.
+    they decay without oscillation, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the
+    Runge-Kutta method of order four. The result is infinite if they do neither.
     """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:

@@ -53,10 +53,10 @@ def quantize(value: float, count: float) -> float:
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
     """Measure the state `y` (14,) and call the controller for its sample number k; return False if it fails.
 
-    The voltage, limited to the largest one (`MAX_VOLTAGE`), is stored in `loop.volts` at k plus the delay (`DELAY`). If
-    the controller reports a leakage flow that it compensates, the flow is stored in `loop.compensated`. The controller
-    fails if the voltage is not finite. If the solver repeats a part of the run at half the step, samples that are
-    already taken keep their voltages.
+    The controller fails if its voltage is not finite. The voltage, limited to +-`MAX_VOLTAGE`, is stored in
+    `loop.volts` at k plus the delay (`DELAY`). If the controller reports a leakage flow that it compensates, the flow
+    is stored in `loop.compensated`. A sample that is already taken keeps its voltage, which the solver needs when it
+    repeats a part of the run at half the step.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:

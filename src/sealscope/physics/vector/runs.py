@@ -72,10 +72,12 @@ def _build_inputs_law(count: int) -> Any:
     - `shape` (steps, count): the commands' common waveform at the nodes, followed by the load in further columns.
     - `drive`: gain and offset [V] of each run's command; `leak`: numbers of each run's leak (`LEAK_ROWS`).
     - `p`: the optional parts of the runs' model; `p.pushed` is empty without an additional load.
+
+    In the generated source, s is the opening of the leak (`leak_opening`) at each node.
     """
 
     def for_nodes(text: str) -> str:
-        """Repeat source text for each node `{n}`, with the column `{load_column}` of its load in `shape`."""
+        """Repeat `text` for every node: {n} becomes its number, {load_column} the column of its load in `shape`."""
         return ", ".join(text.format(n=n, load_column=count + n) for n in range(count))
 
     return _compile(
@@ -109,7 +111,7 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
     flow_sum = flow_sum + abs(piston_leakage(p_A - p_B, leak[4] * opening, leak[5] * opening, q.dp_0))
     min_pressure = min(min_pressure, p_A)
     min_pressure = min(min_pressure, p_B)
-    if len(q.throttled) > 0:  # an empty tuple in rigs without lines
+    if len(q.throttled) > 0:  # rigs with lines
         min_pressure = min(min_pressure, p_1)
         min_pressure = min(min_pressure, p_2)
     state_sum = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]
@@ -145,7 +147,7 @@ def advance(
       load [N] at the same times follows. `drive` (groups, 2, WIDTH): gain and offset [V] of the command.
     - `leaks` (groups, LEAK_ROWS, WIDTH): numbers of the leaks.
     - `table` (groups, cells, fields, WIDTH): the rigs' numbers, constant within a cell, which is a span of steps;
-      `bounds` (cells + 1,): steps at which the cells begin, and the end. `p`: the choices that all rigs share.
+      `bounds` (cells + 1,): first step of each cell, counted from `start`, and the end. `p`: the rigs' common choices.
     - `pressures` (groups, outputs, CHANNELS, WIDTH): written from output `begin` on, before each `every`-th step.
     - `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
     """

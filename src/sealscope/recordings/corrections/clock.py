@@ -96,7 +96,10 @@ def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArr
 
 
 def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
-    """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the sampling rate."""
+    """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the sampling rate.
+
+    The result is NaN within intervals over `MAX_INTERVAL` median intervals, except in slow channels.
+    """
     t = recording.t[rows]
     even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate
     channels = {}

@@ -67,14 +67,16 @@ def remove_dropouts(recording: Recording) -> Recording:
 
 
 def remove_unsupplied(recording: Recording) -> Recording:
-    """Set samples of a whole recording to NaN during which the sensors had no supply.
+    """Set to NaN the samples of a recording during which the sensors had no supply.
 
     A sensor of 4 to 20 mA then reads a quarter of its range below zero. With the fraction `gaps.live_zero`
     (`priors.toml`), these samples are
 
-    - all channels, where both chamber pressures are below vacuum by at least this fraction of their maximum;
+    - all channels, where both chamber pressures are below vacuum by more than this fraction of their maximum;
     - the position alone, where it is constant from the first sample or up to the last one, and outside of all its other
-      values by this fraction of their range, if these are at least `_MIN_POSITIONS` different ones.
+      values by more than this fraction of their range, if these are at least `_MIN_POSITIONS` different ones.
+
+    The recording must be whole, as its beginning, its end and the largest values decide.
     """
     chambers, unsupplied = chambers_of(recording), dict[str, Flags]()
     if len(chambers) == 2:
@@ -89,13 +91,17 @@ def remove_unsupplied(recording: Recording) -> Recording:
 
 
 def _is_below_live_zero(pressure: Array) -> Flags:
-    """Flag the samples of a pressure (n,) [Pa] at the reading of a sensor without a supply, below vacuum."""
+    """Flag the samples (n,) of a sensor without a supply: a `pressure` p [Pa] < -P_ATM - `gaps.live_zero` max(0, p)."""
     highest = float(np.nanmax(pressure, initial=0.0))
     return np.asarray(pressure < -P_ATM - _GAPS.live_zero * highest)
 
 
 def _flag_dead_ends(position: Array) -> Flags:
-    """Flag the first and the last samples of a `position` (n,) if its sensor was off there (`remove_unsupplied`)."""
+    """Flag the first or the last samples of a `position` (n,) if its sensor was off there (`remove_unsupplied`).
+
+    These samples end at the largest step. They are flagged if they are outside of all other positions by a distance of
+    more than `gaps.live_zero` times the range of these, and vary by less than `gaps.dead` times this distance.
+    """
     known, is_dead = np.flatnonzero(np.isfinite(position)), np.zeros(len(position), dtype=bool)
     for rows in (known, known[::-1]):  # from the first sample on, and from the last one back
         values = position[rows]
@@ -283,8 +289,7 @@ def _fill_by_line(values: Array, rows: Flags) -> None:
 def _fill_by_spline(values: Array, rows: Flags) -> None:
     """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known ones.
 
-    Values before the first known one and after the last one stay missing, and all of them if at most `_N_END` values
-    are known.
+    Values before the first known one and after the last one stay missing; so do all if at most `_N_END` are known.
     """
     from scipy.interpolate import CubicSpline
 

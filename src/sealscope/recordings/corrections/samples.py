@@ -55,7 +55,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     2. rows, and then single pressures, that repeat one value for a long time;
     3. spikes, and samples that repeat the previous one;
     4. uneven sampling times;
-    5. speeds without a sign;
+    5. speeds and flows without a sign;
     6. gaps, which are interpolated or bridged, and incomplete rows at the ends, which are cut off.
 
     Steps 3, 5 and 6 are reported as findings, except for short gaps that are interpolated. Channels without any value
@@ -94,7 +94,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
     """Cut a recording to the rows from the first to the last one that has values in all `needed` channels.
 
-    No rows are left if there is none. Without `needed` channels, nothing is cut.
+    Without such a row the result is empty. Without `needed` channels, nothing is cut.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():

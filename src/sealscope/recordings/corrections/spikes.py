@@ -49,11 +49,11 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
 def find_spikes(values: Array) -> NDArray[np.intp]:
     """Find the indices of the samples at which a channel (n,) leaps and returns at once.
 
-    Such a sample lies above both neighbours, or below both. The smaller of its two steps must exceed m = `spike.times`
-    (`priors.toml`) times the usual step plus 10 quantisation steps, and m times the local slope and any other leap
-    nearby. The number of a logger's errors has a Poisson distribution with the mean `spike.share` times the number of
-    samples. If the probability of as many errors as spikes, or more, is below `spike.tail`, the signal itself leaps,
-    and the result is empty. It is also empty for fewer than 50 finite samples.
+    Such a sample lies above both neighbours, or below both. With m = `spike.times` (`priors.toml`), the smaller of its
+    two steps must exceed m times the usual step (the 0.9 quantile) plus 10 quantisation steps, and also m times the
+    local slope and any other leap nearby. The number of a logger's errors has a Poisson distribution with the mean
+    `spike.share` times the number of samples. If the probability of at least as many errors as spikes is below
+    `spike.tail`, the signal itself leaps, and the result is empty; also for fewer than 50 finite samples.
     """
     from scipy.special import pdtrc
 

@@ -130,7 +130,7 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
     """Divide a channel (n,) into its k runs of equal values; return the first index (k,) and a flag (k,) of each.
 
-    A run is flagged if it both begins and ends with a jump by more than `_MIN_JUMP` times the channel's resolution.
+    A run is flagged if it both begins and ends with a jump of more than `_MIN_JUMP` quantisation steps.
     """
     starts = np.flatnonzero(np.r_[True, values[1:] != values[:-1]])
     # flags of jumps at the starts of all runs but the first, which are also the ends of all runs but the last
@@ -141,11 +141,10 @@ def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]
 def estimate_holding_period(t: Array, values: Array) -> float | None:
     """Estimate the time [s] for which a channel (n,) that is slower than its logger repeats each reading.
 
-    It is the mean duration of the regular runs of equal values that begin and end with a jump (`_find_equal_runs`). A
-    run is regular if its duration differs from the median by at most the fraction `stale.spread` (`priors.toml`) of
-    this. Returns None if there are fewer than `stale.runs` runs, if less than the fraction `stale.share` of them is
-    regular, if the median run has fewer than two samples, or if the mean is below `stale.shortest` [s]. `t` (n,): times
-    [s].
+    It is the mean duration of the regular runs among the runs of equal values that begin and end with a jump
+    (`_find_equal_runs`). A run is regular if its duration is within the fraction `stale.spread` (`priors.toml`) of the
+    median. Returns None for fewer than `stale.runs` runs, if less than the fraction `stale.share` of them is regular,
+    if their median length is below two samples, or if the mean is below `stale.shortest` [s]. `t` (n,): times [s].
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)

@@ -30,6 +30,7 @@ _PRIORS = RECORDINGS.unsigned
 _MAX_ITERATIONS = 10
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
+#: Channel -> its quantity, for messages.
 _NAMES = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 
 
@@ -37,9 +38,8 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
     The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
-    cannot be found stays as it is. If a flow q_pump without a sign is that in a valve's supply line
-    (`_is_in_supply_line`), the result has the channel q_supply in its place. Also returns a finding for each channel
-    that was changed.
+    cannot be found stays as it is. A flow q_pump without a sign that was measured in a valve's supply line
+    (`_is_in_supply_line`) becomes the channel q_supply. Also returns a finding for each channel that was changed.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -63,10 +63,10 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
 def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     """Test whether a flow meter without a sign is in the supply line of a valve, and not in a line of the cylinder.
 
-    The valve's command must move both ways. In the supply line, the flow over the piston's speed is the area of the fed
-    chamber, whose logarithm differs between the directions behind a single rod by `unsigned.unlike` (`priors.toml`) or
-    more. Behind a double rod, oil that passes the valve while the piston rests tells the supply line: at least the
-    fraction `unsigned.passes` of the mean flow in motion. `sign` (n,): signs of the flow into chamber A.
+    Command and piston must move both ways, and one of two signs of the supply line is enough. The flow over the
+    piston's speed, i.e. the area of the fed chamber, may differ between the directions, as with a single rod: its
+    logarithm by more than `unsigned.unlike` (`priors.toml`). Or oil passes the valve while the piston rests, more than
+    the fraction `unsigned.passes` of the mean flow in motion. `sign` (n,): signs of the flow into chamber A.
     """
     magnitude, speed = np.abs(recording["q_pump"]), _piston_speed(recording["x"], recording.rate)
     known = np.isfinite(magnitude)
@@ -81,6 +81,7 @@ def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     ]
     if min(gains) > 0.0 and abs(float(np.log(gains[0] / gains[1]))) > _PRIORS.unlike:
         return True
+    # over the mean speed, weighted by the speed itself, so that rests do not count
     is_moving = np.abs(speed) > _PRIORS.rests * float(speed @ speed) / float(np.abs(speed).sum())
     flow_at_rest = float(magnitude[~is_moving].mean()) if not is_moving.all() else 0.0
     return flow_at_rest > _PRIORS.passes * float(magnitude[is_moving].mean())
@@ -156,7 +157,7 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     known = np.isfinite(speed) & np.isfinite(difference) & np.isfinite(magnitude)
     speed, difference, magnitude = (np.where(known, values, 0.0) for values in (speed, difference, magnitude))
     motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
-    step_scale = _average_nearby(np.abs(np.diff(magnitude)), recording.rate)
+    step_scale = _average_nearby(np.abs(np.diff(magnitude)), recording.rate)  # of the Laplace density below
     step_scale = np.maximum(step_scale, np.finfo(float).eps * magnitude.max() + np.finfo(float).tiny)
     # log odds against a change of sign after a sample: a change makes the step of the signed values larger by twice the
     # smaller magnitude, such steps have a Laplace density, and changes are rare
@@ -247,5 +248,6 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
     # if its odds exceed the cost of the next change, a sample keeps its sign whatever follows
     decided = np.abs(path_odds) > np.append(cost_of_change, 0.0)
     decided[-1:] = True
+    # the first decided sample from each sample on
     following = np.flatnonzero(decided)[np.searchsorted(np.flatnonzero(decided), np.arange(log_odds.size))]
     return np.where(path_odds[following] < 0.0, -1.0, 1.0)

@@ -27,6 +27,7 @@ MISSING = frozenset({"", *WORDS["missing"]})
 MAX_WORD_FRACTION = 0.01
 #: Longest number, and longest number with its unit [characters].
 _MAX_NUMBER, _MAX_QUANTITY = 400, 80
+#: Decimal separator -> pattern of a number.
 _NUMBER = {
     ".": re.compile(r"[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),
     ",": re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eEdD][+-]?\d+)?|[+-]?inf(?:inity)?", re.IGNORECASE),

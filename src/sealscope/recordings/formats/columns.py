@@ -36,8 +36,8 @@ _MAX_DIGITS = 9
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: Units of a rotational speed that are revolutions a minute, not frequencies.
 _ROTATION_UNITS = WORDS["rotation_units"]
-#: Channel (or `t`) -> column, given by a caller; or "auto": choose by the columns' names. In a mapping, `REST` ->
-#: "auto" does this for the channels that the mapping does not name.
+#: Channel (or `t`) -> column, given by a caller; or "auto": choose by the columns' names. The entry `REST` -> "auto" of
+#: a mapping does this for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
 REST = "*"
 
@@ -62,7 +62,7 @@ class ColumnMap:
     rate: float | None = None  # sampling rate [Hz] from the caller or the file
     time: int | None = None  # the time column
     time_label: Label | None = None  # name and unit used for it
-    channels: dict[str, Formula[int]] = field(default_factory=dict)
+    channels: dict[str, Formula[int]] = field(default_factory=dict)  # channel -> formula of its columns
     parts: dict[str, int] = field(default_factory=dict)  # part of a time in several columns, such as "hour" -> column
     #: Column of the date, in case the time column contains only times of day. If the name of the time column means a
     #: date, it is the time column itself, which may then contain only dates.
@@ -80,6 +80,7 @@ class ColumnMap:
     @property
     def columns(self) -> dict[int, str]:
         """Mapping from each column to read to its kind, "numbers" or "time"; the time column comes last."""
+        # a time column that is also a channel is read as numbers
         number_columns = {*self.channel_of, *self.parts.values()} - {self.time}
         columns = dict.fromkeys(sorted(number_columns), "numbers")
         if self.time is not None:
@@ -133,9 +134,10 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Reconstruct the map by which a recording was read, from its provenance: channel -> column and unit.
+    """Reconstruct the map that "auto" has chosen for a recording, channel -> column, from its provenance.
 
-    Without an entry `columns` in the provenance, the map is empty.
+    A column has its unit if its name ends in one; units in a user's map are not in the provenance. Without an entry
+    `columns` in the provenance, the map is empty.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}

@@ -71,7 +71,7 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
 
 
 def _read_field(data: Any, name: str, field: str) -> NDArray[Any]:
-    """Read one field of the data set of records `name` as doubles (n,)."""
+    """Read a field of `data`, the data set of records called `name`, as doubles (n,)."""
     check_internal(name, data)
     return np.asarray(data[field], dtype=np.float64)
 

@@ -370,10 +370,10 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
-    """Read the samples (n,) of a series as doubles or, with `as_time`, as datetime64; raise InputError for other types.
+    """Read the samples (n,) of a series as doubles; with `as_time`, read date stamps as datetime64.
 
     Durations become seconds. In a column of texts, words become NaN if they are at most the fraction
-    `MAX_WORD_FRACTION` of the cells.
+    `MAX_WORD_FRACTION` of the cells. Raises InputError for more words, and for other types.
     """
     values = series.values()
     if values.dtype.kind in "OSU":
@@ -488,9 +488,9 @@ def _read_long_channel(
 ) -> tuple[Array, Array, np.datetime64 | None]:
     """Read a channel of a long table, in which each row is one sample of a named channel; `rows` (k,) are its rows.
 
-    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `table`: column -> cells;
-    `value_column`: column of the values; `label`: heading of the channel. The rows with a time are read like a
-    recording with the only channel `u`, in counts, so that values are not converted. Raises InputError if too many
+    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `choice`: the time column, and
+    the values as the only channel `u`, in counts (`_count_request`); `table`: column -> cells; `value_column`: column
+    of the values; `label`: heading of the channel. Rows without a time are left out. Raises InputError if too many
     samples are words.
     """
     assert choice.time is not None

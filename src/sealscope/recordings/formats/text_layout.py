@@ -129,10 +129,10 @@ def _used_width(row: Sequence[str]) -> int:
 def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
     """Detect (delimiter, decimal separator, number of cells in a row) from lines of a log; (",", ".", 1) if unclear.
 
-    Each pair of separators in `_DIALECTS` is tried. The table consists of the rows of one width, namely the width with
-    most values (numbers and time stamps). It must contain at least half of all values. The pair is chosen whose table
-    has the most values, relative to the number of cells that are not missing, in rows of any width with a value. Rows
-    of a single cell are ignored.
+    Each pair of separators in `_DIALECTS` is tried. Its table consists of the rows of one width, namely the width with
+    most values (numbers and time stamps), and must contain at least half of all values. A pair's rank is the number of
+    values in its table over the number of cells, except missing ones, in all rows with a value. The highest rank wins.
+    Rows of a single cell are ignored.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)

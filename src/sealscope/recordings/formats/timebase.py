@@ -19,6 +19,7 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import to_si
 
+#: Date such as 05/06/2024 or 05-06-24, in which the day or the month comes first.
 _EITHER = r"(?P<first>\d{1,2})(?P<stroke>[/-])(?P<second>\d{1,2})(?P=stroke)(?P<year>\d{4}|\d{2})"
 #: Forms of dates; whether `first` is the day or the month is decided from a whole column (`is_day_first`).
 _DATES = (
@@ -64,13 +65,13 @@ _HOUR, _DAY = 3600.0, 86400.0  # [s]
 _TOLERANCE = 3.0
 #: Daylight saving time changes before this hour of the day.
 _LATEST_CHANGE = 4
-#: Range of days since 1899-12-30 in the years 1982 to 2078.
+#: Range of days since 1899-12-30 in the years 1982 to 2077.
 _EXCEL_RANGE = (30_000, 65_000)
 #: Largest intervals of numbers that count fractions of a day, and days: no logger samples every 2 or 12 us.
 _MAX_FRACTION_STEP, _MAX_DAY_STEP = 2e-6, 1.2e-5
 #: MATLAB's datenum of 1899-12-30.
 _DATENUM_OFFSET = 693_960
-#: Numbers from here on (the year 2074 if counted from 1970) are seconds since 1904 (then the year 2008).
+#: Numbers from here on (December 2073 if counted from 1970) are seconds since 1904 (then December 2007).
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 #: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.
 _MIN_EPOCH, _MAX_EPOCH = 1e8, 1e11
@@ -146,7 +147,7 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
-    """Collect the dates like 05/06/2024 or 05-06-24 at the beginnings of `cells`, each once, as keys of a dict."""
+    """Collect the dates like 05/06/2024 or 05-06-24 at the beginnings of `cells`, in order and each once, as keys."""
     return {match["date"]: None for cell in cells if (match := _EITHER_DATE.match(cell))}
 
 
@@ -367,8 +368,8 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
 
     `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only the
     guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log. Returns
-    the times (n,) [s], the provenance of the start, and lines for the history. Raises InputError if no number is
-    finite.
+    the times (n,) [s], the provenance of the start, and lines for the history. Times with an origin, or since 1970,
+    become relative to the first. Raises InputError if no number is finite.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -429,7 +430,7 @@ def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
     """Find the meaning of numbers (n,) in a time column without a unit if they count days; None if they do not.
 
     Their steps, taken as seconds, must be shorter than those of any logger, and the first number must be a date from
-    1982 to 2078 in the count of spreadsheets or of MATLAB. With such steps, numbers between 0 and 1 are fractions of a
+    1982 to 2077 in the count of spreadsheets or of MATLAB. With such steps, numbers between 0 and 1 are fractions of a
     day. Returns (date of day 0, or None for fractions; meaning in words).
     """
     steps = np.diff(values)

@@ -32,7 +32,7 @@ def _integer_constant(value: int) -> Any:
 
 
 def _result_type(arg_types: Any) -> Any:
-    """Return the type of the first argument if that is a vector of doubles (lanes), else None."""
+    """Return the result's type, that of the first argument, if that is a vector of doubles (lanes), else None."""
     return LANES if arg_types[0] == LANES else None
 
 

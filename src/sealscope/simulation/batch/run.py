@@ -472,7 +472,8 @@ class SetRun:
         """Compute the command's waveform [V] and the load [N], if any, at the solver's nodes in all steps of a chunk.
 
         The nodes are times within a step; the chunk has the outputs start <= output < stop. The result has a row for
-        each step: the waveform at the nodes, followed by the load at the nodes if there is one.
+        each step: the waveform at the nodes, followed by the load at the nodes if there is one, (steps, nodes) or
+        (steps, 2 nodes).
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times = t[:, None] + self.nodes

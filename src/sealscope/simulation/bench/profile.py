@@ -42,6 +42,8 @@ _Closed = Annotated[_Number, Field(ge=0.0, le=99.0), AfterValidator(lambda perce
 
 
 class _DriftEntry(BaseModel, extra="forbid"):
+    """The drift in an entry of a profile's file, with `size` in `unit`; the other fields are those of `DriftRange`."""
+
     size: _Pair
     unit: _Text
     shapes: Annotated[tuple[Literal["linear", "wander"], ...], Field(min_length=1)] | None = None
@@ -49,6 +51,12 @@ class _DriftEntry(BaseModel, extra="forbid"):
 
 
 class _NuisanceEntry(BaseModel, extra="forbid"):
+    """An entry of a profile's file, a difference between machines; it states one of `range`, `scale` and `values`.
+
+    `range` [low, high] and `values` are in `unit`; `scale` is the range [low, high] of a factor on the rig's value. The
+    other fields are those of `Nuisance`.
+    """
+
     name: _Text
     parameters: _Names
     range: _Pair | None = None
@@ -104,11 +112,11 @@ class NuisanceChoice:
 
 @dataclass(frozen=True, repr=False, kw_only=True)
 class Duty:
-    """The commands and loads of a profile's machines, of which each machine draws one.
+    """The commands, throttle settings, loads and controllers of which each machine of a profile draws one.
 
-    A factor on the amplitude of `commands` is drawn from the range `amplitude`. `closed`: closed fractions of both
-    throttles (in the file: per cent); `loads` on the rod, if any; `controllers` that follow a position target (default:
-    PI); `why`: the reason for this duty.
+    `commands`: texts of commands or position targets; `closed`: closed fractions of both throttles (in the file: per
+    cent); `amplitude`: range of a factor on the command's amplitude; `loads`: texts of loads on the rod, () for none;
+    `controllers`: names of controllers that follow a position target, () for PI; `why`: the reason for this duty.
     """
 
     __pydantic_config__ = _KNOWN_ONLY
@@ -153,7 +161,7 @@ def _parse_nuisance(table: Any) -> AnyNuisance:
 
 
 def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
-    """Convert an entry of a profile's file to SI units; raise InputError if its fields do not fit together."""
+    """Make the nuisance of an entry, in SI units; raise InputError if the entry's fields do not fit together."""
     parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
@@ -209,7 +217,7 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
-    can_fall = entry.oil != 1.0  # with weight 1 the drift follows the oil, which only warms
+    can_fall = entry.oil != 1.0  # with weight 1 the drift follows oil that only warms (`Family.warms`)
     if low < 0 or (not absolute and can_fall and high >= 1):
         limit = "" if absolute else " and < 100 %"
         raise InputError(f"size of the drift must be >= 0{limit}, got {low:g} to {high:g}")
@@ -319,6 +327,8 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
 
 
 class _Head(BaseModel, extra="forbid"):
+    """The table `[profile]` of a file; `extends`: packaged profile whose nuisances and duty the profile inherits."""
+
     name: _Text
     title: _Text
     seeds: str = ""
@@ -326,6 +336,8 @@ class _Head(BaseModel, extra="forbid"):
 
 
 class _File(BaseModel, extra="forbid"):
+    """The file of a profile: its tables [profile] and [duty], and its lists of [[nuisance]] and [[family]]."""
+
     profile: _Head
     duty: Duty | None = None
     nuisance: _Nuisances = ()

@@ -49,10 +49,14 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    The cells are chamber, detail, geometric mean change of the RMS with the leak [%], simulated and measured, geometric
-    mean and standard deviation of the simulated over the measured RMS without the leak, number of tests in which both
-    RMS change in the same direction, and correlation of the log changes. Without a `measured` sheet, the five cells
-    that need it are None.
+    The cells of a row are:
+
+    - chamber and detail;
+    - change of the RMS with the leak [%], simulated and measured (geometric means over the tests);
+    - ratio of simulated to measured RMS without the leak: geometric mean and geometric standard deviation;
+    - number of tests in which both RMS change in the same direction, and correlation of both log changes.
+
+    Without a `measured` sheet, the five cells that need it are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:

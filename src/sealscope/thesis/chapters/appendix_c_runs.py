@@ -119,7 +119,7 @@ def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) 
 
 
 def pressure_range(values: Array) -> float:
-    """Compute the range of a pressure as the difference between its 95 % and 5 % quantiles."""
+    """Compute the range of a pressure, in its unit, as the difference between its 95 % and 5 % quantiles."""
     return float(np.ptp(np.percentile(values, [5.0, 95.0])))
 
 
@@ -164,8 +164,9 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details in both halves.
 
-    `item.inputs` states the kind of the runs. With the leak, the first test of each operating condition is repeated
-    with half the solver's step, except in a quick reproduction. The halves of a quick reproduction are shorter.
+    `item.inputs` states the kind of the runs. With the leak, the first test of each operating condition (command and
+    closing) is repeated with half the solver's step, except in a quick reproduction. The halves of a quick reproduction
+    are shorter.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows = []

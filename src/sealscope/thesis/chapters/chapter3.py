@@ -49,7 +49,7 @@ class WaveletCentre(NamedTuple):
 
 
 class AmplitudeSpectrum(NamedTuple):
-    """Amplitudes and phases [degree] of the cosines whose sum is a signal, by frequency [Hz]; each (n,)."""
+    """Amplitudes and phases [degree] of the cosines whose sum is a signal, by frequency [Hz]; each (frequencies,)."""
 
     frequency: Array
     amplitude: Array
@@ -59,7 +59,7 @@ class AmplitudeSpectrum(NamedTuple):
 class Spectrogram(NamedTuple):
     """Amplitudes (frequencies, windows) of the cosines in successive windows of a signal.
 
-    `t`: middles of the windows [s]; `frequency`: frequencies [Hz].
+    `t` (windows,): middles of the windows [s]; `frequency` (frequencies,) [Hz].
     """
 
     t: Array
@@ -286,8 +286,8 @@ def _width(t: Array, values: Array) -> float:
 def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the wavelet transform of the simulated pressure p_A, which rings, before and after a leak opens.
 
-    The panels are the pressure, its transform with and without the noise of the instruments, and the rms of the
-    transform without noise over the times before and after the leak opens.
+    The panels are the pressure, the rms of its transform in blocks of 0.05 s, with and without the noise of the
+    instruments, and the rms of the transform without noise over the times before and after the leak opens.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t

@@ -307,11 +307,11 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
         """Compute a statistic of `values` (n,) over whole periods of the command, without and with the leak."""
         return statistic(values[masks[0]]), statistic(values[masks[1]])
 
-    steps = {}
+    step_times = {}
     for chamber in CHAMBERS:
         centres, curves = windowed_detail_rms(recording, chamber)
         is_settled = centres >= SETTLING
-        steps[chamber] = fit_step_time(centres[is_settled], curves["d3"][is_settled])
+        step_times[chamber] = fit_step_time(centres[is_settled], curves["d3"][is_settled])
     before, after = (sine_fit(t[mask], run.outputs["x"][mask], test.omega).slope * 1e3 for mask in masks)
     return LeakTestMeasures(
         test=test,
@@ -320,5 +320,5 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
         drift=(before, after),
         velocity=compute_pair(run.outputs["v"] * 1e3),
         range_MPa={chamber: compute_pair(run.outputs[chamber] / 1e6, pressure_range) for chamber in CHAMBERS},
-        step_s=steps,
+        step_s=step_times,
     )

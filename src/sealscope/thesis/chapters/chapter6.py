@@ -203,7 +203,10 @@ def tracking(run: Trajectory, mask: Array) -> tuple[float, float, float]:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking, bandwidth, energy, stiffness and leakage by controller and leak; plot error and stiffness."""
+    """Tabulate tracking, bandwidth, energy, stiffness and compensated leakage; plot error and stiffness over the leak.
+
+    The table has a row for each of the `CONTROLLERS` and each leak.
+    """
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
         loop = ControlledRig(name, lpm)
@@ -215,7 +218,7 @@ def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figur
 
 
 def _leak_flows(context: Context) -> tuple[float, ...]:
-    """Return the leaks [L/min] to simulate, fewer of them in a quick reproduction."""
+    """Return the leaks [L/min under a load of 2 kN] to simulate, fewer of them in a quick reproduction."""
     return (0.0, 0.5) if context.quick else LEAKS
 
 
@@ -297,18 +300,18 @@ def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]
     due to the loss of oil. The flow of a leak is stated for the mean pressure on its side in a run without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
-    pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
+    mean_pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
     # the controller "ideal" is left out, as only internal leaks are made known to it
     names, leaks = (("pi",), (0.5,)) if context.quick else (CONTROLLERS[:-1], LEAKS[1:])
     rows: list[tuple[Cell, ...]] = []
-    for side, name, lpm in itertools.product(pressure, names, leaks):
-        loop = ControlledRig(name, 0.0, values=((f"G_ext_{side}", lpm * LITRE_PER_MINUTE / pressure[side]),))
+    for side, name, lpm in itertools.product(mean_pressure, names, leaks):
+        loop = ControlledRig(name, 0.0, values=((f"G_ext_{side}", lpm * LITRE_PER_MINUTE / mean_pressure[side]),))
         run, mask = loop.run_duty()
         lower_pressure = np.minimum(run["p_A"], run["p_B"])
         third_cycle, fifth_cycle = (1e-3 * float(np.mean(lower_pressure[_cycle_mask(run.t, k)])) for k in (2, 4))
         error, _, flow = tracking(run, mask)
         rows.append((side, name, lpm, error, loop.stiffness(), flow, fifth_cycle - third_cycle))
-    notes = format_note("outside", rig=RIG, load=LOAD, A=1e-6 * pressure["A"], B=1e-6 * pressure["B"])
+    notes = format_note("outside", rig=RIG, load=LOAD, A=1e-6 * mean_pressure["A"], B=1e-6 * mean_pressure["B"])
     return (item.table(rows, notes),)
 
 
@@ -320,6 +323,7 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
         loop = ControlledRig(name, lpm, rig)
         run, mask = loop.run_duty()
         error, energy, _ = tracking(run, mask)
+        # hydraulic energy at the pump's ports in a cycle [J]
         pump_energy = float(np.mean((run["Q_1"] * (run["p_1"] - run["p_2"]))[mask])) * CYCLE
         efficiencies = [100 * efficiency for efficiency in loop.efficiencies()]
         rows.append((source, name, lpm, error, loop.bandwidth(), loop.stiffness(), energy, pump_energy, *efficiencies))
@@ -393,7 +397,7 @@ def _load_claim(context: Context) -> Claim:
     highs = [high for _, high in error_ranges.values()]
     text = "; ".join(f"{name} {low:.3f} to {high:.3f} mm" for name, (low, high) in error_ranges.items())
     tests = [max(highs) > DISTINCT_RATIO * min(highs)]
-    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE  # 1 % of the amplitude [mm]
+    all_below_one_percent = max(highs) < 0.01 * 1e3 * AMPLITUDE  # 1 % of the duty's amplitude [mm]
     return judge_claim("6.2.3", tests, spread=text, all_below=all_below_one_percent, largest_low=max_low)
 
 
@@ -407,6 +411,7 @@ def _valve_claim(context: Context) -> Claim:
     for head in ("efficiency against a damper [%]", _ERROR):
         pair = [_column_by_leak(table, (source, "pi"), head)[0.0] for source in ("pump", "valve")]
         tests.append(max(pair) > DISTINCT_RATIO * min(pair))
+    # by rig and leak: the cells of the columns after the leak
     numbers = {(source, lpm): values for source, name, lpm, *values in table.rows if name == "pi"}
     max_leak = max(float(lpm or 0.0) for _, lpm in numbers)
     pump, valve = numbers["pump", 0.0], numbers["valve", 0.0]

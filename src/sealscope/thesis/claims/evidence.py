@@ -32,10 +32,10 @@ SENSITIVE = ("d3", "d4", "d3d4")
 class ClaimEvidence:
     """The data by which the claims on detection are judged.
 
-    `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
-    `drift_sheet`: the same tests simulated with their leak, without a leak, and without a leak but with drifting
-    parameters; `leak_table`: the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten simulated
-    tests of chapter 5 by section, such as "5.2a"; `no_leak_measures`: those of test 5.2a without its leak.
+    `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`: the same
+    tests simulated with and without their leak; `drift_sheet`: without a leak but with drifting parameters, each test
+    once or twice; `leak_table`: the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten
+    simulated tests of chapter 5 by section, such as "5.2a"; `no_leak_measures`: those of test 5.2a without its leak.
     """
 
     measured_sheet: DataSheet | None

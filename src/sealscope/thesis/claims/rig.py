@@ -87,8 +87,8 @@ def _printed_test_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims on the ten tests whose figures chapter 5 prints, by measures of the simulated tests.
 
     - 5.7.1: the RMS of the motor's speed changes by less than 1 % with the leak in each test.
-    - 5.7.2: in test 5.2a the piston's drift falls from the first half to the second, in which the leak is open, and
-      this fall is over 10 % larger than without the leak.
+    - 5.7.2: in test 5.2a the fall of the piston's drift, from the first half to the second with the open leak, exceeds
+      the fall without the leak by over 10 % of the latter.
     - 6.1.2: with the leak, the piston's velocity changes by more than 5 % in at least one test, and so does the range
       of a chamber pressure.
     - 5.7.3: the leak of test 5.3a changes the ranges of both chamber pressures by more than 5 %.
@@ -138,7 +138,7 @@ def _throttle_claim(evidence: ClaimEvidence) -> Claim:
     """Judge claim 6.1.3: partly closed throttles raise the leak-free pressure ranges, more so at larger commands.
 
     For each command, the largest closing must raise the range of each chamber pressure by more than 1 %. Among the
-    commands whose largest closing is 75 %, the rise must grow with the amplitude.
+    commands whose largest closing is 75 %, the mean rise of both chambers must grow with the amplitude.
     """
     ranges = np.stack([column(evidence.leak_table, f"{chamber} range [MPa]") for chamber in CHAMBERS])
     closed_pct = np.array([row.closed_pct for row in APPENDIX_C])

@@ -71,10 +71,7 @@ def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
 
 
 def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
-    """Format the false-alarm rates of a rule of Table 5.1, from simulations without a leak.
-
-    These are simulated with constant and with drifting parameters.
-    """
+    """Format the false-alarm rates of a rule of Table 5.1, simulated without a leak, without and with drift."""
     no_leak, drift = (format_rate(rule.fires(sheet)) for sheet in (evidence.no_leak_sheet, evidence.drift_sheet))
     return f"In simulation the rule fires in {no_leak} with no leak and in {drift} with drift alone"
 
@@ -86,7 +83,7 @@ def _rate_claim(rule: Rule, where: str) -> SheetClaim:
     """
     # without an effect each of the rule's details moves in its direction with probability 1/2
     chance = 0.5 ** len(rule.details)
-    printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]
+    printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]; several where the thesis disagrees
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
         """Test that the rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
@@ -353,7 +350,10 @@ _CLAIMS: dict[str, SheetClaim] = {
 
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
-    """Judge the claims that the data sheet decides: abstract, sections 5.6 and 5.7, Table 5.1, and chapter 6."""
+    """Judge the claims on leak detection that the data sheet decides: abstract, chapter 5 with Table 5.1, chapter 6.
+
+    The claims of `leak_level_claims` and `curve_claims` are left out.
+    """
     for number, rule in enumerate(CLAIMED, start=1):
         where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"  # Figs. 5.90 to 5.95
         yield _rate_claim(rule, where).judge(evidence, id=f"5.4.{number}", kind="5.4")
@@ -395,8 +395,8 @@ def _test_rows(
     """Test that the RMS of wavelet details change by more than the noise in the row of the data sheet for `test`.
 
     `names`: the details; `falls`: True if only falls count, False for changes in either direction. Returns a text, and
-    True or False for each detail. If several rows can be the test of chapter 5, the text also counts those that change
-    beyond the noise.
+    True or False for each detail. If several rows can be the test of chapter 5, the text also counts the rows that
+    change beyond the noise.
     """
     row = test.condition.number - 1
     limit = d1_threshold(sheet, chamber, either_side=not falls)
@@ -418,9 +418,9 @@ def _test_rows(
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of chapter 5 that a leak changes the RMS of some wavelet details of a chamber's pressure.
 
-    Some claims state a fall, others any change. It must exceed the noise in the measured data sheet (`_test_rows`);
-    without this sheet the claim cannot be tested. The texts also state the simulated changes and, for each detail, the
-    threshold that changes due to drifting parameters alone exceed in 5 % of the simulated tests.
+    Some claims state a fall, others any change. The fall or change must exceed the noise in the measured data sheet
+    (`_test_rows`); without this sheet the claim cannot be tested. The texts also state the simulated changes and, for
+    each detail, the threshold that changes due to drifting parameters alone exceed in 5 % of the simulated tests.
     """
     curves = load_texts("cases.toml")["curves"]
     for number, (section, chamber, names, statement) in enumerate(curves, start=1):

@@ -108,15 +108,15 @@ def reproduce(
     selected = add_needed_items(all_items, select_items(all_items, patterns))
     root = Path(folder)
     sheet_folder = find_sheet(sheet)
-    data, sheet_key = (None, "") if sheet_folder is None else read_sheet(sheet_folder)
+    data_sheet, sheet_key = (None, "") if sheet_folder is None else read_sheet(sheet_folder)
     keys = _item_keys(all_items, sheet_key, quick, is_published=publish is not None)
     store = make_inner_folder(root, "kept")
     with lock_rows(store, _WHAT):
         stored_rows = read_rows(store, partial(_parse_row, keys), _WHAT, loads)
-        statuses = {item.id: _item_status(item, data, stored_rows.get(item.id), root) for item in all_items}
+        statuses = {item.id: _item_status(item, data_sheet, stored_rows.get(item.id), root) for item in all_items}
         waiting = {item.id: item for item in selected if statuses[item.id].state == "not made"}
         runs = _empty_runs_folder(store)
-        task = partial(_make_item, quick, data, publish, root, runs)
+        task = partial(_make_item, quick, data_sheet, publish, root, runs)
         in_work: list[str] = []
         n_done = 0
 
@@ -133,6 +133,7 @@ def reproduce(
                 products = {need: status.products for need, status in needed.items() if status.state != "failed"}
                 yield waiting[name], keys[name], products
 
+        # an item is ready when all items it needs are finished
         order = TopologicalSorter({name: waiting.keys() & item.needs for name, item in waiting.items()})
         order.prepare()
         while order.is_active():
@@ -198,7 +199,7 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
     """Determine the status of an item before anything is made: "kept", "left out" or "not made".
 
     It is "left out" if it cannot be made without the data sheet, and `sheet` is None. It is "kept" if its stored result
-    `row` has no error, and all files of the result exist in `folder`.
+    `row` (None for none) has no error, and all files of the result exist in `folder`.
     """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)

@@ -26,9 +26,11 @@ class SimulatedRun:
     """The result of one simulated run, which may have failed.
 
     `recording`: None if the run failed; `t` [s], `outputs`: noise-free outputs at the samples (`TRUE_OUTPUTS` in
-    `simulation.simulate`); `mean_leak_lpm`: mean leak while open [L/min]; `resolved`: True if the run changed little
-    when the solver's step was halved, False if not, None if this was not tested; `step_changes`: rms changes by this
-    halving in SI units, by name of the quantity; `diverged`: one-line reason of a failed run, "" for none.
+    `simulation.simulate`), empty if the run failed; `mean_leak_lpm`: mean leak while open [L/min]; `resolved`: True if
+    the run changed little when the solver's step was halved, False if not or if it failed, None if this was not tested;
+    `step_changes`: changes of states, pressures and details by this halving, in SI units, by the name of the quantity
+    (`compare_trajectories` in `simulation.simulate`), empty if there are none; `diverged`: one-line reason of a failed
+    run, "" for none.
     """
 
     recording: Recording | None
@@ -41,7 +43,7 @@ class SimulatedRun:
 
     @property
     def recorded(self) -> Recording:
-        """The recording of the run; raises SimulationFailed if the run diverged."""
+        """The recording of the run; raises SimulationFailed if the run failed."""
         if self.recording is None:
             raise SimulationFailed(self.diverged)
         return self.recording

@@ -66,7 +66,7 @@ def write_thesis_page(
         chapters[status.item.chapter].append(_page_product(status, product, folder, claims))
         for name in product.claims:
             products_by_claim[name].append(product.id)
-    absent: dict[str, list[ItemStatus]] = defaultdict(list)
+    absent: dict[str, list[ItemStatus]] = defaultdict(list)  # items without products, by reason
     for status in statuses:
         if status.state == "not made":
             absent["not made yet, or from other sources"].append(status)
@@ -104,10 +104,7 @@ def write_thesis_page(
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
 ) -> PageProduct:
-    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id.
-
-    The last field of the entry is the text that the page's search looks through.
-    """
+    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id."""
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
     # (format, path) of the product's files, which are named by its id

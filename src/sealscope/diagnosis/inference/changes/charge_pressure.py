@@ -85,8 +85,8 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
-    `charge.near` (`priors.toml`) of the chamber's lowest pressure and change by less than `charge.steady`, since a load
-    that swings through zero lowers the pressure for a moment only. While the pump rests no sample counts, as shut
+    `charge.near` (`priors.toml`) of the chamber's lowest pressure and change more slowly than `charge.steady` [Pa/s]: a
+    load that swings through zero lowers the pressure only for a moment. While the pump rests no sample counts, as shut
     valves may enclose any pressure. The drift of a chamber is unknown if its lowest pressure exceeds that of the other
     chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples of a turning pump counts.
     Return None if neither drift is known, if the recording is shorter than `MIN_SAMPLES`, or if a pressure, or both
@@ -139,14 +139,14 @@ class ChargeTrend(NamedTuple):
     def loss_support(self, flow: float, onset: float) -> float:
         """Compute twice the log likelihood ratio of a loss of oil to no loss, by the fall of the charge pressure.
 
-        A constant loss `flow` = q [m^3/s] since `onset` [s] empties an accumulator with the gas volume V at the charge
-        pressure p. A straight line fitted to the pressure over the whole recording then falls at the rate
+        A constant loss `flow` = q [m^3/s] since `onset` [s] empties an accumulator, whose gas volume at the charge
+        pressure p, divided by the polytropic exponent of the gas, is V. A straight line fitted to the pressure over the
+        whole recording then falls at the rate
 
             fall = (p q / V) (1 - f)^2 (1 + 2 f),
 
-        where f is the fraction of the recording before the onset. Here V is the gas volume over the polytropic exponent
-        of the gas. The likelihood is averaged over a log-normal prior on this V. With a small probability, a measured
-        fall has another cause.
+        where f is the fraction of the recording before the onset. The likelihood is averaged over a log-normal prior on
+        V (`accumulator` in `priors.toml`). With a small probability, a measured fall has another cause.
         """
         prior, z = CHANGES.accumulator, np.linspace(-3.0, 3.0, N_VOLUMES)  # log V in standard deviations
         weights = np.exp(-0.5 * z**2) / np.exp(-0.5 * z**2).sum()

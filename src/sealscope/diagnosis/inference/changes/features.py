@@ -1,4 +1,4 @@
-"""Tests of features that no volume balance contains for a step: amplitude of motion, sensor noise, hum.
+"""Tests for a step of features that no volume balance contains: amplitude of motion, sensor noise, hum.
 
 Each feature is one number in each block with motion, tested against its scatter between blocks. Blocks at rest, with a
 pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak changes none of the
@@ -37,9 +37,10 @@ _NEIGHBOURS = _PRIORS.neighbours
 def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
-    Returns a test for each amplitude; an empty list with too few blocks in motion. A change of what the machine is
-    commanded to do (its duty) changes both amplitudes alike; a leak changes only one. The recording is divided into
-    `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of whole cycles.
+    Returns a test for each amplitude; an empty list if one cannot be tested, as with too few blocks in motion. A change
+    of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one. The
+    recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of
+    whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -56,8 +57,9 @@ def duty_tests(recording: Recording) -> list[StepTest]:
 def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
     """Compute the fraction of each block's samples in which the piston moves, (K,).
 
-    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz]; NaN counts as rest. The speed, averaged over
-    `AVERAGING_TIME`, must exceed the fraction `CHANGES.levels.slowest` of `max_speed`.
+    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz], in any unit, NaN where missing. The speed,
+    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`; a time
+    without any known speed counts as rest.
     """
     mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
     return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))

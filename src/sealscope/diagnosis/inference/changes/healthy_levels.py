@@ -49,7 +49,7 @@ TINY = 1e-300
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 #: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
 DRIFT_KEYS = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
-#: Quantile of the healthy frictions' excess in the wrong direction, over their errors, by which the errors are raised.
+#: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_log_frictions`).
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
 #: one is made without loads that change slowly.
@@ -198,7 +198,7 @@ def _read_drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None
 
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
-    """Estimate friction, drifts and spectra of a recording, by their names; None if none of them can be estimated."""
+    """Estimate friction, drifts and spectra of a recording (`HealthyLevels.learn`); None if none can be estimated."""
     levels = dict[str, float]()
     for keys, without_slow_changes in zip(FRICTION_KEYS, (False, True), strict=True):
         fit = fit_difference(recording, without_slow_changes=without_slow_changes)
@@ -221,7 +221,8 @@ def _estimate_levels(recording: Recording) -> Summary | None:
 def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
     """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
 
-    Its error allows for residuals that are correlated within a stroke. It is infinite if the drift is undetermined.
+    The error allows for residuals that are correlated within a stroke. It is infinite if the motion does not determine
+    the drift.
     """
     values = pressure[motion.rows]
     coefficients, weight = fit_robustly(motion.design, values)

@@ -80,7 +80,7 @@ class LevelChange(NamedTuple):
     `name`: cause that changes these levels, such as "friction"; `rank`: by which patterns are compared (see the
     module); `score`: twice the log likelihood ratio of a step to no step in these levels alone; `chance`: probability
     that a healthy recording scores as high; `onset`: time of the step [s]; `block`: length of a block [s];
-    `pressure_scale`: scale of both pressures that would cause the change, if known.
+    `pressure_scale`: logarithm of a factor on both pressures that would cause the change, None if there is none.
     """
 
     name: str
@@ -255,10 +255,11 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
 
 
 def _pressure_scale(before: Array, after: Array) -> Estimate | None:
-    """Compute the factor on both pressures that would explain the change of the friction between two groups of blocks.
+    """Compute the logarithm of the factor on both pressures that would explain a change of the friction.
 
-    `before`, `after` (k, 4) [Pa]: `PressureLevels.values`. The friction shows in the difference of half_A and half_B.
-    Return None if a group has fewer than two blocks, or no positive mean of the friction.
+    `before`, `after` (k, 4) [Pa]: `PressureLevels.values` of the blocks before and after the change. The friction shows
+    in the difference of half_A and half_B. Return None if there are fewer than two blocks before or after, or if a mean
+    friction is not positive.
     """
     frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
     if min(len(friction) for friction in frictions) < 2:

@@ -239,7 +239,7 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
 
 
 def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous drop.
+    """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
     viscous drop of a steady motion. The result is computed only once for a recording. It is None if too few samples are

@@ -43,7 +43,7 @@ def _test_signals(recording: Recording) -> Observed:
 
 
 def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
-    """Collect the results of all tests; a test in which numbers overflow or a matrix is singular ends early."""
+    """Collect what all `tests` yield; a test in which numbers overflow or a matrix is singular ends early."""
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):

@@ -124,9 +124,9 @@ def volume_observables(
 
 
 def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None:
-    """Compute the scale of both pressures that would make a leak's conductance appear to rise by a step.
+    """Compute the logarithm of a factor on both pressures that would make a leak's conductance appear to step up.
 
-    If both pressures are scaled and the leakage stays the same, the apparent conductance becomes G_2 = G_1 / scale
+    If both pressures are scaled and the leakage stays the same, the apparent conductance becomes G_2 = G_1 / factor
     instead of G_1. `conductance`: its likelihood in the blocks of the recording; `step`: test for the step. Return None
     if no block lies before or after the onset, or if the mean conductance of these blocks is not positive.
     """
@@ -234,11 +234,11 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 
 
 def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
-    """Replace the regressor `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
+    """Replace the column `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
 
-    This volume is the sum of the regressors of motion, which are nuisance terms, each times its coefficient fitted to
-    the whole recording. A change of the sensor's scale of position or speed by the fraction s changes the coefficient
-    of the new regressor by s. `columns`: roles of the regressors of each equation.
+    This volume is the sum of the columns of motion, which are nuisance terms, each times its coefficient fitted to the
+    whole recording. A change of the sensor's scale of position or speed by the fraction s changes the coefficient of
+    the new column by s. `columns`: roles of the columns of each equation.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -108,8 +108,8 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     """Compute the likelihood of an external leak's conductance [m^3/(s Pa)] in K blocks of `block_s` [s].
 
     The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated. `volume`
-    (K,): block means of the volume [m^3] that the accumulator has delivered so far; `pressure` (K,): block means of the
-    pressure that drives the leak [Pa]; `begin`: start of the first block [s].
+    (K,): block means of the volume [m^3] that the accumulator has delivered so far, up to a constant; `pressure` (K,):
+    block means of the pressure that drives the leak [Pa]; `begin`: start of the first block [s].
     """
     n_blocks = len(volume)
     time = (np.arange(n_blocks, dtype=float) + 0.5) * block_s
@@ -118,6 +118,7 @@ def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin:
     noise_variance = float(np.mean(np.diff(volume, 2) ** 2)) / 6.0  # a second difference has 6 times the variance
     # prior standard deviations of the linear and the quadratic change of the volume by the gas temperature
     gas_volume = INFERENCE.level.gas * np.column_stack([time, time**2 / time[-1]])
+    # inverse covariance of the volumes, whose errors are noise and the effect of the gas temperature
     weight = np.linalg.inv(max(noise_variance, np.finfo(float).tiny) * np.eye(n_blocks) + gas_volume @ gas_volume.T)
     weight -= np.outer(weight.sum(axis=0), weight.sum(axis=1)) / weight.sum()  # eliminates the initial volume
     precision, vector = losses.T @ weight @ losses, losses.T @ weight @ volume

@@ -129,8 +129,8 @@ def _build_blocks(
     """Compute the blocks of a volume balance from rows, each a mean over a triangular window of a `half_width` [s].
 
     `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
-    `one_sided`: use only rows in which the same side has the higher pressure throughout. Return None for fewer than
-    `MIN_BLOCKS`.
+    `one_sided`: use only rows in which the same side has the higher pressure throughout, but for noise. Return None for
+    fewer than `MIN_BLOCKS` blocks.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)

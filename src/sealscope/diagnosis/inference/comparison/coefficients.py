@@ -1,10 +1,11 @@
 """Coefficients of the volume balance, estimated from the Gram matrices of a recording and of healthy recordings.
 
-The Gram matrices of the healthy recordings are added up and give the coefficients of all terms of the balance. A
-recording's residual under these coefficients, projected on the leak's column, is its rise. The recording's other
-coefficients may differ from the healthy ones within a prior. The zero of the flow repeats: a free one would absorb a
-leak whose flow is nearly constant, and what it changes from day to day is part of the scatter. The priors are in
-`priors.toml`.
+The Gram matrices are divided by the residual variance of a row (`RecordingSums.sums`), so that their Schur complements
+are precisions of coefficients. Those of the healthy recordings are added up and give the coefficients of all terms of
+the balance. A recording's residual under these coefficients, projected on the leak's column, is its rise. The
+recording's other coefficients may differ from the healthy ones within a prior (`priors.toml`). The zero of the flow
+repeats: a free one would absorb a leak whose flow is nearly constant, and its changes from day to day are part of the
+scatter.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from sealscope.recordings.recording import Array
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    `gram` (E, m, m): Gram matrices of E equations, with the coefficients that recordings do not share already
+    `gram` (E, m, m): `RecordingSums.sums` of E equations, with the coefficients that recordings do not share already
     eliminated (`eliminate_unshared`); `columns`: roles of their columns. Both results are 0 without information on the
     leak.
     """
@@ -109,12 +110,16 @@ def residual_products(
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
-    roles of their columns. Returns the products (m,) of the residual with each column, and in place of the left side,
-    the last column, with itself; the indices of the c columns whose coefficients may differ between recordings; and the
-    precisions (c,) of the priors on these differences. Columns that may differ without limit (infinite
-    `between_deviation`) are not fitted. The leak of healthy recordings has the prior of a healthy piston behind a servo
-    valve, whose overlap looks like a leak where friction makes p_A - p_B. `has_leak`: true if the coefficient of the
-    leak is among the c coefficients, with the prior of the pump's leakage, `between.pump` (`priors.toml`).
+    roles of their columns. Returns three items:
+
+    - products (m,) of the residual with each column and, in place of the left side (the last column), with itself;
+    - indices of the c columns whose coefficients may differ between recordings;
+    - precisions (c,) of the priors on these differences.
+
+    Columns that may differ without limit (infinite `between_deviation`) are not fitted. Behind a servo valve, whose
+    overlap can look like a leak, the leak of the reference recordings has the prior of a healthy piston. `has_leak`:
+    true if the coefficient of the leak is among the c coefficients, with the prior of the pump's leakage,
+    `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     coefficients, matrix = np.zeros(len(gram)), reference[np.ix_(compared, compared)].copy()

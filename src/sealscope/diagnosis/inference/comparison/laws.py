@@ -33,10 +33,9 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Each leak is fitted to the residual that remains if the coefficients of the healthy recordings, `baseline`, predict
-    the recording `judged`. The result has the laminar coefficient that fits an orifice leak with the coefficient 1, and
-    the log likelihood ratio of an orifice to a laminar leak for one residual. `columns`: roles of the columns of each
-    volume balance; all balances are fitted together. Return None if the volume balance has no column of an orifice, if
-    the recording has no information on one of the two leaks, or if their columns are not positively correlated.
+    the recording `judged`. `columns`: roles of the columns of each volume balance; all balances are fitted together.
+    Return None if a balance has no column of an orifice, if the recording has no information on one of the two leaks,
+    or if their columns are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -44,13 +43,14 @@ def compare_laws(
     grams, moments, square_without_leak = np.zeros((2, 2)), np.zeros(2), 0.0
     for e, roles in enumerate(columns):
         gram, leaks = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]  # laminar, orifice
-        residual, nuisance, prior = residual_products(gram, reference[e], roles)
+        # `products`: of the residual with each column, and last with itself
+        products, nuisance, prior = residual_products(gram, reference[e], roles)
         regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
-        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, leaks)], residual[nuisance]]))
+        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, leaks)], products[nuisance]]))
         solved_leaks, solved_residual = solved[:, :2], solved[:, 2]
         grams += gram[np.ix_(leaks, leaks)] - gram[np.ix_(leaks, nuisance)] @ solved_leaks
-        moments += residual[leaks] - gram[np.ix_(leaks, nuisance)] @ solved_residual
-        square_without_leak += float(residual[-1] - residual[nuisance] @ solved_residual)
+        moments += products[leaks] - gram[np.ix_(leaks, nuisance)] @ solved_residual
+        square_without_leak += float(products[-1] - products[nuisance] @ solved_residual)
     energies, cross = np.diag(grams), grams[0, 1]
     if not energies.min() > 0.0 or not cross > 0.0:
         return None
@@ -83,7 +83,6 @@ def compare_with_leak(
         for e, roles in enumerate(columns):
             gram = judged.sums[e]
             tested = roles.names.index(rival) if is_rival else roles.leak
-            # `products`: of the residual with each column, and last with itself
             products, nuisance, prior = residual_products(gram, reference[e], roles, has_leak=is_rival)
             regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
             solved = solve(regularised, np.column_stack([gram[nuisance, tested], products[nuisance]]))

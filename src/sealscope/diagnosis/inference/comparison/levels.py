@@ -13,8 +13,8 @@ Levels that are clearly above zero are compared as logarithms: z = asinh(a / 2 c
 (leak coefficient) of a recording, and c, which follows from the errors of a, is the level below which z is linear. For
 each width all z are normal about an unknown mean. These effects contribute to their covariance:
 
-- Scatter of single recordings: sigma^2 on the diagonal. sigma has a log-uniform prior from a recording's standard error
-  to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
+- Scatter of single recordings: sigma^2 on the diagonal. sigma has a log-uniform prior from a part of a recording's
+  standard error to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
 - Sessions: recordings of one session share oil and set-up. The deviation tau of a session has a half-normal prior.
   Sessions are separated by date; undated recordings form one session.
 - Oil (`oil`): z has a slope in the temperature or in the viscous drop, and a recording with oil outside of the known
@@ -151,7 +151,7 @@ class _Estimates(NamedTuple):
     The priors are on differences between recordings. All fields have the unit of the coefficient.
 
     - `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
-    - `errors` (s,): standard error of one rise;
+    - `errors` (s,): smallest plausible scatter of one rise, by its standard error;
     - `level`, `level_error`: mean coefficient of the healthy recordings, and its standard error;
     - `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero;
     - `session_deviation`: prior standard deviation between sessions with the same oil, None for that of the whole
@@ -195,8 +195,8 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     log_condition_excess = sum(condition.log_excess for condition in find_unusual_conditions(judged, baseline))
     pause = 3600.0 * INFERENCE.oil.shift  # from hours to seconds
     sessions = number_sessions([recording.start_s for recording in recordings], pause)
-    # grid of sigma in z, for each row of the estimates: from the standard error to the largest plausible scatter, at
-    # least to ten standard errors
+    # grid of sigma in z, for each row of the estimates: from the smallest plausible scatter to the largest, which is at
+    # least ten times as large
     max_scatter = min(steepness * prior.largest * judged.conductance_of_flow, prior.relative)
     max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)

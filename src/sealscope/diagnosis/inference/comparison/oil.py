@@ -24,7 +24,7 @@ class OilHypothesis(NamedTuple):
     - `variances` (n + 1,): variance of the error of each prediction, without the error of its slope;
     - `log_probability`: log probability of the hypothesis, given the resistances to the motion;
     - `slope_deviation`: relative standard deviation of the slope of `thinning` in temperature or pressure drop;
-    - `session_deviation`: standard deviation of the logarithm of one session about the mean, 0 if the oil is known.
+    - `session_deviation`: standard deviation of a session's log leakage by unknown oil, 0 if the oil is known.
     """
 
     thinning: Array
@@ -55,7 +55,8 @@ def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
         warmer = np.array(temperatures) - np.mean(temperatures[:-1])
         slope_deviation = prior.per_kelvin_deviation / prior.per_kelvin
         return [OilHypothesis(prior.per_kelvin * warmer, zeros, slope_deviation=slope_deviation)]
-    # half the log range is the standard deviation between two sessions, which is sqrt(2) times that of one session
+    # half of log(warmest), the range, is the standard deviation of the difference of two sessions: sqrt(2) times that
+    # of one session
     unknown = OilHypothesis(zeros, zeros, session_deviation=float(np.sqrt(0.125) * np.log(prior.warmest)))
     by_drop = _oils_by_drop(recordings, unknown.session_deviation)
     if not by_drop:

@@ -68,23 +68,23 @@ _CYLINDER = (
 )
 
 
-def _masked(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Term, ...]:
-    """Multiply the increments of terms by a `mask` (n - 1,) that is computed from the signals."""
+def _mask_terms(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Term, ...]:
+    """Multiply the increments of `terms` by the zeros and ones (n - 1,) that `mask` computes from the signals."""
 
-    def masked(s: Signals, increments: Callable[[Signals], Array]) -> Array:
-        """Compute the masked increments of one term."""
+    def mask_increments(s: Signals, increments: Callable[[Signals], Array]) -> Array:
+        """Compute the masked increments (n - 1,) of one term."""
         return np.asarray(mask(s) * increments(s))
 
-    return tuple(term._replace(increments=partial(masked, increments=term.increments)) for term in terms)
+    return tuple(term._replace(increments=partial(mask_increments, increments=term.increments)) for term in terms)
 
 
 def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array]) -> Equation:
-    """Add terms to a balance behind a valve that count only while the piston rests; nothing is known of their size.
+    """Let the leak of a balance behind a servo valve count only in motion, and add terms of the flow while at rest.
 
     While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
-    hardly changes the flow. Therefore the terms of the leak, the last ones, count only while the piston moves, and
-    before them the balance gets two terms at rest: `null_sign` dt, the sign of the flow, and (p_A - p_B) dt.
+    hardly changes the flow. Before the terms of the leak, the last ones, the balance gets two terms at rest with
+    unknown coefficients: a flow with the sign that `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B.
     """
     left = equation.left
     at_rest = (
@@ -93,7 +93,7 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
             LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
         ),
     )
-    moving_leaks = _masked(LEAKS, lambda s: s.moving(left))
+    moving_leaks = _mask_terms(LEAKS, lambda s: s.moving(left))
     return equation._replace(terms=(*equation.terms[: -len(LEAKS)], *at_rest, *moving_leaks))
 
 
@@ -115,25 +115,25 @@ def _supply_equation(rig: Rig) -> Equation:
     the supply, if that is recorded.
     """
 
-    def fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
+    def while_fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
         """Let terms of the chamber `side` count only while the supply feeds it and the piston moves."""
         sign = 1.0 if side == "A" else -1.0
-        return _masked(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
+        return _mask_terms(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
 
     def direction(s: Signals) -> Array:
-        """Compute the sign of the flow in each interval, which the offset of a meter without a direction takes."""
+        """Compute the sign of the flow in each interval; the meter reads none, so its offset changes sign with it."""
         return np.sign(s.mean("q_supply"))
 
     air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
     terms = (
         *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
-        *fed("A", chamber_terms("A")),
-        *fed("B", chamber_terms("B")),
+        *while_fed("A", chamber_terms("A")),
+        *while_fed("B", chamber_terms("B")),
         LAG_TERM,
         BIAS_TERM._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
-        *fed("A", (external_leak_term("A"),)),
-        *fed("B", (external_leak_term("B", weight=-1.0),)),
-        *_masked((air,), lambda s: s.moving(_supply_volume)),
+        *while_fed("A", (external_leak_term("A"),)),
+        *while_fed("B", (external_leak_term("B", weight=-1.0),)),
+        *_mask_terms((air,), lambda s: s.moving(_supply_volume)),
         Term(
             "compliance of the supply",
             "m^3/Pa",
@@ -151,9 +151,10 @@ def _supply_equation(rig: Rig) -> Equation:
 def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation:
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
-    The volume displaced by the piston equals the flow over the valve's edges, less compression and leakage. An overlap
-    of the edges (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B
-    change its sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap.
+    The volume A dx displaced by the piston equals the flow over the valve's edges, less compression and leakage. The
+    left side is -A dx, so that a leak from A to B has a positive coefficient in both balances. An overlap of the edges
+    (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B change its
+    sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap.
     """
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
@@ -180,9 +181,9 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """Return the volume balances of a machine that can be computed from the recorded `channels`; empty if none can.
 
     The position and both chamber pressures are always needed. Where a valve meters the flow into the chambers, and u
-    and p_1 are recorded, there is one balance for each chamber. If neither p_2 nor a flow meter is recorded, the return
-    has the pressure of the rig, `supply.p_return`. Otherwise there is one balance of the cylinder, in which the pump's
-    flow is computed from its angle, its speed, a flow meter or, without these, the command.
+    and p_1 are recorded, there is one balance for each chamber. The pressure of the return is p_2, or `supply.p_return`
+    of the rig if neither p_2 nor a flow meter is recorded. In all other cases there is one balance of the cylinder,
+    whose flow follows from the pump's angle, its speed, a flow meter or, without these, the command.
     """
     has_return = "p_2" in channels or not channels & {*METERS}
     if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
@@ -220,9 +221,9 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump while the piston displaces no net volume.
 
     The balance holds over whole cycles or at standstill, so the position need not be known. Its signals must contain
-    `START` (`balance.derive_drive_signals`). The offset of the flow,
-    which cannot be separated from leakage under a steady load, is assumed to be zero. Return None if the pump does not
-    feed the chambers, or if its delivery or a chamber's pressure is not recorded.
+    `START` (`balance.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a
+    steady load, is assumed to be zero. Return None if the pump does not feed the chambers, or if its delivery or a
+    chamber's pressure is not recorded.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(PRESSURES):
@@ -282,8 +283,9 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
 
 def with_rests(equation: Equation) -> Equation:
-    """Add three terms to a pump's volume balance that are zero in some states of the machine (`STATES`).
+    """Add three terms to a pump's volume balance, each of which counts in one state of the machine only (`STATES`).
 
+    From these columns `regimes.apply_regime` makes the balance for valves that are open, or shut, while the pump rests.
     The new terms are inserted before those of the leak. Their increments, 0 in all other states, are
 
     - (p_A - p_B) dt while the pump moves the piston (`TURNING`),

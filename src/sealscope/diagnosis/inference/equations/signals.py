@@ -121,7 +121,7 @@ class Signals:
         """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
 
         `pump_volume` computes the left side of the volume balance [m^3] in each interval, for example the volume that
-        the pump delivers; that of the first call counts for all. Without `rest_limits` all intervals count as motion.
+        the pump delivers; later calls use that of the first one. Without `rest_limits` all intervals count as motion.
         """
         return self._find_states(pump_volume)[0]
 
@@ -133,7 +133,7 @@ class Signals:
         return self._find_states(pump_volume)[1]
 
     def _find_states(self, pump_volume: Callable[[Signals], Array]) -> tuple[Array, Array]:
-        """Compute the results of `moving` and `holding` in the first call, and return the same ones in later calls."""
+        """Compute the results of `moving` and `holding`; later calls return those of the first, which are stored."""
         limits = self._rest_limits
         if limits is None:
             return np.ones_like(self.time_step), np.zeros_like(self.time_step)

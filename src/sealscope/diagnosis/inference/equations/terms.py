@@ -45,8 +45,8 @@ class Term(NamedTuple):
     - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless
       `cause` is present;
     - `needs`: channels from which the increments are computed;
-    - `driver`: "pressure" or "root" if an offset of a pressure sensor changes the increments like that of a leak in
-      proportion to a pressure or to its square root; "" if such an offset is neglected.
+    - `driver`: "pressure" or "root" if the flow is driven by a pressure or its square root, so that an offset of a
+      pressure sensor changes the increments; "" if such an offset is neglected.
     """
 
     name: str
@@ -128,6 +128,7 @@ CYLINDER, LOCKED = "cylinder", "locked"
 START = "start"
 
 PRESSURES = ("p_A", "p_B")
+#: Makes a term whose coefficient changes suddenly only by a sensor fault.
 fitted_term = partial(Term, cause="sensor fault")
 
 
@@ -241,7 +242,7 @@ LINES_TERM = conductance_term(
     needs=("p_1", "p_2", *PRESSURES),
     drift="pump",
 )
-#: The increments are changes of the piston's speed.
+#: The increments are changes of the piston's speed; the coefficient is the piston's area times the delay.
 LAG_TERM = fitted_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
 
 

@@ -75,9 +75,9 @@ class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
-    p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends`:
-    simulated states at the last sample; `squares`: residual sums of squares [Pa^2] of `theta` and of the further
-    parameter sets that were simulated with it.
+    p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends` (8,
+    12): simulated states at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2]
+    of `theta` and of the further parameter sets that were simulated with it.
     """
 
     theta: Array

@@ -310,7 +310,7 @@ class Follower:
         Stribeck's does not explain the beginning and LuGre's fits better.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
-        # 1 or -1: whether a positive command raises or lowers p_A - p_B
+        # 1 if a positive command raises p_A - p_B, -1 if it lowers it
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]

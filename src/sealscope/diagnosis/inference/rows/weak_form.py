@@ -60,7 +60,7 @@ def half_width(rate: float) -> float:
 
 
 def strides_in(seconds: float, rate: float) -> int:
-    """Compute the number of distances of neighbouring test functions in a time [s], at least `SPAN`."""
+    """Convert a time [s] to a number of strides, the distances of neighbouring test functions; at least `SPAN`."""
     return max(SPAN, round(seconds / max(STRIDE, stride_samples(rate) / rate)))
 
 

@@ -76,13 +76,15 @@ class BalanceLeak(LeakMeasure):
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
+        Holds are times in which shut valves separate the pump from the loaded cylinder. They measure the leakage if
+        `rise` is the rise in holds, and if the balance assumes shut valves at every rest or the rise is too high for a
+        healthy machine.
+
         - "piston or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
           too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
           `held_oil.rare` (`priors.toml`), as it does beside a chamber that is open to the tank.
-        - "piston leak" if a servo valve drives the cylinder, if a flow meter measures the flow behind the pump, or if
-          holds measure the leakage, i.e. times in which shut valves separate the pump from the loaded cylinder. Then
-          `rise` must be the rise in holds. In addition, the balance must already assume shut valves at every rest, or
-          the rise must be too high for a healthy machine.
+        - "piston leak" in other cases in which holds measure the leakage, if a servo valve drives the cylinder, or if a
+          flow meter measures the flow behind the pump.
         - "piston or pump leak" otherwise.
         """
         if self.balance.is_creep:
@@ -280,15 +282,15 @@ class BalanceLeak(LeakMeasure):
     def _rise_laws(self) -> list[tuple[float, float]]:
         """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
 
-        Returns for each law its mean flow and its log weight. The flow is that of a leak to which the fit of a laminar
-        leak gives a conductance of 1, and has the unit Pa of a flow per conductance. A law with an exponent e of
-        `EXPONENTS` lies the fraction f = 2 (1 - e) of the way from laminar to orifice flow:
+        Returns for each law a mean flow per conductance [Pa] and a log weight. The flow is that of a leak of this law
+        which looks like a laminar leak with a conductance of 1. A law with an exponent e of `EXPONENTS` lies the
+        fraction f = 2 (1 - e) of the way from laminar to orifice flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
 
         where L is the log likelihood ratio of an orifice to a laminar leak for one residual, and N = `size.readings`
-        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow and
-        the log weight 0.
+        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow and the log
+        weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -387,10 +389,10 @@ class BalanceLeak(LeakMeasure):
     def step_rise(self) -> LeakRise | None:
         """Leakage above that of healthy recordings, and the evidence for its causes (`LeakRise`).
 
-        The causes are a leak that began within the recording, as the step shows, and an older leak. If shut valves hold
-        the load after the step's onset, `step_log_ratio` compares the rise in these holds with the whole step.
-        Otherwise it compares the mean rise over the recording with the part of the step that this mean contains. None
-        without healthy recordings. Without a step test, all fields but `rise` keep their defaults.
+        The causes are a leak that began within the recording, with the size of the tested step, and an older leak.
+        `step_log_ratio` compares the rise in holds after the step's onset with the whole step, if shut valves then hold
+        the load. Otherwise it compares the mean rise over the recording with the part of the step that this mean
+        contains. None without healthy recordings. Without a step test, all fields but `rise` keep their defaults.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
@@ -537,7 +539,10 @@ class BalanceLeak(LeakMeasure):
         return [*remarks, *self._iter_condition_remarks()]
 
     def _iter_condition_remarks(self) -> Iterator[Remark]:
-        """Yield a remark on each condition (load, speed, oil) outside of the range of the healthy recordings."""
+        """Yield a remark on each condition (load, speed, oil) outside of the range of the healthy recordings.
+
+        It states load [bar] and oil temperature [deg C] with the range, but the speed over the nearer end of its range.
+        """
         for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":

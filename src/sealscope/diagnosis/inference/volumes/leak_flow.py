@@ -4,9 +4,9 @@ A step of the leak's conductance is fitted at each possible onset, with each law
 each growth after the onset: a seal that continues to wear leaks more towards the end, and a leak may grow from nothing.
 The flow is a mixture over them, weighted by likelihood and prior (`estimate_step_flow`).
 
-The rise over healthy recordings shows a part only of a leak that began or grew within the recording, as the blocks
-after the onset have but a part of the information. Rise and changes within the recording together tell its flow, and
-bound it where none is found (`fit_rise`).
+If a leak began or grew within the recording, the rise over healthy recordings contains only a part of it, since the
+blocks after the onset have only a part of the information. `fit_rise` therefore estimates the flow from the rise and
+from the changes within the recording together, and bounds it if no leak is found.
 """
 
 from __future__ import annotations
@@ -51,8 +51,8 @@ _TINY = np.finfo(float).tiny
 def _step_growths() -> list[tuple[float, float]]:
     """List the relative growths of a leak that begins within a recording, with their prior probabilities.
 
-    They are those of `growth_priors`, and infinity for a leak that grows from nothing: it has the fraction
-    `growth.from_nothing` (`priors.toml`) of the probability of leaks that grow.
+    They are those of `growth_priors`, and infinity for a leak that grows from nothing, which has the fraction
+    `growth.from_nothing` (`priors.toml`) of the probability of all leaks that grow.
     """
     from_nothing: float = INFERENCE.growth.from_nothing
     steady, *growing = growth_priors()
@@ -125,12 +125,12 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 
 
 class RiseFits(NamedTuple):
-    """Leak above healthy recordings under h hypotheses on its onset, growth and law.
+    """Leak above healthy recordings under h hypotheses on its onset, growth and law (`fit_rise`).
 
     `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
     is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
     mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if the rise shows the leak, false if
-    it tells nothing. `log_none`: log probability that there is no leak, up to the same constant.
+    it is no evidence. `log_none`: log probability that there is no leak, up to the same constant.
     """
 
     log_weights: Array
@@ -166,7 +166,7 @@ class RiseFits(NamedTuple):
     def bound(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s], 0 if there is hardly a leak.
 
-        Leaks of which the rise tells nothing do not count: steps are tested by themselves.
+        Hypotheses under which the rise is no evidence do not count: the step test covers them.
         """
         from scipy.special import ndtr
 
@@ -174,7 +174,7 @@ class RiseFits(NamedTuple):
         weights = np.exp(log_weights - log_weights.max())
         weights = weights[:-1] / weights.sum()
         flows, deviations = self.parts * self.flows, np.maximum(self.parts * self.deviations, _TINY)
-        chance, tail = float(weights.sum()), 1.0 - BOUND_PROBABILITY  # of a leak, which is positive
+        chance, tail = float(weights.sum()), 1.0 - BOUND_PROBABILITY  # of a leak, and of one above the bound
         if chance <= tail:
             return 0.0
         truncated = weights / np.maximum(ndtr(flows / deviations), _TINY)  # of normal densities without negative flows
@@ -194,30 +194,34 @@ def fit_rise(
     """Fit a leak to the rise over healthy recordings and to the changes of the leakage within the recording.
 
     - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
-      in the blocks; `test`: test for a step of it, None for a leak from the start; `weights` (K,): information of each
-      block in the comparison with healthy recordings;
+      in the blocks; `weights` (K,): information of each block in the comparison with healthy recordings; `test`: step
+      test of the coefficient, None if the leak can only be older than the recording;
     - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
-    - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, but an older one under the first law.
+    - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, except an older one under the first law.
 
-    A leak with the coefficient s, and a given onset, growth and law, changes the conductance of block k by s c_k. The
-    changes within the recording measure s as s' with the standard error e, and with the log likelihood ratio L to no
-    leak (`step_sizes`). The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted
-    by the information of the blocks. The flow of any leak, and so s, has a half-normal prior whose scale, in s the
-    value S, is the fraction `size.usual` of the pump's flow. With N(x; v) the density of a normal distribution with the
-    variance v, and s'' and e'' the mean and the error of s by its prior and s', the likelihood of the leak is, up to a
-    common factor,
+    With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. Three
+    sources determine s:
 
-        exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+    - The changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of
+      the leak to no leak (`step_sizes`).
+    - The flow has a half-normal prior, whose scale is the fraction `size.usual` (`priors.toml`) of the pump's flow; S
+      is the coefficient of a leak with this flow. s'' and e'' are mean and standard deviation of s by this prior and
+      s'.
+    - The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted by `weights`.
 
-    that of a leak which is older than the recording N(r; d^2 + R^2), where R is the rise by a leak of the usual flow,
-    and that of no leak N(r; d^2), times the odds against a leak by its prior probability `size.present`. The flow of an
-    older leak is that of the rise alone.
+    N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
+    and p = `size.present` the prior probability of a leak. The weights of the hypotheses, up to a common factor, are as
+    follows; those of leaks are also multiplied by the probability that the flow is positive.
 
-    With the small probability 2 `scatter.tail` (`priors.toml`) the rise tells nothing, as the recording is like none
-    that the healthy ones predict. Its density is then 1 / R, and s'' and e'' alone give the flow. All onsets together
-    are as probable beforehand as an older leak.
+        leak within the recording: exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+        older leak:                N(r; d^2 + R^2),
+        no leak:                   N(r; d^2) (1 - p) / p.
+
+    The flow of an older leak follows from the rise alone. All onsets together are as probable beforehand as an older
+    leak. With the small probability 2 `scatter.tail` the rise is no evidence, as the recording is like none that the
+    healthy ones predict. Its density is then 1 / R, and only s'' and e'' give the flow.
     """
     from scipy.special import log_ndtr
 
@@ -258,9 +262,9 @@ def _combine_with_rise(
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
     `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
-    it is older than the recording; `weights` (K,): information of the blocks, with the sum 1. Yields the log weight of
-    each onset, without the priors of law and onset, the mean flow after it, and the flow's standard error [m^3/s], (o,)
-    each: first as the rise shows the step, then as it tells nothing.
+    it is older than the recording; `weights` (K,): information of the blocks, with the sum 1. Yields two triples of
+    arrays (o,): log weight of each onset, without the priors of law and onset, mean flow after it, and the flow's
+    standard error [m^3/s]. In the first the rise is evidence of the step, in the second it is not.
     """
     unit_flow = np.maximum(fit.unit_flow, MIN_UNIT * float(fit.unit_flow.max()))  # 0 where no pressure is known
     prior_deviation = usual_flow / unit_flow  # of the coefficient

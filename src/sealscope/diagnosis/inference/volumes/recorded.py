@@ -128,10 +128,11 @@ class RecordedBalance:
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first block that begins after the machine; 0 if too few blocks remain for a step test.
+        """Index of the first moving block that begins after the machine's start; 0 if too few blocks would remain.
 
-        A machine begins with the flow of its pump or, behind a servo valve (two balances), with the piston's motion.
-        Where a cylinder's flow is not known, it is the first block in which the machine moves.
+        The machine starts with the flow of its pump or, behind a servo valve (two balances), with the motion of the
+        piston. In a balance without a position or a flow (`balances.circulation`, `balances.locked`) the first moving
+        block counts. A step test needs `MIN_BLOCKS` blocks.
         """
         first = int(np.argmax(self.blocks.is_moving))
         if self.equations[0].name == CYLINDER or len(self.equations) > 1:
@@ -316,7 +317,7 @@ class RecordedBalance:
         """Compute the log odds (n,) that a load causes abs(p_A - p_B), and not an offset between the two sensors.
 
         `pressure` (n,): values of abs(p_A - p_B) [Pa]. All loads up to the largest of the recording are equally
-        probable; the offset is normal about 0.
+        probable; the offset has the prior of `offset_cost`.
         """
         # an offset z has the log probability density -offset_cost(z) / 2 - log_offset_norm
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
@@ -372,11 +373,13 @@ class RecordedBalance:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
-        the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are stated,
-        scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of the motion under its
-        load in the volume balance, weighted by the sums of squares of the columns. The main side is the one with more
-        motion in which it surely carries the load. The area of the other side is corrected for motion that may belong
-        to the main side (`log_area_ratio`).
+        the position x is reversed, and zero if nothing moves.
+
+        - Areas in the rig's file are used if they are stated, scaled to the flows of the balance.
+        - Otherwise the area of a side is the mean coefficient of the motion under its load in the volume balance,
+          weighted by the sums of squares of the columns. The main side is the one with more motion in which it surely
+          carries the load. The area of the other side is corrected for motion that may belong to the main side
+          (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -560,8 +563,8 @@ class RecordedBalance:
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
-        If the pump's leakage has a separate term, it is left out, so that the term of the leak contains both. The
-        history includes a step of the leakage if a test finds one with a p-value below `RAREST`.
+        The coefficient of the leak is that of both together, without a separate term of the pump's leakage (`PUMP`).
+        The history includes a step of the leakage if a test finds one with a p-value below `RAREST`.
         """
         roles = self.columns[0]
         pump = roles.names.index(PUMP) if PUMP in roles.names else None

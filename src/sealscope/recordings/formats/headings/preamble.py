@@ -120,7 +120,7 @@ def _clean_text(text: str, max_length: int) -> str:
 def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
     """Find the oil temperature [deg C] in the remarks of a recording's provenance; None if it is not stated.
 
-    Values outside -60 to 200 deg C are ignored.
+    The name of the remark contains a word for oil, or "temp". Values outside -60 to 200 deg C are ignored.
     """
     for name, text in clean_remarks(provenance).items():
         if not _OIL.search(name):

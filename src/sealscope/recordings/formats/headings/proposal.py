@@ -13,6 +13,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import is_familiar, same_dimension
 
+#: Words of a heading by the quantity, the side of the machine or another kind that they mean, from `words.toml`.
 _MEASURED = {name: frozenset(words) for name, words in WORDS["measured"].items()}
 _SIDE = {name: frozenset(words) for name, words in WORDS["side"].items()}
 _KIND = {name: frozenset(words) for name, words in WORDS["kind"].items()}
@@ -133,6 +134,7 @@ _AMBIGUOUS_UNITS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "posit
 def split_unit(name: str) -> tuple[str, str | None]:
     """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if no channel has such a unit."""
     parts = name.replace(" ", "_").split("_")
+    # the last two words, such as l/min, and the last one
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]
     last_word = _LAST_WORD.search(name)
     if last_word and len(last_word[0]) > 2:

@@ -29,6 +29,7 @@ _DOCUMENTS = (".pdf", ".md", ".png", ".jpg", ".jpeg", ".doc", ".docx", ".html", 
 _WORKBOOK = ("[Content_Types].xml", "mimetype")
 #: Longest time to unpack an archive: _BASE_TIME [s] + size / _MIN_SPEED [bytes/s].
 _BASE_TIME, _MIN_SPEED = 20.0, 1e6
+#: Bytes unpacked at a time, and most memory of the subprocess [bytes].
 _CHUNK, _MEMORY = 2**20, 2**30
 
 

@@ -41,7 +41,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
         return
     if (fields := _struct_fields(value)) is not None:
         yield from _iter_struct(group, name, fields, clock, depth)
-    elif hasattr(value, "columns") and hasattr(value, "index"):
+    elif hasattr(value, "columns") and hasattr(value, "index"):  # a data frame
         yield from _iter_table(f"{group}/{name}" if group else name, value)
     elif isinstance(value, np.ndarray) and value.dtype == object:
         for number, member in enumerate(value.reshape(-1), start=1):
@@ -52,7 +52,7 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
     """Return the fields of a struct by name, or the structs in an array by `(1)`, `(2)`, ...; None for other values."""
-    properties = getattr(value, "properties", value)
+    properties = getattr(value, "properties", value)  # those of an object of mat-io
     if isinstance(properties, Mapping):
         return properties
     if isinstance(value, np.ndarray) and value.dtype.names and 1 <= value.size <= _MAX_COLUMNS:
@@ -183,7 +183,7 @@ def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None
 
 
 def _list_structs(value: Any) -> list[Mapping[str, Any]]:
-    """List the structs in an array of structs, or a single struct, as mappings of their fields."""
+    """List the structs in an array of structs, or a single struct, as mappings; one empty mapping for other values."""
     fields = _struct_fields(value) or {}  # of an array: `(1)`, `(2)`, ...
     members = [member for field in fields.values() if (member := _struct_fields(field)) is not None]
     return members if members and all(key.startswith("(") for key in fields) else [fields]

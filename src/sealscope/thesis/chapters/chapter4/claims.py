@@ -121,7 +121,7 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
     """
     runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
-    def largest_change(*, with_throttles: bool) -> str:
+    def format_largest_change(*, with_throttles: bool) -> str:
         """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles.
 
         The text is "diverged" if there is no such change.
@@ -132,7 +132,7 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
         return f"{max(changes):.3g} Pa rms" if changes else "diverged"
 
     tests = [run.resolved is True for run in runs.values()]
-    plain, throttled = largest_change(with_throttles=False), largest_change(with_throttles=True)
+    plain, throttled = format_largest_change(with_throttles=False), format_largest_change(with_throttles=True)
     yield judge_claim("4.1", tests, plain=plain, throttled=throttled, passed=sum(tests), cases=len(tests))
     drive_gains = {"motor.k_p": 50000.0, "motor.K_i": 100.0}  # section 4.2.1, in internal units
     texts, tests = [], []
@@ -222,7 +222,7 @@ def _judge_runs(
     return judge_claim(f"4.{claim_number}", passed, simulation=simulation, noise=noise)
 
 
-def _range_text(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
+def _range_formatter(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
     """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
 
     The built function takes a list with the summaries of the runs (`summarise_run`) under each interpretation of the
@@ -282,15 +282,15 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         largest = max(rows[1][flows] for rows in all_rows)
         return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
 
-    changes = _range_text("25 % against open, peaks and ranges", peak_and_range_changes)
-    yield _judge_runs(8, opening, lambda rows: np.abs(peak_and_range_changes(rows)) < min_visible, changes)
-    yield _judge_runs(10, opening, lambda rows: np.abs(_changes(rows, "peak")) > min_visible, changes)
+    format_changes = _range_formatter("25 % against open, peaks and ranges", peak_and_range_changes)
+    yield _judge_runs(8, opening, lambda rows: np.abs(peak_and_range_changes(rows)) < min_visible, format_changes)
+    yield _judge_runs(10, opening, lambda rows: np.abs(_changes(rows, "peak")) > min_visible, format_changes)
     yield _judge_runs(9, opening, lambda rows: [rows[1][flows] < _MAX_FLOW_DIFFERENCE], format_flow_difference)
     # two tests each: the sign of the mean drop, and whether the drop is visible
-    drop = _range_text(p_1, lambda rows: [rows[1][p_1]])
-    yield _judge_runs(11, opening, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -min_visible), drop)
-    drop = _range_text(p_2, lambda rows: [rows[1][p_2]])
-    yield _judge_runs(12, opening, lambda rows: (rows[1][p_2] > 0, rows[1][p_2] > min_visible), drop)
+    format_drop = _range_formatter(p_1, lambda rows: [rows[1][p_1]])
+    yield _judge_runs(11, opening, lambda rows: (rows[1][p_1] < 0, rows[1][p_1] < -min_visible), format_drop)
+    format_drop = _range_formatter(p_2, lambda rows: [rows[1][p_2]])
+    yield _judge_runs(12, opening, lambda rows: (rows[1][p_2] > 0, rows[1][p_2] > min_visible), format_drop)
 
 
 def _judge_larger_closings(context: Context) -> Iterator[Claim]:
@@ -298,7 +298,7 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
 
     The pressures' ranges (maximum minus minimum) grow with the amplitude of the command (4.14); tighter orifices raise
     the chamber pressures' peaks (4.15) and the ranges of all four pressures (4.16); the largest drop at the orifices is
-    visible (4.21). Each change must exceed a transducer's noise (`visible_pressure`).
+    visible at each closing (4.21). Each change must exceed a transducer's noise (`visible_pressure`).
     """
     min_visible = cases.visible_pressure()
     by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
@@ -315,7 +315,7 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
         `values`: computes the numbers from the summaries of the runs; `head`: text before the numbers.
         """
         return _judge_runs(
-            number, runs, lambda rows: (value > min_visible for value in values(rows)), _range_text(head, values)
+            number, runs, lambda rows: (value > min_visible for value in values(rows)), _range_formatter(head, values)
         )
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
@@ -328,8 +328,8 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     yield judge_increase(14, by_command, head, range_changes)
     head = f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks"
     yield judge_increase(15, fast_by_closing, head, lambda rows: _changes(rows, "peak", CHAMBERS))
-    changes = _range_text("75 against 25 % closed, ranges", range_changes)
-    yield _judge_runs(16, slow_by_closing, ranges_grow, changes)
+    format_changes = _range_formatter("75 against 25 % closed, ranges", range_changes)
+    yield _judge_runs(16, slow_by_closing, ranges_grow, format_changes)
     head = f"largest drop at 25, 50, 75 % under {COMMAND}"
     yield judge_increase(21, slow_by_closing, head, lambda rows: [row["largest drop"] for row in rows])
 

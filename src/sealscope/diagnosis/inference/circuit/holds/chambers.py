@@ -134,9 +134,9 @@ class HeldChambers:
     def _refillable_sides(self) -> SideSupplies:
         """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
-        Neither is refilled if the areas are equal. The leak moves equal volumes from one side to the other, and the
-        piston follows the side that loses oil. If the side that gains oil has the larger area, its volume grows by more
-        than the leak supplies.
+        The leak moves equal volumes from one side to the other, and the piston follows the side that loses oil. If the
+        side that gains oil has the larger area, its volume grows by more than the leak supplies, and the check valve
+        opens. With equal areas neither side is refilled.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         if area_A == area_B:
@@ -145,18 +145,18 @@ class HeldChambers:
 
     @cached_property
     def _unloaded_open(self) -> SideSupplies:
-        """Supplies of A and B if the side with the lower mean pressure is open, as if only the other had a valve."""
+        """Supplies of A and B if no valve shuts the side with the lower mean pressure, which is then open."""
         means = [np.mean(np.concatenate([getattr(hold, side) for hold in self.holds])) for side in ("p_A", "p_B")]
         return (SideSupply.CHECK, SideSupply.OPEN) if means[0] > means[1] else (SideSupply.OPEN, SideSupply.CHECK)
 
     def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
-        An open side has the probability `held_oil.open` (`priors.toml`). Only while it empties, it is above the charge
-        pressure by more than the back pressure `held_oil.tank` of its line: for the fraction a = `held_oil.above` of a
-        hold. A larger fraction f has the relative probability exp(-(f - a) / a). If check valves keep both sides at
-        their pressure, a side that gains oil must drain to the tank. The charge pressure is then that of a tank line,
-        whose gauge pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
+        An open side has the probability `held_oil.open` (`priors.toml`). It is above the charge pressure, by more than
+        the back pressure `held_oil.tank` of its line, only while it empties: for the fraction a = `held_oil.above` of a
+        hold. Each hold with a larger fraction f multiplies the probability by exp(-(f - a) / a). If check valves keep
+        both sides at their pressure, a side that gains oil must drain to the tank. The charge pressure is then that of
+        a tank line, whose gauge pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
@@ -366,10 +366,10 @@ class HeldChambers:
 
     @cached_property
     def _onset_ranges(self) -> tuple[Array, Array]:
-        """First and last time [s] for which each evenly spaced possible onset stands, (o,) each.
+        """First and last time [s] that each of g possible onsets stands for, (g,) each.
 
-        The beginning of the recording, and each onset within a hold, stand for themselves; one between two holds stands
-        for all times between them.
+        These are `onsets` without those of the largest pressure change. The beginning of the recording and the evenly
+        spaced onsets within a hold stand for themselves, one between two holds for all times between them.
         """
         lows, highs = [self.begin], [self.begin]
         for k, hold in enumerate(self.holds):
@@ -390,7 +390,9 @@ class HeldChambers:
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume lost up to each of r readings through a leak that begins at each of o `onsets`, (r, o).
 
-        The readings (sample means) of each hold, side A before side B, are relative to their mean over the hold.
+        With the volume V(t) that a leak from the start of the hold has lost, a sample at t shows V(t) - V(onset), or 0
+        before the onset. The readings (sample means) of each hold, side A before side B, are relative to their mean
+        over the hold.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
@@ -401,7 +403,7 @@ class HeldChambers:
             counts, sizes = last - first, hold.sizes[:, None]
             for is_A, flow in zip((True, False), sides, strict=True):
                 volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * steps)])
-                volume_before = np.interp(onsets, hold.t, volume)  # leaked before each onset; does not count
+                volume_before = np.interp(onsets, hold.t, volume)  # V(onset)
                 sums = np.concatenate([[0.0], np.cumsum(volume)])  # differences are sums over samples
                 readings = (sums[last] - sums[first] - counts * volume_before) / sizes
                 columns.append(hold.centre(readings, is_A))
@@ -507,8 +509,8 @@ class HeldChambers:
     def _fit_over_supplies(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
         """Fit a leak that is not past the piston and may grow, under each possible choice of the sides' supplies.
 
-        Returns the most probable fit and the index of its onset in `onsets`. The likelihood of the fit is replaced by
-        the sum over all choices, each times its prior probability.
+        `leaks`: flows of this one leak, for each choice. Returns the most probable fit and the index of its onset in
+        `onsets`. The likelihood of the fit is replaced by the sum over all choices, each times its prior probability.
         """
         fits = [self._fit_growing_leak(leak) for leak in leaks]
         log_priors = [self._supply_log_prior(leak.supplies, drains=False) for leak in leaks]
@@ -564,6 +566,7 @@ class HeldChambers:
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
         """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order."""
+        # if BOTH is not possible, no reading is at the charge pressure, and it flags the same samples as NEITHER
         possible = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies] or [
             BOTH
         ]

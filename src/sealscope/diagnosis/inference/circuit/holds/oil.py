@@ -162,7 +162,7 @@ def build_regression(
 
 
 def _sum_changes(values: Array, is_closed: NDArray[np.bool_]) -> Array:
-    """Sum the changes of `values` (n,) from sample to sample, only those in which the side `is_closed` (n,)."""
+    """Sum the changes of `values` (n,) from sample to sample that happen while the side is closed (`is_closed`)."""
     return np.cumsum(np.diff(values, prepend=values[0]) * is_closed)
 
 
@@ -221,10 +221,11 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
     """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
-    The `regression` is linearised at the usual properties of the oil. `columns` (r, o): volume lost up to each reading
-    through a leak with a coefficient of 1 since each onset; `variance`: variance of a reading, which weights the priors
-    on the properties against the readings. The properties are changes relative to their usual values, each with a lower
-    limit: each may fall by `MAX_DECREASE` standard deviations of its logarithm, and a dead volume not below its least.
+    The changes of the oil's properties relative to their usual values, at which the `regression` is linearised, are
+    fitted as well, and their weighted squares, by the priors, are part of the sum. Each has a lower limit: it may fall
+    by `MAX_DECREASE` standard deviations of its logarithm, and a dead volume not below its least. `columns` (r, o):
+    volume lost up to each reading through a leak with a coefficient of 1 since each onset; `variance`: variance of a
+    reading, which weights the priors against the readings.
     """
     usual = np.zeros(4)
     leaked, oil = regression.leaked(usual), regression.slopes(usual)
