@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Recording
 
 #: A detector's summary of a healthy recording, from its method `learn`: plain values that only this detector reads.
 Summary = Mapping[str, Any]
@@ -26,7 +26,7 @@ class SummarisedRecording:
     # pressure, oil, noise and problems, for display (`commissioned.summary.describe_recording`)
     about: Mapping[str, Any] = field(default_factory=dict)
     # surprisal, -log(p-value), of each test for a change within it, by the key of the test (`healthy_surprisals`)
-    statistics: Mapping[str, float | Array] = field(default_factory=dict)
+    statistics: Mapping[str, float] = field(default_factory=dict)
 
 
 #: A healthy recording, as samples or as summaries.

@@ -39,8 +39,7 @@ def refused(path: Path) -> str:
 
 def test_a_summary_is_read_as_it_was_learnt(machine):
     """To the last bit, with names that this version does not know."""
-    numbers = np.array([[1.0, 1e-300], [-0.1, 3e90]])
-    statistics = {"rise": 0.25, "later kind": numbers, "empty": np.zeros((0, 3))}
+    statistics = {"rise": 0.1 + 0.2, "later kind": 1e-300}
     summaries = {**machine.healthy[0].summaries, "a plug-in's": {"names": ["a", "b"], "n": 3, "curve": [0.1, 0.2]}}
     learnt = replace(machine.healthy[0], statistics=statistics, summaries=summaries)
     again = parse_summary(format_summary(learnt), learnt.file, "place")
@@ -48,10 +47,7 @@ def test_a_summary_is_read_as_it_was_learnt(machine):
         learnt.digest, learnt.units, learnt.rate, learnt.seconds,
     )  # fmt: skip
     assert again.about == learnt.about
-    assert {name: np.shape(value) for name, value in again.statistics.items()} == {
-        "rise": (), "later kind": (2, 2), "empty": (0, 3),
-    }  # fmt: skip
-    np.testing.assert_array_equal(again.statistics["later kind"], numbers)
+    assert again.statistics == statistics
     np.testing.assert_array_equal(again.summaries["volume balance"]["sums"], summaries["volume balance"]["sums"])
     assert format_summary(again) == format_summary(learnt)
     np.testing.assert_array_equal(again.summaries["a plug-in's"].pop("curve"), [0.1, 0.2])
@@ -67,7 +63,7 @@ def test_the_text_is_small(pair, machine):
 
 
 def test_numbers_that_are_not_finite_are_no_summary(machine):
-    for value in (np.nan, [1.0, np.inf]):
+    for value in (np.nan, np.inf, 1e300):
         with refusal("run1.nc"):
             format_summary(replace(machine.healthy[0], statistics={"rise": value}))
 
@@ -224,7 +220,7 @@ HOSTILE = {
     "summaries/volume balance/pressure": (None, "pressure"),
     "summaries/rms change/levels": ({"shape": [3], "f8": "AAAA"}, "levels"),
     "summaries/other": ([[], []] * 4000, "must hold its numbers in arrays"),
-    "statistics/rise": ("high", "statistics: rise: must be an array"),
+    "statistics/rise": ("high", "statistics: rise"),
 }
 
 

@@ -107,12 +107,6 @@ def _check_array(value: Any) -> Any:
     return value
 
 
-def _check_statistic(value: Any) -> Any:
-    """Return the value, a float or an array, if its numbers are finite and below 1e100; raise ValueError otherwise."""
-    _check_array(np.array(value) if isinstance(value, float) else value)
-    return value
-
-
 def _check_sums(summary: Any) -> Any:
     """Return the `summary` by a volume balance (`_BALANCE`) if it is consistent; raise ValueError otherwise.
 
@@ -186,7 +180,6 @@ def _check_octaves(values: Any) -> Any:
 
 # types of values; `_BALANCE` and `_RMS` are those of the summaries by `VolumeBalance.learn` and `RmsChange.learn`
 _Array = Annotated[Any, AfterValidator(_check_array)]
-_Statistic = Annotated[Any, AfterValidator(_check_statistic)]
 _Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]
 _Magnitude = Annotated[float, Field(ge=0.0, lt=_MAX_NUMBER)]
 _Positive = Annotated[float, Field(gt=0.0, lt=_LAST_TIME)]
@@ -271,7 +264,7 @@ _RECORDING = table_type(
     start_s=(_Time, None),
     about=(table_type("allow", **{name: (kind, None) for name, kind in _ABOUT.items()}), None),
     summaries=_BY_METHOD,
-    statistics=(Annotated[uniform_table_type(_Statistic), _RESTORED], None),
+    statistics=(uniform_table_type(_Number), None),
 )
 
 

@@ -136,12 +136,12 @@ class Case:
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) from which the test `alarm` was computed.
 
-        It is `RISE` for a comparison of measured leakage with healthy recordings, otherwise the kind of the judging
-        detector's first observable.
+        It is `RISE` for a comparison of measured leakage with healthy recordings, and without observables; else the
+        kind of the judging detector's first observable.
         """
         if alarm.name == AGAINST and self.leak is not None:
             return RISE
-        return self.judge.observables[0].data
+        return self.judge.observables[0].data if self.judge.observables else RISE
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:

@@ -194,7 +194,7 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
             shut_keys = [key for key in surprisals if key.startswith(SHUT)]
             surprisals = {**surprisals, **{key.removeprefix(SHUT): surprisals[key] for key in shut_keys}}
         for key, surprisal in surprisals.items():
-            surprisals_by_key[key].append(float(surprisal))
+            surprisals_by_key[key].append(surprisal)
     for observables in compare_healthy(baseline):
         for data in {observable.data for observable in observables}:
             max_surprisal = max(observable.surprisal for observable in observables if observable.data == data)

@@ -41,6 +41,8 @@ from sealscope.storage.plain_state import SavedAttributes
 _PRIORS = LIVE.step
 #: q of the module's docstring: variances of the walk in a block, over that of the first block's estimate; shape (q, 1).
 WALKS = np.array(_PRIORS.walks)[:, None]
+#: Index of the walk whose filter measures the noise: in each block, a tenth of the first estimate's variance.
+_NOISE_WALK = _PRIORS.walks.index(0.1)
 #: v of the module's docstring: prior variances of the step's size, in the same unit.
 SIZES = np.array(_PRIORS.sizes)
 #: Fractions of the step's first block in which the leak is open.
@@ -285,11 +287,9 @@ class StepDetector(SavedAttributes):
         """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
 
         The ratio is averaged over the blocks with exponential forgetting and with a prior that is worth `step.stated`
-        (`priors.toml`) blocks of the ratio 1. It is taken from the filter whose random walk has, in each block, a tenth
-        of the first estimate's variance.
+        (`priors.toml`) blocks of the ratio 1. It is taken from the filter with the walk `_NOISE_WALK`.
         """
-        walk = 3  # index of this walk, 0.1, in `WALKS`
-        return float((self._squares[walk, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
+        return float((self._squares[_NOISE_WALK, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def load_state(self, state: Any) -> None:
         """Restore the evidence from a result of the method `state`; raise InputError if it does not fit the onsets."""

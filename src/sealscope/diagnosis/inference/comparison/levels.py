@@ -72,7 +72,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     count, prior = len(baseline), INFERENCE.scatter
     # factors on the prior standard deviations; log(`prior.between`) is the standard deviation of their logarithm
     widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
-    rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, count))
+    rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, 0))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
         projections = [
             estimate_leak_excess(recording.sums, healthy_sums - recording.sums, columns, widths)

@@ -293,7 +293,7 @@ def with_rests(equation: Equation) -> Equation:
     - dt while pump and piston move (`MOVING_BIAS`).
     """
     left = equation.left
-    in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak", driver="pressure")
+    in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak")
     return _insert_before_leaks(equation, *_pump_leakage_terms(left), in_motion)
 
 

@@ -159,7 +159,10 @@ class VolumeBalance:
         """
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
-            recording, ("lost oil", self.rig), lambda samples: recorded_oil_loss_tests(samples, self.rig, offset), READ
+            recording,
+            ("lost oil", self.rig, offset),
+            lambda samples: recorded_oil_loss_tests(samples, self.rig, offset),
+            READ,
         )
         return RecordedBalance(
             regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
