@@ -8,8 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
-from sealscope.diagnosis.inference.comparison.coefficients import motion_change
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
+from sealscope.diagnosis.inference.comparison.coefficients import (
+    block_weights,
+    eliminate_unshared,
+    estimate_leak_excess,
+    motion_change,
+)
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.levels import rise
 from sealscope.diagnosis.inference.comparison.population import Population
@@ -76,6 +81,27 @@ def beyond(judged: Blocks, healthy: Sequence[Blocks]) -> Rise:
         [RecordingSums.from_blocks(own, (COLUMNS,)) for own in healthy],
         (COLUMNS,),
     )
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_leak_that_varies_causes_the_rise_that_the_weights_of_the_blocks_state(seed: int) -> None:
+    """A leak of g_k in block k adds g_k times the leak's column to the left side: the rise grows by sum_k w_k g_k."""
+    random = np.random.default_rng(seed)
+    blocks, healthy = (recording(random, 20.0 * PRIORS) for _ in range(2))
+    columns = (COLUMNS, COLUMNS.with_free_zero())[seed % 2]  # without and with a flow offset of each recording
+    grams = scale_grams(blocks, (columns,))
+    leaks, leak = PRIORS * random.standard_normal(len(blocks)), columns.leak
+    leaking = grams.copy()
+    leaking[..., -1] += leaks[:, None, None] * leaking[..., leak]  # the left side with all columns ...
+    leaking[..., -1, :] += leaks[:, None, None] * leaking[..., leak, :]  # ... and all columns with it
+    reference = eliminate_unshared(scale_grams(healthy, (columns,)).sum(axis=0), (columns,))
+    before, after = (
+        estimate_leak_excess(eliminate_unshared(gram.sum(axis=0), (columns,)), reference, (columns,), np.ones(1))[0][0]
+        for gram in (grams, leaking)
+    )
+    weights = block_weights(grams, reference, (columns,))
+    assert weights.sum() == pytest.approx(1.0)
+    assert after - before == pytest.approx(weights @ leaks, rel=1e-6, abs=1e-6 * PRIORS)
 
 
 DAY = 86400.0

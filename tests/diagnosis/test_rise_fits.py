@@ -58,7 +58,9 @@ def fit(
     rise = float(weights @ course / weights.sum()) + deviation * random.standard_normal() + shift
     laws = [(PRESSURE, float(np.log(prior))) for prior in (0.5, 0.25, 0.25)]
     test = find_leak_step(blocks, columns, leak)
-    return fit_rise(blocks, columns, leak, weights, test, Estimate(rise * unit, deviation * unit), laws, max_flow)
+    return fit_rise(
+        blocks, columns, leak, weights / weights.sum(), test, Estimate(rise * unit, deviation * unit), laws, max_flow
+    )
 
 
 @pytest.mark.parametrize("weights", [PRESS, PLAIN])

@@ -245,6 +245,11 @@ class ColumnRoles:
         self.drivers = tuple(term.driver for term in equation.terms)
         self.healthy_conductance = equation.healthy
 
+    @property
+    def unshared(self) -> list[int]:
+        """Columns of the terms, except the leak, of whose differences between recordings nothing is known."""
+        return [k for k in self.compared if k != self.leak and not np.isfinite(self.between_deviation[k])]
+
     def level_deviations(self, total: Array) -> Array:
         """Compute the prior standard deviations (m - 1,) of the constant parts of all coefficients.
 
@@ -721,10 +726,15 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
     return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
 
 
-def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Compute the Gram matrix of a whole recording for each of E equations, divided by the residual variance of a row.
+def scale_grams(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
+    """Divide the Gram matrices of K blocks by the residual variance of a row, for each of E equations.
 
-    The result has the shape (E, m, m); the m columns are the terms of the balance and, last, its left side.
+    The result has the shape (K, E, m, m); the m columns are the terms of the balance and, last, its left side.
     """
     variances = [_fit_equation(blocks, e, roles).variance for e, roles in enumerate(columns)]
-    return np.array([blocks.gram[:, e].sum(axis=0) / variance for e, variance in enumerate(variances)])
+    return blocks.gram / np.array(variances)[:, None, None]
+
+
+def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
+    """Compute the Gram matrix (E, m, m) of a whole recording for each of E equations, scaled as by `scale_grams`."""
+    return np.asarray(scale_grams(blocks, columns).sum(axis=0))

@@ -97,7 +97,7 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     for e, roles in enumerate(columns):
         if roles.hold_leak is not None:
             reduced[e][roles.hold_leak] = reduced[e][:, roles.hold_leak] = 0.0
-        unshared = [k for k in roles.compared if k != roles.leak and not np.isfinite(roles.between_deviation[k])]
+        unshared = roles.unshared
         cross = reduced[e][:, unshared].copy()
         reduced[e] -= cross @ solve(reduced[e][np.ix_(unshared, unshared)], cross.T)
         reduced[e][unshared] = reduced[e][:, unshared] = 0.0
@@ -158,3 +158,35 @@ def estimate_leak_excess(
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)
+
+
+def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]) -> Array:
+    """Compute the weights (K,) of K blocks in a recording's excess over reference recordings; their sum is 1.
+
+    A leak with the coefficient g_k in block k causes the excess sum_k w_k g_k (`estimate_leak_excess`). With N_k, the
+    sum of squares of the leak's column in the block, and C_k, its products with the columns of the other terms,
+
+        w_k = (N_k - C (G + P)^-1 C_k') / (N - C (G + P)^-1 C').
+
+    N and C are the sums over the blocks, G is the Gram matrix of the other columns, and P the prior precision of their
+    coefficients. The weight of a block in which the other terms explain the leak is small, and may be negative.
+
+    `grams` (K, E, m, m): Gram matrices of the blocks for E equations; `reference` (E, m, m): that of the sum of the
+    reference recordings; `columns`: roles of their columns.
+    """
+    grams = grams.copy()
+    for e, roles in enumerate(columns):
+        if roles.hold_leak is not None:
+            grams[:, e, roles.hold_leak] = grams[:, e, :, roles.hold_leak] = 0.0
+    totals = grams.sum(axis=0)
+    shared = eliminate_unshared(totals, columns)
+    weights = np.zeros(len(grams))
+    for e, roles in enumerate(columns):
+        _, nuisance, prior = residual_products(shared[e], reference[e], roles)
+        others = [*nuisance, *roles.unshared]
+        precision = np.append(prior, np.zeros(len(others) - len(nuisance)))
+        cross = grams[:, e, roles.leak][:, others]  # C_k
+        factors = solve(totals[e][np.ix_(others, others)] + np.diag(precision), totals[e][others, roles.leak])
+        weights += grams[:, e, roles.leak, roles.leak] - cross @ factors
+    total = float(weights.sum())
+    return weights / total if total > 0.0 else np.full(len(grams), 1.0 / len(grams))

@@ -199,7 +199,7 @@ class BalanceLeak(LeakMeasure):
             balance.running_blocks,
             balance.columns,
             balance.leak,
-            balance.compared_leak.precision.sum(axis=0),
+            balance.block_weights(self.healthy),
             self.step,
             rise=Estimate(motion_rise.value, motion_rise.normal_deviation),
             laws=self._rise_laws(),
@@ -409,7 +409,8 @@ class BalanceLeak(LeakMeasure):
         onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
         if rise_after is None:
-            fraction = balance.compared_leak.fraction_after(step.onset().value)
+            is_after = balance.running_blocks.time >= step.onset().value
+            fraction = float(np.clip(balance.block_weights(self.healthy)[is_after].sum(), 0.0, 1.0))
             mean_rise = step.fitted.value * fraction  # mean over the recording
             step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
             return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)

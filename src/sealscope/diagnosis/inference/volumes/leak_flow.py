@@ -194,8 +194,8 @@ def fit_rise(
     """Fit a leak to the rise over healthy recordings and to the changes of the leakage within the recording.
 
     - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
-      in the blocks; `weights` (K,): information of each block in the comparison with healthy recordings; `test`: step
-      test of the coefficient, None if the leak can only be older than the recording;
+      in the blocks; `weights` (K,): weight of each block in the rise (`coefficients.block_weights`); `test`: step test
+      of the coefficient, None if the leak can only be older than the recording;
     - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
@@ -209,7 +209,7 @@ def fit_rise(
     - The flow has a half-normal prior, whose scale is the fraction `size.usual` (`priors.toml`) of the pump's flow; S
       is the coefficient of a leak with this flow. s'' and e'' are mean and standard deviation of s by this prior and
       s'.
-    - The rise r, with the standard deviation d, measures f s, where f is the mean of c_k, weighted by `weights`.
+    - The rise r, with the standard deviation d, measures f s, where f is the sum of the weights times c_k.
 
     N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
     and p = `size.present` the prior probability of a leak. The weights of the hypotheses, up to a common factor, are as
@@ -238,7 +238,6 @@ def fit_rise(
     flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
     older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
     fits = [older]
-    weights = np.maximum(weights, 0.0) / max(float(np.maximum(weights, 0.0).sum()), _TINY)
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
@@ -262,8 +261,8 @@ def _combine_with_rise(
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
     `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
-    it is older than the recording; `weights` (K,): information of the blocks, with the sum 1. Yields two triples of
-    arrays (o,): log weight of each onset, without the priors of law and onset, mean flow after it, and the flow's
+    it is older than the recording; `weights` (K,): weights of the blocks in the rise. Yields two triples of arrays
+    (o,): log weight of each onset, without the priors of law and onset, mean flow after it, and the flow's
     standard error [m^3/s]. In the first the rise is evidence of the step, in the second it is not.
     """
     unit_flow = np.maximum(fit.unit_flow, MIN_UNIT * float(fit.unit_flow.max()))  # 0 where no pressure is known

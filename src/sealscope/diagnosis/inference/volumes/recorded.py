@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
@@ -17,6 +17,7 @@ from sealscope.diagnosis.inference.blocks import (
     estimate_weighted_mean,
     information,
     offset_cost,
+    scale_grams,
     solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
@@ -30,6 +31,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
+from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, PUMP, Equation
@@ -156,14 +158,14 @@ class RecordedBalance:
         """Likelihood of the leak's conductance in each of `running_blocks` (`onset.Information`)."""
         return self._leak_and_test[0]
 
-    @cached_property
-    def compared_leak(self) -> Information:
-        """Likelihood of the leak's conductance in each of `running_blocks`, for a comparison with other recordings.
+    def block_weights(self, healthy: Sequence[RecordingSums]) -> Array:
+        """Compute the weights (K,) of `running_blocks` in the rise of the leakage over `healthy` recordings.
 
-        Unlike `leak`, it has no separate coefficient for the leakage while the pump holds a load.
+        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`coefficients.block_weights`).
         """
-        roles = self.columns[0]
-        return information(self.running_blocks, self.columns, roles.leak, left_out=roles.hold_leak)
+        grams = scale_grams(self.blocks, self.columns)
+        reference = np.sum([recording.sums for recording in healthy], axis=0)
+        return block_weights(grams, reference, self.columns)[self._first_motion :]
 
     @property
     def test(self) -> StepTest | None:
