@@ -40,10 +40,10 @@ def suggestion(word: str, known: Iterable[str]) -> str:
 
 
 def checked_call(function: Callable[P, R]) -> Callable[P, R]:
-    """Wrap `function` to raise InputError for wrong arguments; the wrapper has the same signature and docstring.
+    """Wrap `function` to raise InputError for unknown, missing or superfluous arguments; their types are not checked.
 
-    The error for an unknown keyword suggests the nearest known one: ``simulate has no argument 'comand'; did you mean
-    'command'?``.
+    The wrapper keeps signature and docstring. The error for an unknown keyword suggests the nearest known one:
+    ``simulate has no argument 'comand'; did you mean 'command'?``.
     """
     signature = inspect.signature(function)
     parameters = signature.parameters.values()
@@ -83,10 +83,10 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 def take_fields_of(arguments_class: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Build a decorator that makes the fields of a dataclass the parameters of a function.
 
-    `arguments_class`: the dataclass, whose fields are declared by `argument`. It is typed as its constructor, so that
-    type checkers know the parameters. The function is written with one parameter, an instance of this dataclass; its
-    callers pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the
-    section "Returns". Wrong arguments raise InputError.
+    `arguments_class`: the dataclass, whose fields are declared by `argument`; its annotation as a constructor tells
+    type checkers the parameters. The function is written with one parameter, an instance of this dataclass; its callers
+    pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the section
+    "Returns". Wrong arguments raise InputError (`checked_call`).
     """
     lines: list[str] = []
     for declared_field in fields(arguments_class):  # type: ignore[arg-type]

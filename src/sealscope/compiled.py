@@ -38,6 +38,7 @@ numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
 _MESSAGE_LIMITS = "monitor/sources/message_limits.py"
+#: Packages and modules with compiled code.
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py"),
     *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
@@ -105,7 +106,8 @@ def _prune(kernels: Path, current: str) -> None:
 def _check_owner(folder: Path, forbidden: int) -> None:
     """Raise PermissionError unless `folder` is a directory, not a link, that belongs to this user alone.
 
-    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write; not on Windows.
+    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows only the
+    existence of the folder is checked.
     """
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
@@ -170,7 +172,8 @@ def kernel(function: _F, fastmath: Any = False) -> _F:
 def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
     """Compile a law, a function that compiled functions call; `inlined`: True to insert its code in place of each call.
 
-    `fastmath`: LLVM's fast-math flags, False for none. Without numba's compilation, the law is returned as it is.
+    `fastmath`: LLVM's fast-math flags, False for none. If numba's compilation is switched off (`NUMBA_DISABLE_JIT`),
+    `function` itself is returned.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -183,7 +186,7 @@ def law(function: _F) -> _F:
 
 
 def large_law(function: _F) -> _F:
-    """Compile a large function for calls from Python and compiled functions, which call it and do not inline it."""
+    """Compile a large function for calls from Python and from compiled functions; its code is not inlined in these."""
     return _compile_law(function, fastmath=False, inlined=False)
 
 
@@ -196,7 +199,10 @@ def contracted(function: _F) -> _F:
 
 
 class Entry:
-    """A C function `double f(double *memory, double *input)`, compiled when its `address` is first requested."""
+    """A C function `double f(double *memory, double *input)`, compiled when its `address` is first requested.
+
+    An example is a control law: `memory` holds its state and parameters, `input` the measured values of a sample.
+    """
 
     _SIGNATURE = numba.float64(types.CPointer(numba.float64), types.CPointer(numba.float64))
 

@@ -26,7 +26,8 @@ LEAK = "0.0042 L/min from 30 s"
 class Demo:
     """Results of the demo: the commissioned machine, two diagnoses, the simulated leak, and the files written.
 
-    `healthy`, `diagnosis`: diagnoses of a healthy and of the leaking recording; `page`: report on the latter.
+    `healthy`, `diagnosis`: diagnoses of a healthy and of the leaking recording; `recording`, `page`: files of the
+    leaking recording and of the report on it.
     """
 
     machine: CommissionedMachine
@@ -41,13 +42,14 @@ class Demo:
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
-    All files are written into `folder`. `progress`: called with the name of a task and its completed fraction.
+    All files are written into `folder`. `seed` sets the random numbers of all recordings. `progress` is called with the
+    name of a task and its completed fraction.
     """
     report_progress = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
     recordings = {}  # name of the file -> recording
     for k, name in enumerate(names):
-        run_seed = len(names) * seed + k  # a different one for each recording and each `seed`
+        run_seed = len(names) * seed + k  # differs for each healthy recording and `seed`
         healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
         report_progress("simulating healthy recordings", (k + 1) / len(names))

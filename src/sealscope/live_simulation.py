@@ -1,4 +1,4 @@
-"""Simulated actuators as sources of blocks for the monitor, at a multiple of real time.
+"""Simulated actuators as sources of blocks of samples for the monitor, at a multiple of real time.
 
 A simulation is reproducible, and the identity of a block contains everything that it depends on. A restarted monitor
 therefore continues after the last block that it stored, and counts no block twice.
@@ -56,7 +56,8 @@ _simulation_lock = Lock()
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
     """Build a source of samples for each actuator whose settings contain `simulate`.
 
-    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError.
+    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError
+    for invalid settings (`_make_experiment`).
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)

@@ -21,7 +21,7 @@ from numba.core.ir_utils import get_definition, guard
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import register_jitable
 
-#: Names of numba that are not in its reference manual but used by both modules, `physics.lanes` and `fmu`, by module.
+#: Names of numba, by module, that its manual lacks but this module, `numba_private`, `physics.lanes` or `fmu` uses.
 EXTENSION_NAMES = {
     "numba.core": ("cgutils", "config", "ir"),
     "numba.core.compiler": ("CompilerBase", "DefaultPassBuilder"),

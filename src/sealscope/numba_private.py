@@ -126,7 +126,7 @@ _config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
-    """Build numba's dispatcher of a function, which compiles it when it is called.
+    """Build numba's dispatcher of a function: the object that compiles the function when it is called.
 
     `options`: additional options of `numba.njit`; `folder`: folder of the cache, None for no cache.
     """
@@ -165,7 +165,7 @@ class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
 
 
 class _LawCompiler(_ShortCompiler):
-    """Compiler of laws, functions for other compiled functions, to LLVM code in a `_LawLibrary`, not machine code."""
+    """Compiler of laws, the functions for other compiled functions; its result is LLVM code in a `_LawLibrary`."""
 
     def define_pipelines(self) -> list[Any]:
         """Build a list with one pipeline of numba, with the passes in `_PASSES` but without machine code."""

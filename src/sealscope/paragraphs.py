@@ -29,7 +29,7 @@ def paragraph(text: str, head: str = "", indent: int | None = None, width: int =
 
 
 def paragraphs(rows: Iterable[tuple[str, str | None]], columns: int) -> list[str]:
-    """Format pairs (label, text) as paragraphs, the label in the first `columns` characters; omit any without text."""
+    """Format pairs (label, text) as paragraphs, the label in the first `columns` characters; omit missing texts."""
     return [paragraph(text, f"  {label}".ljust(columns), indent=columns) for label, text in rows if text]
 
 

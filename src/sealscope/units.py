@@ -1,9 +1,9 @@
 """Convert the units of files, options and figures to the SI doubles used inside, and back.
 
-A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi. The conversion is exact:
-``234 cm^3`` is the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``, ``m^3/rev`` is
-not ``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are looked up by
-pint, which is loaded only then.
+A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi. The conversion of a number
+is exact: ``234 cm^3`` is the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``,
+``m^3/rev`` is not ``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are
+looked up by pint, which is loaded only then.
 """
 
 from __future__ import annotations
@@ -40,7 +40,10 @@ _Conversion = tuple[Fraction, float, Fraction, Fraction]
 
 
 class Unit(NamedTuple):
-    """A unit of measurement: SI value = (value + offset) * factor * pi**pi_power; `powers`: exponents of base units."""
+    """A unit of measurement: SI value = (value + offset) * factor * pi**pi_power.
+
+    `powers`: pairs of base unit and exponent, sorted; they define the dimension.
+    """
 
     factor: Fraction = Fraction(1)
     pi_power: Fraction = Fraction(0)
@@ -74,7 +77,7 @@ def _build_unit(row: Mapping[str, Any]) -> Unit:
 def _absolute_unit(unit: Unit) -> Unit:
     """Build the unit of absolute pressure that belongs to `unit`, a unit of gauge pressure.
 
-    SI values are gauge pressures: the offset is -1 atmosphere.
+    SI values are gauge pressures: the offset is -1 atmosphere, expressed in `unit`.
     """
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
@@ -120,7 +123,10 @@ def _registry() -> Any:
 
 
 def _parse_name(name: str) -> Unit:
-    """Look up a unit in `units.toml` and then in pint; raise InputError unless it is proportional to an SI unit."""
+    """Look up a unit in `units.toml` and then in pint; raise InputError if neither has it.
+
+    Pint's units must be proportional to an SI unit; those with an offset, such as degC, are in the table alone.
+    """
     unit_of_table = _ATOMS.get(_SPELLINGS.get(name, name))
     if unit_of_table is not None:
         return unit_of_table
@@ -162,7 +168,8 @@ def _tokenize(text: str) -> list[str]:
 def _parse_product(tokens: list[str]) -> Unit:
     """Parse a product of units, such as ``m^3/(s Pa)``, from its `tokens`, and remove them from the list.
 
-    The product ends with the list or before a closing bracket. Raises ValueError if there is no valid product.
+    The product ends with the list or before a closing bracket. A slash divides by the next factor alone. Raises
+    ValueError if there is no valid product.
     """
     result: Unit | None = None
     divides = False
@@ -271,8 +278,11 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
     return source.factor / target.factor, float(source.pi_power - target.pi_power), source.offset, target.offset
 
 
-def _find_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the `_conversion` from `unit` to `si_unit`; an InputError states quantity (`name`) and file (`place`)."""
+def _require_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
+    """Compute the `_conversion` from `unit` to `si_unit`, with an error for the user if the dimensions differ.
+
+    The InputError states the quantity (`name`), the expected dimension and the file (`place`).
+    """
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
@@ -309,7 +319,7 @@ def to_si(
     scalar = isinstance(values, int | float)
     if unit == si_unit:
         return float(values) if scalar else np.asarray(values, dtype=np.float64)  # type: ignore[arg-type]
-    conversion = _find_conversion(unit, si_unit, name, place)
+    conversion = _require_conversion(unit, si_unit, name, place)
     if scalar:
         number = float(values)  # type: ignore[arg-type]
         return _convert_exactly(Fraction(repr(number)), conversion) if math.isfinite(number) else number
@@ -339,7 +349,7 @@ def from_si(
 
     Raises InputError if `unit` has another dimension; the message states `name`, that dimension and the file `place`.
     """
-    _find_conversion(unit, si_unit, name, place)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
+    _require_conversion(unit, si_unit, name, place)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
     return to_si(values, si_unit, unit, name=name, place=place)
 
 
@@ -368,7 +378,7 @@ def parse_quantity(
     elif unit == si_unit:
         result = number
     else:
-        result = _convert_exactly(Fraction(match["number"]), _find_conversion(unit, si_unit, name, place))
+        result = _convert_exactly(Fraction(match["number"]), _require_conversion(unit, si_unit, name, place))
     if finite and not math.isfinite(result):
         raise InputError(f"{name} must be a finite number, got {text[:60].strip()}{suffix}")
     return result

@@ -150,7 +150,7 @@ def main() -> None:
         status = _WRONG_CALL
     except (typer.Abort, KeyboardInterrupt):
         status = _INTERRUPTED
-    except BrokenPipeError:
+    except BrokenPipeError:  # the reader of the output has ended
         status = 1
     except SealscopeError as error:
         complain(error)
@@ -162,7 +162,7 @@ def main() -> None:
         complain("interrupted")
     try:
         sys.stdout.flush()
-    except OSError:  # the reader of a pipe has ended: discard the rest, or Python's flush at exit would complain
+    except OSError:  # discard the rest, or Python's flush at exit would complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(status if isinstance(status, int) else 0)
 

@@ -123,7 +123,10 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, and the processor time of a record and of the remaining ones."""
+    """Format the numbers of records done and failed, the processor time of a record, and that of all remaining ones.
+
+    The times are left out while no record has a result.
+    """
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"

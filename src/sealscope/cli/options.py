@@ -282,7 +282,7 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
     The command gets the experiment that these options describe. The argument `drifts` is left out, as it cannot be
     written as text.
     """
-    special_options = {
+    special_options = {  # those with completion, with a flag of another name, or repeatable
         "rig": RigOption,
         "set": SetOption,
         "x_0": Annotated[str, declared_option("x_0", option="--start-position")],
@@ -312,7 +312,10 @@ def _build_experiment(rig: str, set: Sequence[str] | None, **arguments: Any) -> 
 def _replace_parameter(
     name: str, make: Callable[..., Any], options: Sequence[Parameter]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `name` of a command by options, from which `make` builds it."""
+    """Build a decorator that replaces the parameter `name` of a command by options.
+
+    `make`: function that builds the parameter's value from the values of the options, its keyword arguments.
+    """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         """Wrap the command with a signature that has the options in place of the parameter."""
@@ -321,13 +324,14 @@ def _replace_parameter(
 
         @wraps(command)
         def call(**arguments: Any) -> None:
-            """Build the value of the parameter from the options, and call the command with it."""
+            """Build the parameter's value from the options, and call the command with it."""
             value = make(**{option.name: arguments.pop(option.name) for option in options})
             command(**{name: value}, **arguments)
 
         parameters = list(signature.parameters.values())
         index = list(signature.parameters).index(name)
         parameters[index : index + 1] = options
+        # keyword-only: a required option may then follow one with a default
         keyword_only = [parameter.replace(kind=parameter.KEYWORD_ONLY) for parameter in parameters]
         call.__signature__ = signature.replace(parameters=keyword_only)  # type: ignore[attr-defined]
         return call
@@ -482,7 +486,7 @@ def _minute_reporter() -> Callable[[str, float], None]:
         """Print the task and the time left, estimated from the fraction done, at most once a minute."""
         nonlocal last_print, start_fraction
         now = time.monotonic()
-        if start_fraction is None:
+        if start_fraction is None:  # an earlier call may have done this fraction: it took none of the time
             start_fraction = fraction
         if now - last_print >= 60.0 and fraction > start_fraction:
             last_print = now

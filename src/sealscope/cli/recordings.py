@@ -112,9 +112,9 @@ def _diagnose_in_parallel(
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
     """Diagnose files in parallel processes; yield a pair (messages, dated diagnoses) for each file, in their order.
 
-    `work`: function that yields the dated diagnoses of files, None for an unreadable one. The messages are the text
-    that it printed on standard error. If the process of a file dies, its diagnoses are [None]. On a single core, one
-    pair contains all files.
+    `work`: function that yields a dated diagnosis, (start, diagnosis), of each file, None for an unreadable one. The
+    messages are the text that it printed on standard error. If the process of a file dies, its diagnoses are [None]. On
+    a single core, one pair contains all files.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
@@ -179,10 +179,10 @@ def _iter_diagnoses(
 ) -> Iterator[DiagnosedRecording | None]:
     """Yield each recording with its diagnosis, or None if the file cannot be read or diagnosed.
 
-    If a baseline, i.e. a leak-free recording for comparison, cannot be read, None is yielded first, once. A file never
-    serves as its own baseline. `joined`: True if the files are parts of a single recording; `settings`: further
-    arguments of `sealscope.diagnose`. Raises InputError if the only baseline of a file is the file itself, and
-    UnreadableFile if no baseline can be read.
+    If a baseline, i.e. a leak-free recording for comparison, cannot be read, an additional None is yielded first, so
+    that the call counts as incomplete. A file never serves as its own baseline. `joined`: True if the files are parts
+    of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError if the only baseline
+    of a file is the file itself, and UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files:
@@ -225,7 +225,7 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 def _run_collecting_messages(
     work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`; return what it prints on standard error, and its dated diagnoses."""
+    """Diagnose files by the function `work`; return its text on standard error, and what it yields for each file."""
     with redirect_stderr(StringIO()) as messages:
         dated_diagnoses = list(work(files))
     return messages.getvalue(), dated_diagnoses
@@ -296,7 +296,7 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
     """Write the page of a commissioned machine, with its newest verdict and all its recordings over time.
 
     `files`: recordings and folders of them; `false_alarm`: probability of the verdict `leak` for a leak-free recording.
-    Raises UnreadableFile if no recording can be read, and ends with the exit status 1 if some cannot be read.
+    Raises UnreadableFile if no recording can be read and diagnosed, and ends with the exit status 1 if some cannot.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count

@@ -48,7 +48,7 @@ class HydraulicLine(Part):
 
     With `orifices = "absent"` the pump is piped directly to the cylinder: p_1 = p_A, p_2 = p_B, V_1 and V_2 are
     unused, and there are neither valves nor filters. A filter may clog with the volume that has passed it
-    (`clogged_resistance`), and has a bypass valve. The circulation valve between the pump's ports is shut by default.
+    (`physics.restrictors`), and has a bypass valve. The circulation valve between the pump's ports is shut by default.
     """
 
     orifices: Literal["absent", "present"] = choice("throttles and line volumes in the model")

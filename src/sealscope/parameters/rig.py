@@ -437,6 +437,7 @@ def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry]
         text = str(error)
         wrong_parameter = path + text.split(maxsplit=1)[0]  # a message of `Part` begins with the symbol
         wrong_place = place if isinstance(error, PartsDisagreeError) else entries[wrong_parameter].place
+        # without a `path` the rule is one of `Rig`, whose messages contain dotted names
         raise InputError(f"{_qualify_symbol(wrong_parameter, text) if path else text} ({wrong_place})") from None
 
 

@@ -62,10 +62,10 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart of the page.
 
-    `key`: its identifier; `group`: section of the page that shows it; `base`: name of the time axis, which has the
-    times of all samples, the centres of the RMS windows, or the times at which the leak is estimated; `height`: in
-    pixels; `band`: True if the second and third line are the interval of the first; `limits`: ends of the y axis, None
-    to show all values; `level`: repair limit, None if there is none.
+    `key`: its identifier; `group`: section of the page, one of `GROUPS`; `base`: name of the time axis: `SAMPLES` for
+    the recording's samples, "windows-CHANNEL" for the centres of the RMS windows, or `COURSE` for the times of the
+    leak's estimates; `height`: in pixels; `band`: True if the second and third line are the interval of the first;
+    `limits`: ends of the y axis, None to show all values; `level`: repair limit in `unit`, None if there is none.
     """
 
     key: str
@@ -141,7 +141,7 @@ def detail_label(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Build the charts of all channels with samples, over the time of the recording.
+    """Build the charts of the channels in `_CHANNELS` that have finite values, over the time of the recording.
 
     The two chamber pressures share a chart, and so do those at the pump's ports, unless their display units differ.
     """
@@ -157,7 +157,7 @@ def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
     return charts
 
 
-#: Key, title, height and channels of the charts.
+#: Charts of channels: key, title, height [pixels] and the channels that share the chart.
 _CHANNELS = (
     ("u", "Command", 140, ("u",)),
     ("x", "Piston position", 140, ("x",)),
@@ -328,9 +328,9 @@ def _clip_values(values: Array) -> Array:
 
 
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its interval [s] with both ends limited to `span` [s].
+    """Return the onset of the leak [s], and its interval [s] with both ends limited to the times `span` [s].
 
-    Either is None if it is not known.
+    Both are None without a finite onset; the interval alone is None if it is not known.
     """
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
@@ -346,8 +346,8 @@ def render_still(
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    `lines`: values (n,) of each line at the times `t` (n,) [s]; `span` [s]: ends of the time axis; `moments`:
-    moments and intervals to be marked.
+    `lines`: for each of `chart.lines`, the values (n,) at the times `t` (n,) [s], in place of those in `chart`; `span`
+    [s]: ends of the time axis; `moments`: moments and intervals to be marked.
     """
     lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)
@@ -356,7 +356,7 @@ def render_still(
     max_magnitude = max(abs(low), abs(high))
     if high - low <= max(_MIN_EXTENT, _MIN_RELATIVE_EXTENT * max_magnitude):  # all values are equal
         pad = max(0.5, 1e-6 * max_magnitude)
-        low, high = low - pad, high + pad
+        low, high = low - pad, high + pad  # the axis needs a length
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
     lines = [np.clip(line, low, high) for line in lines]

@@ -72,7 +72,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
     for part in usable_parts:
         try:
             transform = details(signal[part])
-            rows, inside = transform.quantities(), transform.inside()
+            rows, inside = transform.quantities(), transform.inside()  # `inside`: without the effect of padding
             ends, window_rows = windowed_rms(rows[:, inside], first=inside.start)
         except InputError as error:  # such as pressures of 1e300, whose squares overflow
             return None, f"No details of {channel}: {error}."
@@ -99,7 +99,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
 
 
 class Parts(NamedTuple):
-    """Two parts of a recording that are compared on the page: until the time `end` [s], and from `start` [s] on.
+    """Two parts of a recording that are compared on the page: before the time `end` [s], and from `start` [s] on.
 
     `heads`: their headings in the table; `text`: sentence that explains the choice.
     """
@@ -135,7 +135,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
     """Compute the RMS of each wavelet detail of `chambers` in two parts of the recording.
 
-    It is None for a part without finite values.
+    The RMS is None for a part without finite values.
     """
     t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start

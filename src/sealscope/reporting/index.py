@@ -18,8 +18,8 @@ _ORDER = ("leak", "cannot tell", "no leak")
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     """Compute a key that sorts diagnoses by severity, the most severe first.
 
-    The order is by verdict ("leak", "cannot tell", "no leak"), then by the leak over the repair limit and by the flow
-    [L/min], the largest first and 0 if unknown, and last by the file's name.
+    The order is by verdict ("leak", "cannot tell", "no leak"), then by the leak divided by the repair limit, then by
+    the leak or else the total leakage [L/min], the largest first and 0 if unknown, and last by the file's name.
     """
     severity = diagnosis.severity
     # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval

@@ -83,9 +83,9 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the named cause of the change in a recording, or None if no cause is named.
+    """Return the cause of the change in a recording that texts may name, or None if there is none.
 
-    A leak past piston or pump (`LEAKS`) is named only with the verdict "leak".
+    A leak past the piston, or one that cannot be told from it (`LEAKS`), is named only with the verdict "leak".
     """
     if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
         return None
@@ -151,7 +151,7 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
-    """Return the reason why the leak cannot be stated in L/min, and the remedy, as text."""
+    """Format the reason why the leak is not stated in L/min, with the remedy if there is one."""
     if "leak_lpm" not in diagnosis.refuses:  # not withheld, but cannot be computed
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")

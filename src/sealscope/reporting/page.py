@@ -58,9 +58,9 @@ def report(
     marks : sequence of Mark, optional
         Further moments that are marked on every chart.
     truth_onset_s, truth_leak_lpm : float, optional
-        True onset [s] and leak [L/min], shown next to the verdict.
+        True onset [s] and leak [L/min], shown next to the verdict; a card has a mark at the onset alone.
     title : str, optional
-        By default the name of the recording.
+        By default the name of the recording or, on a card, of its machine if that is known.
     pressure_unit : {"bar", "MPa", "kPa", "psi"}, optional
         By default the unit of the log, or bar if the log states none.
 

@@ -13,8 +13,8 @@ from sealscope.recordings.recording import Recording
 def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
     """Collect the facts about a recording for the head of its page, as texts by label, such as "Date" or "Operator".
 
-    The facts come from remarks in the recording's file. If no remark states the machine, it is the name of `rig`, and
-    if none states the date, it is the start of the recording. Labels are in the order of `particulars.toml`.
+    The facts come from remarks in the recording's file. If no remark states the machine, it is the title or name of
+    `rig`; if none states the date, it is the start of the recording. Labels are in the order of `particulars.toml`.
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))
@@ -28,5 +28,5 @@ def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[st
         matches = (name for pattern in patterns for name in remarks if re.fullmatch(pattern, name, re.IGNORECASE))
         name = next(matches, None)
         if name is not None:
-            facts[label] = remarks.pop(name)  # pop: no remark is used for two facts
+            facts[label] = remarks.pop(name)  # from a copy of the remarks; none is used for two facts
     return {label: facts[label] for label in patterns_by_label if label in facts}

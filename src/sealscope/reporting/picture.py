@@ -152,7 +152,7 @@ class Picture:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """Choose about `count` round values between low and high, at steps of 1, 2 or 5 times a power of ten."""
+    """List about `count` round values from `low` to `high`, multiples of 1, 2 or 5 times a power of ten."""
     min_step = (high - low) / count
     power = 10.0 ** np.floor(np.log10(min_step))
     # 0.999 and 1e-9: rounding errors must not change the step or leave out an end

@@ -22,8 +22,9 @@ class DrawnTimes:
     Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
     `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): samples [start, stop) of each
     bucket; `width`: number of samples in a full bucket, 1 if all are drawn; `fine`: range of samples that are all
-    drawn; `breaks`: for each gap in time, the number of points before it, without NaN, where a NaN interrupts the line;
-    `by_sample`: True if the time stamps do not increase, and `t` is the number of the sample over the sampling rate.
+    drawn; `breaks` (g,): for each gap in time, the index of the first point after it, in a count without NaN, before
+    which a NaN interrupts the line; `by_sample`: True if the time stamps do not increase, so that `t` is the number of
+    the sample over the sampling rate.
     """
 
     t: Array
@@ -37,8 +38,8 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        Each bucket, a group of successive samples, gives its minimum and maximum, the minimum first if the last value
-        is not below the first. A bucket of one sample gives one point. A NaN is inserted at each gap in time.
+        Each bucket gives its minimum and maximum, the minimum first if its last value is not below its first. A bucket
+        of one sample gives one point. A NaN is inserted at each gap in time.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -70,11 +71,12 @@ def choose_drawn_times(
 ) -> DrawnTimes:
     """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
-    The samples are divided into buckets, groups of successive samples of which only minimum and maximum are drawn. A
-    bucket has two times. Full buckets have equal numbers of samples, so a drawn peak is at most one bucket away from
-    its true time. At each gap in time a new bucket starts, and an additional point interrupts the line. This is done
-    for the longest gaps only, at most `points` / 20. `t` (n,) [s]: time stamps; `rate` [Hz]: nominal sampling rate;
-    `near` [s]: time around which `near_samples` samples are all drawn, None for the start of the recording.
+    The samples are divided into buckets, groups of successive samples of which only minimum and maximum are drawn, at
+    the times of the bucket's first and last sample. Full buckets have equal numbers of samples, so a drawn peak is at
+    most one bucket away from its true time. At each gap in time a new bucket starts, and an additional point interrupts
+    the line. This is done for the longest gaps only, at most `points` / 20. `t` (n,) [s]: time stamps; `rate` [Hz]:
+    nominal sampling rate; `near` [s]: time around which `near_samples` samples are all drawn, each in a bucket of its
+    own; None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -99,7 +101,7 @@ def choose_drawn_times(
 
 
 def encode_values(values: Array) -> dict[str, Any]:
-    """Encode values as base64 text of 16-bit integers, for the script of the page.
+    """Encode values as base64 text of little-endian 16-bit integers, for the script of the page.
 
     Returns the text `q`, the minimum `low` of the values, and `step`, 1/65534 of their range. An integer q of the text
     stands for the value ``low + (q + 32767) * step``, and -32768 for a value that is not finite.

@@ -175,7 +175,7 @@ def _say(name: str, **values: Any) -> str:
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
     """Format notes on the channels and rigs that detectors were given, one for each set of channels and each rig.
 
-    A note names the detectors concerned. Only the note on channels names none if all detectors were given the same.
+    A note names the detectors concerned, except that on channels if all detectors were given the same ones.
     """
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)

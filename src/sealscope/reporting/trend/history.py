@@ -39,7 +39,7 @@ def write_history_page(
     """Write the page of a machine as .html, .htm or .pdf, and return its path; raise InputError if that fails.
 
     `judged`: the machine's diagnosed recordings, in any order; `title`: name of the machine; `left_out`: number of
-    files that could not be read.
+    files that could not be read or diagnosed.
     """
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
@@ -48,14 +48,14 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
     """Render the page of a machine as HTML; raise InputError if there are no recordings.
 
     `judged`: the machine's diagnosed recordings, in any order; `title`: name of the machine; `left_out`: number of
-    files that could not be read.
+    files that could not be read or diagnosed.
     """
     if not judged:
         raise InputError("the page of a machine must have at least 1 recording, got 0")
     first = -math.inf  # recordings without a date come first
     ordered = sorted(judged, key=lambda item: (first if item.start_s is None else item.start_s, item.diagnosis.file))
     newest = ordered[-1].diagnosis
-    dates = _dates(ordered)
+    dates = _format_dates(ordered)
     page_charts, drawn, files = _draw_comparison(ordered)
     entries = zip(ordered, dates, strict=True)
     rows = [{"file": Path(entry.diagnosis.file).name, "date": date, "d": entry.diagnosis} for entry, date in entries]
@@ -136,7 +136,7 @@ def _leak_level(diagnosis: Diagnosis) -> _Level | None:
     return leak, low if math.isfinite(low) else 0.0, high
 
 
-def _dates(ordered: Sequence[Judged]) -> list[str]:
+def _format_dates(ordered: Sequence[Judged]) -> list[str]:
     """Format the start of each recording as a date, with the time of day if all are within 3 days; "–" if unknown."""
     starts = [entry.start_s for entry in ordered if entry.start_s is not None]
     span_days = (max(starts) - min(starts)) / DAY if starts else 0.0

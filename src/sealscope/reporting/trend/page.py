@@ -53,9 +53,9 @@ def level_pictures(
 ) -> dict[str, Picture]:
     """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
-    `days` [d]: times of the first and last recording; `levels`: ends of the leakage axis; `limit`: repair limit, drawn
-    unless it lies above the axis; `format_day`: formats a time [d] for the axis; `draw`: draws the recordings into a
-    picture.
+    `days`: times of the first and last recording [d], or their numbers if dates are unknown; `levels`: ends of the
+    leakage axis; `limit`: repair limit, drawn unless it lies above the axis; `format_day`: formats a value of the time
+    axis; `draw`: draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5  # half a day if there is one time only
     first, last = days[0] - margin, days[1] + margin

@@ -136,9 +136,9 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [days]: time from the last recording until then. There is no date if the
-    limit is reached already, the date is too far away, or the recordings are too few. Without an alarm only the
-    earliest date is stated (95 % confidence).
+    `limit`: in the unit of the trend; `reach` [days]: time from the last recording until then (`Wear.reach`). There is
+    no date if the limit is reached already, the date is too far away (`history.furthest` of the priors), or the
+    recordings are too few. Without an alarm only the earliest date is stated (95 % confidence).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = trend.points[0].day, trend.points[-1].day
