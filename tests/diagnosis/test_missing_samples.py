@@ -160,7 +160,7 @@ def step_of(recording: Recording) -> tuple[float, float, float]:
     balance = balance_of(recording)
     assert balance.test is not None
     onset = balance.test.onset().value
-    return balance.test.fitted[0] * balance.mean_pressure(onset) / balance.mean_flow, balance.test.score, onset
+    return balance.test.fitted[0] * balance.mean_pressure() / balance.mean_flow, balance.test.score, onset
 
 
 def test_a_poll_with_holes_gives_the_same_leak(late_leak: Recording, polled_leak: Recording) -> None:

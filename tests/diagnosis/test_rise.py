@@ -27,8 +27,8 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from ..representatives import few
 
 PRESSURE, FLOW = 1e5, 1e-5
-#: What is believed of the scatter of the leak's coefficient [m^3/(s Pa)].
-PRIORS = INFERENCE.scatter.leak * FLOW / PRESSURE
+#: Usual scatter of the leak's coefficient [m^3/(s Pa)].
+PRIORS = 0.003 * FLOW / PRESSURE
 
 
 def nothing(_: object) -> np.ndarray:

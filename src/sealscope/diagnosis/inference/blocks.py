@@ -312,7 +312,7 @@ class ColumnRoles:
         coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`. This
         conductance is at most that of a healthy piston, since the pump's leakage is laminar.
         """
-        driver = self.drivers[column] if column < self.left else ""
+        driver = self.drivers[column]
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
         per_conductance = {"": float("inf"), "pressure": 1.0, "root": pressure / root if root > 0.0 else 1.0}
         conductance = self.healthy_conductance
@@ -330,7 +330,7 @@ class ColumnRoles:
         much smaller numbers.
         """
         # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
-        driver = self.drivers[column] if column < self.left and self.bias is not None else ""
+        driver = self.drivers[column] if self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
         # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))
         per_pascal = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}
@@ -405,15 +405,14 @@ def information(
     blocks: Blocks,
     columns: Sequence[ColumnRoles],
     test: int,
-    left_out: int | None = None,
     with_expansion: bool = False,
 ) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
     For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
     The likelihoods of the equations are multiplied. `columns`: roles of the columns of each equation; `test`: index of
-    the coefficient's column; `left_out`: another column to omit; `with_expansion`: add the errors of the coefficient by
-    an imperfect model of the oil's expansion (`_expansion_errors`).
+    the coefficient's column; `with_expansion`: add the errors of the coefficient by an imperfect model of the oil's
+    expansion (`_expansion_errors`).
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
@@ -427,7 +426,7 @@ def information(
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
     for e, roles in enumerate(columns):
-        fit = _fit_equation(blocks, e, roles, test, left_out)
+        fit = _fit_equation(blocks, e, roles, test)
         normal = fit.normal
         right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
         solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
@@ -592,19 +591,17 @@ class _EquationFit(NamedTuple):
     variance: float
 
 
-def _fit_equation(
-    blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None, left_out: int | None = None
-) -> _EquationFit:
+def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None) -> _EquationFit:
     """Fit the nuisance coefficients of an equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
     The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `equation`: index of the equation; `test`: column of g, by default the leak's; `left_out`: another column to omit.
+    `equation`: index of the equation; `test`: column of g, by default the leak's.
     """
     gram, test = blocks.gram[:, equation], roles.leak if test is None else test
-    nuisance = [k for k in roles.nuisance if k not in (test, left_out)]
+    nuisance = [k for k in roles.nuisance if k != test]
     polynomials, minutes = _drift_polynomials(blocks)
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
@@ -732,7 +729,7 @@ def scale_grams(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
     The result has the shape (K, E, m, m); the m columns are the terms of the balance and, last, its left side.
     """
     variances = [_fit_equation(blocks, e, roles).variance for e, roles in enumerate(columns)]
-    return blocks.gram / np.array(variances)[:, None, None]
+    return np.asarray(blocks.gram / np.array(variances)[:, None, None])
 
 
 def sum_blocks(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:

@@ -240,7 +240,7 @@ class Ringing(NamedTuple):
 
     The ringing is an oscillation, measured by the RMS of wavelet details.
 
-    - `bound`: 95 % upper bound of an undetected change of the logarithm of this RMS;
+    - `bound`: 95 % upper bound of an undetected change of the ringing, the logarithm of this RMS without noise;
     - `rate`: sampling rate [Hz];
     - `healthy`: number of healthy recordings in the comparison; `is_dated`: true if their dates are known;
     - `unused`: recorded columns that are not assigned to a channel.

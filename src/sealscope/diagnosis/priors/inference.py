@@ -55,7 +55,6 @@ class ScatterPriors(PriorTable):
     freedom: float  # degrees of freedom of the prior on the scatter of conductances (`student_rise`)
     estimate: float  # smallest scatter, over the standard error that a recording states for its leakage
     finest: float  # smallest scatter of the leakage
-    leak: float  # usual scatter of the leakage, a standard deviation
     largest: float  # largest scatter of the leakage
     relative: float  # largest scatter of the leakage's logarithm
     unlike: float  # fraction of days whose unrecorded oil temperature is unlike that of all others

@@ -41,7 +41,6 @@ class RmsChange:
     """Detector of changes of the wavelet details' RMS, within a recording or against leak-free recordings."""
 
     name = RMS_CHANGE
-    reads = ("u", "p_A", "p_B")
 
     def __init__(self, rig: object = None) -> None:
         """Create the detector; `rig` is ignored, as the method needs no assumption on the machine."""

@@ -183,10 +183,10 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
     weights = np.zeros(len(grams))
     for e, roles in enumerate(columns):
         _, nuisance, prior = residual_products(shared[e], reference[e], roles)
-        others = [*nuisance, *roles.unshared]
-        precision = np.append(prior, np.zeros(len(others) - len(nuisance)))
-        cross = grams[:, e, roles.leak][:, others]  # C_k
-        factors = solve(totals[e][np.ix_(others, others)] + np.diag(precision), totals[e][others, roles.leak])
-        weights += grams[:, e, roles.leak, roles.leak] - cross @ factors
+        eliminated = [*nuisance, *roles.unshared]
+        precision = np.append(prior, np.zeros(len(eliminated) - len(nuisance)))
+        matrix = totals[e][np.ix_(eliminated, eliminated)] + np.diag(precision)
+        factors = solve(matrix, totals[e][eliminated, roles.leak])
+        weights += grams[:, e, roles.leak, roles.leak] - grams[:, e, roles.leak][:, eliminated] @ factors
     total = float(weights.sum())
     return weights / total if total > 0.0 else np.full(len(grams), 1.0 / len(grams))

@@ -298,9 +298,8 @@ class BalanceLeak(LeakMeasure):
         if fit is None:
             return [(laminar_flow, 0.0)] * len(EXPONENTS)
         # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
-        orifice_flow = (
-            balance.mean_of_blocks(balance.blocks.mean_root(), balance.blocks.pressure_weights) / fit.regression
-        )
+        root = np.average(balance.blocks.mean_root(), weights=balance.blocks.pressure_weights)
+        orifice_flow = float(root) / fit.regression
         log_ratio = INFERENCE.size.readings * fit.log_ratio
         fractions = 2.0 * (1.0 - np.array(EXPONENTS))
         return [

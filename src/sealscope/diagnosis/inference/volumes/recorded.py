@@ -34,7 +34,7 @@ from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, PUMP, Equation
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, Equation
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
@@ -447,9 +447,10 @@ class RecordedBalance:
         value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
         return Estimate(self._loaded_area.sign * value / area, deviation / area) if area > 0.0 else None
 
-    def mean_pressure(self, since: float = -np.inf) -> float:
-        """Compute the mean of abs(p_A - p_B) [Pa] from the time `since` [s] on, without the sensor offset."""
-        return self.mean_of_blocks(self.blocks.mean_pressure(self.pressure_offset), self.blocks.pressure_weights, since)
+    def mean_pressure(self) -> float:
+        """Compute the mean of abs(p_A - p_B) [Pa] without the sensor offset."""
+        pressures = self.blocks.mean_pressure(self.pressure_offset)
+        return float(np.average(pressures, weights=self.blocks.pressure_weights))
 
     def outside_unit_flows(self) -> dict[str, float]:
         """Compute the flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by the name of its term.
@@ -467,19 +468,9 @@ class RecordedBalance:
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of the flow that the piston displaces."""
         if not self.is_creep:
-            return self.mean_of_blocks(self.blocks.flow, np.maximum(self.blocks.rows, 1e-9))
+            return float(np.average(self.blocks.flow, weights=np.maximum(self.blocks.rows, 1e-9)))
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
-
-    def mean_of_blocks(self, values: Array, weights: Array, since: float = -np.inf) -> float:
-        """Average `values` (K,) over the blocks from `since` [s] on, or over the last block if there are none.
-
-        `weights` (K,): positive weights of the blocks.
-        """
-        is_after = self.blocks.time >= since
-        if not is_after.any():
-            is_after[-1] = True
-        return float(np.average(values[is_after], weights=weights[is_after]))
 
     @cached_property
     def size(self) -> Size:
@@ -565,12 +556,9 @@ class RecordedBalance:
     def total_history(self) -> History:
         """Total leakage of pump and piston in each block, as a conductance [m^3/(s Pa)] with its covariance.
 
-        The coefficient of the leak is that of both together, without a separate term of the pump's leakage (`PUMP`).
         The history includes a step of the leakage if a test finds one with a p-value below `RAREST`.
         """
-        roles = self.columns[0]
-        pump = roles.names.index(PUMP) if PUMP in roles.names else None
-        total = information(self.blocks, self.columns, roles.leak, left_out=pump)
+        total = information(self.blocks, self.columns, self.columns[0].leak)
         test = step_test(total)
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
