@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import compress
 
 import numpy as np
 
@@ -21,37 +22,40 @@ from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
 
 
+def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None) -> Array:
+    """Eliminate the coefficients of c columns from a Gram matrix (m, m), whose rows and columns become zero.
+
+    The result is the Schur complement G - C' (D + P)^-1 C, where C are the rows of G in `eliminated`, and D those of
+    their entries that lie in these columns. Of a column k that remains alone, the coefficient is then estimated as
+    entry (k, left) / entry (k, k), with the precision of entry (k, k). `prior` (c,): precisions P of normal priors on
+    the coefficients, about 0; None without priors.
+    """
+    cross, matrix = gram[eliminated], gram[np.ix_(eliminated, eliminated)]
+    if prior is not None:
+        matrix = matrix + np.diag(_limit_precisions(prior, matrix))
+    reduced = gram - cross.T @ solve(matrix, cross)
+    reduced[eliminated] = reduced[:, eliminated] = 0.0
+    return np.asarray(reduced)
+
+
+def _limit_precisions(prior: Array, gram: Array) -> Array:
+    """Limit prior precisions (c,), which may be infinite, to 1e9 times those of the data, the diagonal of `gram`."""
+    return np.minimum(prior, 1e9 * np.diag(gram))
+
+
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    `gram` (E, m, m): `RecordingSums.sums` of E equations, with the coefficients that recordings do not share already
+    `gram` (E, m, m): Gram matrices of E equations, with the coefficients that recordings do not share already
     eliminated (`eliminate_unshared`); `columns`: roles of their columns. Both results are 0 without information on the
     leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
         nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
-        equation_precision, equation_moment = reduce_to_tested(gram[e], gram[e][:, roles.left], roles.leak, nuisance)
-        precision, moment = precision + equation_precision, moment + equation_moment
+        reduced = eliminate(gram[e], nuisance)
+        precision, moment = precision + reduced[roles.leak, roles.leak], moment + reduced[roles.leak, roles.left]
     return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
-
-
-def reduce_to_tested(
-    gram: Array, products: Array, tested: int, nuisance: list[int], prior: Array | None = None
-) -> tuple[float, float]:
-    """Compute precision and moment of a tested coefficient, with other coefficients eliminated (Schur complement).
-
-    The estimate of the coefficient is moment / precision. `gram` (m, m): Gram matrix of the columns; `products` (m,):
-    their products with the left side, or with a residual; `tested`, `nuisance`: columns of the tested coefficient and
-    of the eliminated ones; `prior`: precisions of the priors on the eliminated coefficients, whose means are 0; None
-    without priors.
-    """
-    cross = gram[nuisance, tested]
-    matrix = gram[np.ix_(nuisance, nuisance)]
-    if prior is not None:  # limited to 1e9 times the recording's precision, which is enough to fix a coefficient
-        matrix = matrix + np.diag(np.minimum(prior, 1e9 * np.diag(matrix)))
-    solved = solve(matrix, np.column_stack([cross, products[nuisance]]))
-    return float(gram[tested, tested] - cross @ solved[:, 0]), float(products[tested] - cross @ solved[:, 1])
 
 
 def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[float, float]:
@@ -74,8 +78,7 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     leak_coefficient = reference[fitted.index(roles.leak)]
     precision = roles.difference_precisions(fitted, reference, leak_coefficient)
     gram = judged[np.ix_(fitted, fitted)]
-    # limited to a precision that is enough to fix a coefficient
-    prior = np.where(is_free, 0.0, np.minimum(precision, 1e9 * np.diag(gram)))
+    prior = np.where(is_free, 0.0, _limit_precisions(precision, gram))
     weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
     # second right side: gives the variance of the weighted sum of the coefficients
     right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
@@ -91,20 +94,28 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     Their `between_deviation` is infinite, i.e. nothing is known of their differences between recordings. The leakage of
     a pump that holds the load, which counts only within a recording, is not eliminated but set to zero first
     (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations; `columns`: roles of their columns. In the
-    result, the Schur complement, the rows and columns of these coefficients are zero.
+    result the rows and columns of these coefficients are zero.
     """
     reduced = gram.copy()
     for e, roles in enumerate(columns):
         if roles.hold_leak is not None:
             reduced[e][roles.hold_leak] = reduced[e][:, roles.hold_leak] = 0.0
-        unshared = roles.unshared
-        cross = reduced[e][:, unshared].copy()
-        reduced[e] -= cross @ solve(reduced[e][np.ix_(unshared, unshared)], cross.T)
-        reduced[e][unshared] = reduced[e][:, unshared] = 0.0
+        reduced[e] = eliminate(reduced[e], roles.unshared)
     return reduced
 
 
-def residual_products(
+def subtract_fit(gram: Array, fitted: Sequence[int], coefficients: Array, left: int) -> Array:
+    """Replace the left side of a regression, in its Gram matrix (m, m), by the residual of a fit.
+
+    The residual is the left side minus the sum of the columns `fitted` times the `coefficients` (c,). `left`: index of
+    the column of the left side.
+    """
+    transform = np.eye(len(gram))
+    transform[fitted, left] = -coefficients
+    return np.asarray(transform.T @ gram @ transform)
+
+
+def subtract_reference(
     gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False
 ) -> tuple[Array, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
@@ -112,7 +123,7 @@ def residual_products(
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
     roles of their columns. Returns three items:
 
-    - products (m,) of the residual with each column and, in place of the left side (the last column), with itself;
+    - Gram matrix (m, m) of the recording with the residual in place of the left side;
     - indices of the c columns whose coefficients may differ between recordings;
     - precisions (c,) of the priors on these differences.
 
@@ -122,18 +133,14 @@ def residual_products(
     `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
-    coefficients, matrix = np.zeros(len(gram)), reference[np.ix_(compared, compared)].copy()
-    leak = compared.index(roles.leak)
+    matrix, leak = reference[np.ix_(compared, compared)].copy(), compared.index(roles.leak)
     matrix[leak, leak] += roles.healthy_conductance**-2  # precision of the prior; 0 if the healthy leakage is unknown
-    coefficients[compared] = -solve(matrix, reference[compared, roles.left])
-    nuisance = [k for k in compared if has_leak or k != roles.leak]
-    prior = roles.difference_precisions(nuisance, coefficients[nuisance], coefficients[roles.names.index(LEAK)])
-    coefficients[roles.left] = 1.0  # residual = left side - sum of the fitted terms
-    products = gram @ coefficients
-    products[roles.left] = coefficients @ products  # the residual's sum of squares
-    # limited, as the prior on a coefficient of zero has an infinite precision
-    prior = np.minimum(prior, 1e9 * np.diag(gram)[nuisance])
-    return products, nuisance, prior
+    coefficients = solve(matrix, reference[compared, roles.left])
+    leak_coefficient = coefficients[compared.index(roles.names.index(LEAK))]
+    is_nuisance = [has_leak or k != roles.leak for k in compared]
+    nuisance = [*compress(compared, is_nuisance)]
+    prior = roles.difference_precisions(nuisance, coefficients[is_nuisance], leak_coefficient)
+    return subtract_fit(gram, compared, coefficients, roles.left), nuisance, prior
 
 
 def estimate_leak_excess(
@@ -146,15 +153,16 @@ def estimate_leak_excess(
     differences between recordings in the coefficients of all terms but the leak. Both results (s,) are 0 where there is
     no information.
 
-    The excess is fitted to the residual under the coefficients of the reference recordings (`residual_products`). The
+    The excess is fitted to the residual under the coefficients of the reference recordings (`subtract_reference`). The
     coefficients of all other terms are eliminated. The precisions and moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
-        residual, nuisance, prior = residual_products(gram[e], reference[e], roles)
+        residual, nuisance, prior = subtract_reference(gram[e], reference[e], roles)
         for index, width in enumerate(widths):
-            reduced = reduce_to_tested(gram[e], residual, roles.leak, nuisance, prior / width**2)
-            precision[index], moment[index] = precision[index] + reduced[0], moment[index] + reduced[1]
+            reduced = eliminate(residual, nuisance, prior / width**2)
+            precision[index] += reduced[roles.leak, roles.leak]
+            moment[index] += reduced[roles.leak, roles.left]
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)
@@ -182,10 +190,12 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
     shared = eliminate_unshared(totals, columns)
     weights = np.zeros(len(grams))
     for e, roles in enumerate(columns):
-        _, nuisance, prior = residual_products(shared[e], reference[e], roles)
+        _, nuisance, prior = subtract_reference(shared[e], reference[e], roles)
         eliminated = [*nuisance, *roles.unshared]
-        precision = np.append(prior, np.zeros(len(eliminated) - len(nuisance)))
-        matrix = totals[e][np.ix_(eliminated, eliminated)] + np.diag(precision)
+        prior = np.append(
+            _limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]), np.zeros(len(roles.unshared))
+        )
+        matrix = totals[e][np.ix_(eliminated, eliminated)] + np.diag(prior)
         factors = solve(matrix, totals[e][eliminated, roles.leak])
         weights += grams[:, e, roles.leak, roles.leak] - grams[:, e, roles.leak][:, eliminated] @ factors
     total = float(weights.sum())

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.comparison.coefficients import residual_products
+from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.comparison.coefficients import eliminate, subtract_reference
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import TINY
 from sealscope.diagnosis.inference.equations.terms import AIR, ORIFICE
@@ -42,15 +42,11 @@ def compare_laws(
     reference = np.sum([recording.sums for recording in baseline], axis=0)
     grams, moments, square_without_leak = np.zeros((2, 2)), np.zeros(2), 0.0
     for e, roles in enumerate(columns):
-        gram, leaks = judged.sums[e], [roles.leak, roles.names.index(ORIFICE)]  # laminar, orifice
-        # `products`: of the residual with each column, and last with itself
-        products, nuisance, prior = residual_products(gram, reference[e], roles)
-        regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
-        solved = solve(regularised, np.column_stack([gram[np.ix_(nuisance, leaks)], products[nuisance]]))
-        solved_leaks, solved_residual = solved[:, :2], solved[:, 2]
-        grams += gram[np.ix_(leaks, leaks)] - gram[np.ix_(leaks, nuisance)] @ solved_leaks
-        moments += products[leaks] - gram[np.ix_(leaks, nuisance)] @ solved_residual
-        square_without_leak += float(products[-1] - products[nuisance] @ solved_residual)
+        leaks = [roles.leak, roles.names.index(ORIFICE)]  # laminar, orifice
+        reduced = eliminate(*subtract_reference(judged.sums[e], reference[e], roles))
+        grams += reduced[np.ix_(leaks, leaks)]
+        moments += reduced[leaks, roles.left]
+        square_without_leak += float(reduced[roles.left, roles.left])
     energies, cross = np.diag(grams), grams[0, 1]
     if not energies.min() > 0.0 or not cross > 0.0:
         return None
@@ -81,14 +77,11 @@ def compare_with_leak(
         # sums over the equations: square of the tested column, its product with the residual, square of the residual
         energy = moment = square_without = 0.0
         for e, roles in enumerate(columns):
-            gram = judged.sums[e]
             tested = roles.names.index(rival) if is_rival else roles.leak
-            products, nuisance, prior = residual_products(gram, reference[e], roles, has_leak=is_rival)
-            regularised = gram[np.ix_(nuisance, nuisance)] + np.diag(prior)
-            solved = solve(regularised, np.column_stack([gram[nuisance, tested], products[nuisance]]))
-            energy += float(gram[tested, tested] - gram[tested, nuisance] @ solved[:, 0])
-            moment += float(products[tested] - gram[tested, nuisance] @ solved[:, 1])
-            square_without += float(products[-1] - products[nuisance] @ solved[:, 1])
+            reduced = eliminate(*subtract_reference(judged.sums[e], reference[e], roles, has_leak=is_rival))
+            energy += float(reduced[tested, tested])
+            moment += float(reduced[tested, roles.left])
+            square_without += float(reduced[roles.left, roles.left])
         if not energy > 0.0:
             return None
         can_be_negative = is_rival and rival == AIR  # there may be less air, but oil only leaves

@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, reduce_to_tested
+from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, eliminate, subtract_fit
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
 from sealscope.diagnosis.inference.comparison.levels import MIN_WITH_HOLDS, held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import predict_thinning
@@ -179,8 +179,7 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
         leak = roles.names.index(LEAK)
         free = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
         coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
-        residual = gram[e][:, roles.left] - gram[e][:, free] @ coefficients
-        prior_precisions = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
-        equation_precision, equation_moment = reduce_to_tested(gram[e], residual, tested, free, prior_precisions)
-        precision, moment = precision + equation_precision, moment + equation_moment
+        prior = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
+        reduced = eliminate(subtract_fit(gram[e], free, coefficients, roles.left), free, prior)
+        precision, moment = precision + reduced[tested, tested], moment + reduced[tested, roles.left]
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)
