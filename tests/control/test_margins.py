@@ -118,3 +118,11 @@ def test_tolerance_costs_no_margin_without_a_leak_and_little_with_one_where_the_
 def test_a_speed_beyond_the_drive_is_refused():
     with refusal("speed", "5 m/s"):
         margins(RIG, PI, 5.0)
+
+
+def test_margins_do_not_jump_where_the_voltage_of_the_stroke_reaches_its_limit():
+    """The motor's controller is linear there: more speed damps the piston a little more."""
+    below, at_limit = (margins(RIG, PI, speed) for speed in (0.09, 0.1))
+    assert below.damped and at_limit.damped
+    assert 1.0 < at_limit.gain / below.gain < 1.1
+    assert at_limit.crossover == pytest.approx(below.crossover, rel=0.01)

@@ -215,10 +215,10 @@ def test_a_zero_that_is_some_bar_too_low_is_no_missing_supply() -> None:
 
 
 @pytest.mark.parametrize(("value", "is_dead"), [(-0.2, True), (0.25, True), (-0.12, False), (0.0, False)])
-@pytest.mark.parametrize("at_end", [False, True])
-def test_a_position_that_jumps_out_of_its_range_is_dead_before(value: float, is_dead: bool, at_end: bool) -> None:
+@pytest.mark.parametrize("ends", ["first", "last", "first and last"])
+def test_a_position_that_jumps_out_of_its_range_is_dead_before(value: float, is_dead: bool, ends: str) -> None:
     recording = with_position(machine())
-    is_off = recording.t > 55.0 if at_end else recording.t < 5.0
+    is_off = ("first" in ends) & (recording.t < 5.0) | ("last" in ends) & (recording.t > 55.0)
     held = replace(recording, channels={**recording.channels, "x": np.where(is_off, value, recording["x"])})
     cleaned = remove_unsupplied(held)
     assert np.isnan(cleaned["x"][is_off]).all() == is_dead

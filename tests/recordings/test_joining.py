@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sealscope.recordings import Recording, inspect, join, read
+from sealscope.recordings.joining import start_seconds
 
 from ..refusals import refusal
 
@@ -47,6 +49,18 @@ def test_stamps_order_the_files_and_a_pause_is_a_gap(tmp_path: Path) -> None:
     assert joined.provenance["start"].startswith("2024-05-31T23:59:59")
     assert joined.t[600] == pytest.approx(11.0, abs=1e-9)
     assert [finding.code for finding in inspect(joined)] == ["gap"]
+
+
+def test_every_sample_keeps_its_date_whichever_file_has_the_earliest_zero() -> None:
+    """Each file counts its times from a zero of its own, be it long before its first sample."""
+    first = replace(WHOLE.samples(slice(0, 600)), provenance={"start": "2024-06-01T12:00:10"})
+    last = WHOLE.samples(slice(600, N))
+    last = replace(last, t=last.t - last.t[0] + 20.0, provenance={"start": "2024-06-01T12:00:00"})
+    joined = join([first, last])
+    start, start_first, start_last = (start_seconds(recording) for recording in (joined, first, last))
+    assert start is not None and start_first is not None and start_last is not None
+    dates = start + joined.t - joined.t[0]
+    assert dates[[0, 600]] == pytest.approx([start_first, start_last], abs=1e-6)
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from sealscope.recordings.joining import start_seconds
+from sealscope.recordings import read
+from sealscope.recordings.joining import file_seconds, start_seconds
 from sealscope.recordings.recording import Recording
 
 
@@ -37,3 +40,21 @@ def test_start_of_a_recording(name: str, start: str | None, stamp: str | None) -
     else:
         assert result == np.datetime64(stamp, "ms").astype(np.int64) / 1e3
         assert start_seconds(named(name, 2.0, start)) == result + 2.0
+
+
+def test_a_log_in_seconds_since_1970_starts_then_whatever_its_name_says(tmp_path: Path) -> None:
+    begin = 1_719_835_509.0
+    log = tmp_path / "20260701_140509.csv"
+    log.write_text("time [s],p_A [Pa]\n" + "".join(f"{begin + k},{3e5 + k * k % 7}\n" for k in range(20)))
+    recording = read(log)
+    assert start_seconds(recording) == file_seconds(recording, log) == begin
+    assert start_seconds(recording.between(5.0, 10.0)) == begin + 5.0
+
+
+@pytest.mark.parametrize("epoch", ["then", None, float("nan"), 12.0, 1e300])
+def test_what_is_no_time_since_1970_is_not_taken_for_a_start(epoch: object) -> None:
+    recording = Recording(
+        np.arange(10) / 10.0, {"p_A": np.zeros(10)}, {"p_A": "Pa"}, 10.0,
+        {"file": "20260701_140509.csv", "start_epoch_s": epoch},
+    )  # fmt: skip
+    assert start_seconds(recording) == start_seconds(named("20260701_140509.csv"))

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import COUNTS, inspect, read, split_map_option
 from sealscope.recordings.formats.headings.preamble import parse_remarks
+from sealscope.recordings.oil import oil_temperature
 
 from ..refusals import refusal
 
@@ -261,6 +262,27 @@ def test_what_stands_above_the_header_is_kept(tmp_path: Path) -> None:
         "Remark": "seal new",
     }
     assert "1 line before the header not used" in recording.history
+
+
+@pytest.mark.parametrize(
+    ("remarks", "expected"),
+    [
+        ("Ambient temperature: 21 degC\nOil temperature: 45 degC\n", 45.0),
+        ("Temperature: 21 degC\nHydraulic fluid temp.: 45 degC\n", 45.0),
+        ("Temp_degF: 104\n", 40.0),
+        ("Ambient temperature: 21 degC\n", None),
+        ("Template: 300 K\n", None),
+        ("Boiler: 80 °C\n", None),
+        ("12: 20 C\n", None),
+        ("Oil temperature: 480 K\n", None),
+    ],
+)
+def test_the_oil_s_temperature_is_taken_from_no_other_remark(
+    tmp_path: Path, remarks: str, expected: float | None
+) -> None:
+    recording = read(saved(tmp_path, remarks + "t [s];p_A [bar]\n" + body(";")))
+    assert recording.remarks
+    assert oil_temperature(recording) == (None if expected is None else pytest.approx(expected))
 
 
 @settings(max_examples=30)

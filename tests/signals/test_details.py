@@ -158,6 +158,15 @@ def test_product_is_the_sample_product():
     assert result.inside(4) == result.inside() == slice(105, 380)
 
 
+@pytest.mark.parametrize("level", [0, -1, 5])
+def test_a_level_without_details_has_no_inside(level):
+    result = details(np.ones(500))
+    with refusal("level", "4", level):
+        result.inside(level)
+    with refusal("level", "4", level):
+        result[level]
+
+
 def test_counts_are_taken_as_numbers():
     counts = np.random.default_rng(7).integers(-8192, 8191, size=400, dtype=np.int16)
     assert np.array_equal(details(counts).values, details(counts.astype(float)).values)

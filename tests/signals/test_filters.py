@@ -53,6 +53,12 @@ def test_reach_of_db8_and_of_haar():
     assert reach("haar", 3).tolist() == [[0, 1], [0, 3], [0, 7]]
 
 
+@pytest.mark.parametrize("wavelet", ["db99", ["db8"], 8, None])
+def test_a_wavelet_that_is_none_is_refused(wavelet):
+    with refusal("wavelet", repr(wavelet)):
+        decomposition_filters(wavelet)
+
+
 @pytest.mark.parametrize("levels", [0, -1, MAX_LEVELS + 1, 2.0, True, "4", None])
 def test_levels_that_are_refused(levels):
     with refusal("levels", "12"):

@@ -11,10 +11,13 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
+from sealscope.recordings.chambers import PRESSURES
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4 import figures as chapter4
 from sealscope.thesis.chapters.chapter4.cases import (
     CASES,
+    CLOSINGS,
+    COMMAND,
     DEFAULT_READING,
     PERIOD,
     READINGS,
@@ -37,6 +40,7 @@ from sealscope.thesis.engine.context import SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, ThesisTable
 
+from ..refusals import mentions
 from .conftest import ITEMS, Kept, numbers
 
 
@@ -229,6 +233,24 @@ def test_a_run_that_diverged_leaves_its_reason_and_no_curve(kept: Kept) -> None:
     assert len(closing_figure.panels[1].curves) == 0
 
 
+def test_the_notes_on_three_closings_are_of_all_their_runs(kept: Kept) -> None:
+    class FailingAt25(Kept):
+        def run(self, spec: Experiment, *, prove: bool = True) -> SimulatedRun:
+            if spec.method == "rk4" and spec.rig["line.closed_A"] == 0.25:
+                return SimulatedRun(None, np.empty(0), {}, 0.0, False, diverged="the run diverged: p_1 is not finite")
+            return super().run(spec, prove=prove)
+
+    (figure,) = make(kept, ALL["fig-4.33"])
+    lowest = min(
+        float(run_both_solvers(kept, COMMAND, closed)["as_published"].outputs[name].min())
+        for closed in CLOSINGS
+        for name in PRESSURES
+    )
+    assert mentions(figure.notes, f"{lowest * 1e-6:.2f} MPa")
+    (figure,) = make(FailingAt25(runs=kept.runs), ALL["fig-4.33"])
+    assert "p_1 is not finite" in figure.notes
+
+
 def test_friction_is_continuous_under_one_bracketing_only(kept: Kept) -> None:
     jumps = friction_at_threshold(25.0)
     assert jumps["continuous"] == pytest.approx((73.24, 73.24), abs=0.01)
@@ -322,7 +344,7 @@ def test_claims_on_the_orifice_follow_their_numbers(kept: Kept, claims: dict[str
 def test_the_sweep_of_the_line_volumes_shows_where_the_step_fails(kept: Kept) -> None:
     (figure,) = make(kept, ALL["chapter-4-volumes"])
     result = numbers(figure)
-    gaps = [abs(result[f"mean of p_1 - p_A at {v} cm3, RK4, 1e-4 s"]) for v in (10, 44, 234)]
+    gaps = [abs(result[f"mean of p_1 - p_A at {v} cm3, RK4 1e-4 s"]) for v in (10, 44, 234)]
     assert gaps[0] > gaps[1] > gaps[2] > 5e-3
     assert all(abs(result[f"mean of p_1 - p_A at {v} cm3, converged"]) < 1e-3 for v in (10, 44, 234))
 

@@ -129,7 +129,6 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
     y, u = initial_state(rig, 0.0, load), 0.0
     if speed != 0.0:
-        u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)
         samples, limit = round(_SETTLING * rate), rig.daq.u_max
 
         def find_moving_state(u: float) -> tuple[Array, float]:
@@ -142,13 +141,14 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
+        next_u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)
         for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
-            state, mean_speed = find_moving_state(min(max(u, -limit), limit))
+            u = min(max(next_u, -limit), limit)
+            state, mean_speed = find_moving_state(u)
             speed_gain = mean_speed - drift_speed  # due to the voltage
-            if speed_gain * speed > 0.0:
-                u *= min(max((speed - drift_speed) / speed_gain, 0.2), 5.0)  # by at most a factor of 5
-            else:  # the piston does not follow
-                u *= 1.5
+            # by at most a factor of 5; by 1.5 if the piston does not follow
+            factor = min(max((speed - drift_speed) / speed_gain, 0.2), 5.0) if speed_gain * speed > 0.0 else 1.5
+            next_u = factor * u
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can reach, got {speed:g} m/s")
         y = state

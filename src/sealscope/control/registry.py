@@ -68,9 +68,8 @@ def controller_named(name: str, rig: Rig) -> Controller:
     """Make the controller called `name` for a rig.
 
     `name`: a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function. A class
-    with a method `from_rig` (or `of`, its former name) makes the controller by this method; any other class or function
-    is called with the rig. Raises InputError for an unknown name, for code that fails, and for a controller without
-    `rate`, `delay` or `start`.
+    with a method `from_rig` makes the controller by this method; any other class or function is called with the rig.
+    Raises InputError for an unknown name, for code that fails, and for a controller without `rate`, `delay` or `start`.
 
     Examples
     --------
@@ -88,8 +87,7 @@ def controller_named(name: str, rig: Rig) -> Controller:
             factory: Any = _installed()[name].load()
         else:
             factory = getattr(_load_module(module_or_file), attribute)
-        build = getattr(factory, "from_rig", None) or getattr(factory, "of", factory)
-        controller = build(rig)
+        controller = getattr(factory, "from_rig", factory)(rig)
     except InputError:
         raise
     except Exception as error:  # a user's code may raise anything

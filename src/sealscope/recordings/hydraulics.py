@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.channels import UNUSED, Array
+from sealscope.recordings.channels import COUNTS, UNUSED, Array
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
@@ -53,7 +53,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
     between 1 / m and m, with m = `readings.misfit`. Also None if the speed hardly correlates with the rate of the
     angle, if either channel is absent or in raw counts, or if samples are missing or fewer than `readings.samples`.
     """
-    if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != "count"}:
+    if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != COUNTS}:
         return None
     n_mean = max(1, round(recording.rate / _PRIORS.rate))  # samples averaged to one, against noise
     n_samples = len(recording) // n_mean * n_mean

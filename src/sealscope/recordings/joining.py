@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
-from sealscope.recordings.formats.timebase import parse_epoch
+from sealscope.recordings.formats.timebase import counts_from_1970, parse_epoch
 from sealscope.recordings.recording import Recording
 
 #: Starts that differ by less [s] are equal: the times then continue from file to file.
@@ -32,11 +32,11 @@ _TWELVE_HOURS = re.compile(
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
-    The time of t = 0 is the entry `start` of the provenance. Without this entry it is the date in the file's name: the
-    entry `file` of the provenance, or the argument `file` if that entry is missing, too. Dates and times are taken as
-    UTC; a date without a time of day means midnight.
+    The time of t = 0 is the entry `start_epoch_s` or `start` of the provenance. Without these entries it is the date in
+    the file's name: the entry `file` of the provenance, or the argument `file` if that entry is missing, too. Dates and
+    times are taken as UTC; a date without a time of day means midnight.
     """
-    start = parse_epoch(str(recording.provenance.get("start", "")))
+    start = _time_zero(recording)
     if start is None:
         start = _parse_file_name(str(recording.provenance.get("file") or file))
     return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
@@ -73,7 +73,9 @@ def _parse_file_name(name: str) -> float | None:
 def _time_zero(recording: Recording) -> float | None:
     """Find the time of t = 0 [s since 1970], the entry `start_epoch_s` or `start` of the provenance; None without."""
     epoch = recording.provenance.get("start_epoch_s")
-    return parse_epoch(str(recording.provenance.get("start", ""))) if epoch is None else float(epoch)
+    if isinstance(epoch, int | float) and counts_from_1970(epoch):
+        return float(epoch)
+    return parse_epoch(str(recording.provenance.get("start", "")))
 
 
 def _check_compatible(recordings: Sequence[Recording], names: Sequence[str]) -> None:
@@ -133,7 +135,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     starts = [_time_zero(recording) for recording in recordings]
     known_starts = [start for start in starts if start is not None]
     is_dated = len(known_starts) == len(starts) and max(known_starts) - min(known_starts) > _SAME_START
-    # times `t` become relative to the earliest start
+    # all times relative to the earliest start
     offsets = [start - min(known_starts) for start in known_starts] if is_dated else [0.0] * len(recordings)
     times = [recording.t + offset for recording, offset in zip(recordings, offsets, strict=True)]
     order = sorted(range(len(recordings)), key=lambda number: float(np.nanmin(times[number])))
@@ -151,7 +153,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     history = tuple(dict.fromkeys(line for part in parts for line in part.history))
     return replace(
         parts[0],
-        t=np.concatenate([times[number] for number in order]),
+        t=np.concatenate([times[number] for number in order]) - offsets[order[0]],  # from the start in the provenance
         channels={name: np.concatenate([part[name] for part in parts]) for name in parts[0].channels},
         provenance={**parts[0].provenance, "files": files},
         history=(*history, f"joined from {len(parts)} files: {', '.join(files)}"),

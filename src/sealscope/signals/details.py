@@ -56,9 +56,13 @@ class Details:
 
     def __getitem__(self, level: int) -> Array:
         """Return the detail d_j (n,) of the level j, from 1, the finest, to `levels`; raise InputError for others."""
+        return np.asarray(self.values[self._find_row(level)])
+
+    def _find_row(self, level: int) -> int:
+        """Find the row of a level in `values` and `edges`; raise InputError if there is no such level."""
         if not 1 <= level <= self.levels:
             raise InputError(f"level must be 1 to {self.levels}, got {level!r}")
-        return np.asarray(self.values[level - 1])
+        return level - 1
 
     def product(self) -> Array:
         """Compute the product (n,) of the details d_3 and d_4 of each sample [unit^2], called d3d4 in the thesis."""
@@ -69,8 +73,12 @@ class Details:
         return np.vstack([self.values, self.product()])
 
     def inside(self, level: int | None = None) -> slice:
-        """Return the slice of the samples whose details of a `level` (default: all levels) do not depend on padding."""
-        before, after = self.edges[(level or self.levels) - 1]  # the deepest level has the longest edges
+        """Return the slice of the samples whose details of a `level` (default: all levels) do not depend on padding.
+
+        Raises InputError for a level that is not 1 to `levels`.
+        """
+        # the deepest level has the longest edges
+        before, after = self.edges[-1 if level is None else self._find_row(level)]
         return slice(int(before), self.values.shape[1] - int(after))
 
 

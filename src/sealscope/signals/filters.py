@@ -19,12 +19,19 @@ MAX_LEVELS = 12
 
 
 @cache
+def _wavelet_names() -> list[str]:
+    """List the names of all discrete wavelets of PyWavelets."""
+    import pywt
+
+    return list(pywt.wavelist(kind="discrete"))
+
+
 def discrete_wavelet(name: str) -> Any:
     """Load the discrete wavelet of PyWavelets with this name; raise InputError if there is none."""
     import pywt
 
-    if not isinstance(name, str) or name not in pywt.wavelist(kind="discrete"):
-        matches = difflib.get_close_matches(str(name), pywt.wavelist(kind="discrete"), n=1)
+    if not isinstance(name, str) or name not in _wavelet_names():
+        matches = difflib.get_close_matches(str(name), _wavelet_names(), n=1)
         hint = f"; did you mean {matches[0]}?" if matches else ""
         raise InputError(f"wavelet must be a discrete wavelet such as db8, got {name!r}{hint}")
     return pywt.Wavelet(name)

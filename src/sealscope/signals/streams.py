@@ -88,10 +88,9 @@ class DetailStream:
         low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
         self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])  # deepest level
         self.settling = self.first + self.delay
-        dilations = 2 ** np.arange(self.levels)
-        level_delays = len(low) // 2 * (2**self.levels - 2 * dilations)  # give all levels the lag of the deepest
-        # number of earlier samples that the filters of all levels need
-        self._history = max(self.delay, int(np.max(level_delays + (len(low) - 1) * dilations)))
+        # number of earlier samples that the filters need: most for level 1, whose L taps begin (L/2)(2^levels - 2)
+        # samples back, as it waits for the deepest level
+        self._history = len(low) // 2 * 2**self.levels - 1
         groups = -(-self._shape_2d[1] // WIDTH)  # rounded up
         self.taps = low, high  # each (taps, WIDTH), as the kernels take them
         # (groups, rows of the table, levels, samples, WIDTH)

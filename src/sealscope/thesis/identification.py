@@ -27,7 +27,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import format_note, load_texts
-from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, GROUPS, Condition, DataSheet
+from sealscope.thesis.sheet import APPENDIX_C, BENCH_RIG, GROUPS, Condition, DataSheet, log_change_to_percent
 from sealscope.units import PSI
 
 #: Start-up that is left out, and length of the analysed part [s]: two cycles of the slowest command (2 pi s each).
@@ -227,7 +227,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         """Return the sign of the change with the leak of detail `q` of chamber `c` in each test, (tests,)."""
         return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
 
-    measured = [float(100 * np.expm1(np.mean(sheet.log_change(c, q)))) for c, q in change_columns]
+    measured = [log_change_to_percent(sheet.log_change(c, q)) for c, q in change_columns]
     n = len(level_columns)
     # the sheet agrees with itself: all ratios are 1, and all tests have the same sign
     rows: list[tuple[Cell, ...]] = [("the sheet", *[1.0] * n, *measured, *[sheet.tests] * n)]
@@ -235,7 +235,7 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
         log_ratios = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in level_columns]
-        changes = [100 * (float(np.exp(np.mean(predicted.log_change(c, q)))) - 1.0) for c, q in change_columns]
+        changes = [log_change_to_percent(predicted.log_change(c, q)) for c, q in change_columns]
         same_sign = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in level_columns]
         rows.append((hypothesis.name, *(float(np.exp(log_ratio)) for log_ratio in log_ratios), *changes, *same_sign))
     return (item.table(rows, format_note("hypotheses"), heads),)

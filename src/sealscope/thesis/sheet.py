@@ -98,6 +98,11 @@ class DataSheet:
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
 
+def log_change_to_percent(change: Array | float) -> float:
+    """Convert a change c of a logarithm, or the mean of several, to the relative change 100 (exp(c) - 1) [%]."""
+    return float(100.0 * np.expm1(np.mean(change)))
+
+
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
     """Find the folder of the measured data sheet: `folder`, else that named by SEALSCOPE_SHEET, else `./data`.
 

@@ -74,7 +74,8 @@ def remove_unsupplied(recording: Recording) -> Recording:
 
     - all channels, where both chamber pressures are below vacuum by more than this fraction of their maximum;
     - the position alone, where it is constant from the first sample or up to the last one, and outside of all its other
-      values by more than this fraction of their range, if these are at least `_MIN_POSITIONS` different ones.
+      values by more than this fraction of their range, if these are at least `_MIN_POSITIONS` different ones. It may be
+      so at both ends.
 
     The recording must be whole, as its beginning, its end and the largest values decide.
     """
@@ -97,23 +98,29 @@ def _is_below_live_zero(pressure: Array) -> Flags:
 
 
 def _flag_dead_ends(position: Array) -> Flags:
-    """Flag the first or the last samples of a `position` (n,) if its sensor was off there (`remove_unsupplied`).
+    """Flag the first samples of a `position` (n,), the last ones or both if its sensor was off (`remove_unsupplied`).
 
-    These samples end at the largest step. They are flagged if they are outside of all other positions by a distance of
-    more than `gaps.live_zero` times the range of these, and vary by less than `gaps.dead` times this distance.
+    The sensor was on before the largest step, after it, or between the two largest ones. The samples at an end are
+    flagged if they are outside of all positions in that time by a distance of more than `gaps.live_zero` times the
+    range of these, and vary by less than `gaps.dead` times this distance.
     """
     known, is_dead = np.flatnonzero(np.isfinite(position)), np.zeros(len(position), dtype=bool)
-    for rows in (known, known[::-1]):  # from the first sample on, and from the last one back
-        values = position[rows]
-        steps = np.abs(np.diff(values))
-        end = int(steps.argmax()) + 1 if steps.size else 0  # number of samples before the largest step
-        if not end or np.unique(values[end:]).size < _MIN_POSITIONS:
-            continue
-        low, high = float(values[end:].min()), float(values[end:].max())
-        distance = max(low - values[:end].max(), values[:end].min() - high)
-        if distance > _GAPS.live_zero * (high - low) and np.ptp(values[:end]) < _GAPS.dead * distance:
-            is_dead[rows[:end]] = True
+    if known.size < 2:
+        return is_dead
+    values = position[known]
+    *_, second, largest = 0, *np.argsort(np.abs(np.diff(values))) + 1  # first samples after the largest steps
+    for start, stop in ((largest, values.size), (0, largest), (min(second, largest), max(second, largest))):
+        live, ends = values[start:stop], [end for end in (values[:start], values[stop:]) if end.size]
+        if all(_is_dead_end(end, live) for end in ends) and np.unique(live).size >= _MIN_POSITIONS:
+            is_dead[known[:start]] = is_dead[known[stop:]] = True
     return is_dead
+
+
+def _is_dead_end(end: Array, live: Array) -> bool:
+    """Test whether the positions at an `end` (k,) are constant, far from all `live` ones (m,) (`_flag_dead_ends`)."""
+    low, high = live.min(), live.max()
+    distance = max(low - end.max(), end.min() - high)
+    return bool(distance > _GAPS.live_zero * (high - low) and np.ptp(end) < _GAPS.dead * distance)
 
 
 def remove_impossible(recording: Recording) -> Recording:
@@ -155,8 +162,8 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
         if not (period and _copy_other_cycle(channels, needed, first, stop, period)):
             line_rows[first:stop] = True
     for values in channels.values():
-        _fill_by_spline(values, spline_rows)
-        _fill_by_line(values, line_rows)
+        _fill_rows(values, spline_rows, by_spline=True)
+        _fill_rows(values, line_rows, by_spline=False)
     if not bridged.any():
         return recording
     note = f"{np.count_nonzero(bridged)} samples in {len(find_runs(bridged))} gaps bridged"
@@ -277,24 +284,19 @@ def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
     target[np.isnan(target)] = copied[np.isnan(target)]
 
 
-def _fill_by_line(values: Array, rows: Flags) -> None:
-    """Fill missing values (n,) in the flagged `rows` (n,), in place, by linear interpolation, except at the ends."""
-    known = np.flatnonzero(np.isfinite(values))
-    missing = np.flatnonzero(rows & np.isnan(values))
-    if missing.size and known.size:
-        missing = missing[(missing > known[0]) & (missing < known[-1])]
-        values[missing] = np.interp(missing, known, values[known])
+def _fill_rows(values: Array, rows: Flags, by_spline: bool) -> None:
+    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline or by linear interpolation.
 
-
-def _fill_by_spline(values: Array, rows: Flags) -> None:
-    """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline through the known ones.
-
-    Values before the first known one and after the last one stay missing; so do all if at most `_N_END` are known.
+    Values before the first known one and after the last one stay missing; so do all if at most `_N_END` are known for a
+    spline.
     """
     from scipy.interpolate import CubicSpline
 
     known = np.flatnonzero(np.isfinite(values))
     missing = np.flatnonzero(rows & np.isnan(values))
-    if missing.size and known.size > _N_END:
+    if missing.size and known.size > (_N_END if by_spline else 0):
         missing = missing[(missing > known[0]) & (missing < known[-1])]
-        values[missing] = CubicSpline(known, values[known])(missing)
+        if by_spline:
+            values[missing] = CubicSpline(known, values[known])(missing)
+        else:
+            values[missing] = np.interp(missing, known, values[known])

@@ -62,7 +62,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     are left out, except chamber pressures. A chamber pressure that is stuck in more than `MAX_STUCK_FRACTION` of the
     rows stays as it is, and is named as unusable.
     """
-    part, findings = remove_unsupplied(remove_dropouts(remove_impossible(recording))), list[Finding]()
+    part = remove_unsupplied(remove_dropouts(remove_impossible(recording)))
     is_frozen = flag_frozen_rows(part)
     part = set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
     chambers = chambers_of(part)
@@ -73,9 +73,10 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     stuck = {name: rows for name in chambers if (rows := flag_stuck_rows(part, name)).any()}
     unusable = tuple(name for name, rows in stuck.items() if np.mean(rows) > MAX_STUCK_FRACTION)
     part = set_missing(part, {name: rows for name, rows in stuck.items() if name not in unusable})
-    for correct in (remove_spikes, interpolate_stale_samples, _resample, restore_signs):
-        part, new_findings = correct(part)
-        findings += new_findings
+    part, spikes = remove_spikes(part)
+    part, stale_samples = interpolate_stale_samples(part)
+    part, restored_signs = restore_signs(resample_evenly(part))
+    findings = [*spikes, *stale_samples, *restored_signs]
     part = interpolate_short_gaps(bridge(part, needed), needed)
     if part.bridged is not None:
         bridged = np.flatnonzero(part.bridged)
@@ -113,8 +114,3 @@ def remove_holes(recording: Recording) -> Recording:
     if not is_hole.any():
         return recording
     return replace(set_missing(recording, dict.fromkeys(recording.channels, is_hole)), bridged=None)
-
-
-def _resample(recording: Recording) -> tuple[Recording, list[Finding]]:
-    """Resample a recording to evenly spaced times; the findings, which every correction returns, are empty."""
-    return resample_evenly(recording), []

@@ -34,8 +34,6 @@ from sealscope.units import same_dimension, to_si
 _MAX_DIGITS = 9
 #: Separators of the parts of a path such as `Rig.Cyl.p_A`.
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
-#: Units of a rotational speed that are revolutions a minute, not frequencies.
-_ROTATION_UNITS = WORDS["rotation_units"]
 #: Channel (or `t`) -> column, given by a caller; or "auto": choose by the columns' names. The entry `REST` -> "auto" of
 #: a mapping does this for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
@@ -228,7 +226,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
         return COUNTS, f"{description} has no unit: taken as raw counts"
     if same_dimension(unit, COUNTS):
         return COUNTS, None
-    if channel == "omega" and unit in _ROTATION_UNITS:
+    if channel == "omega" and unit in WORDS["rotation_units"]:
         return "rpm", None
     if channel == "u" and is_current_or_fraction(unit):
         return COUNTS, f"{description} is a command in {unit}: its scale in V is unknown, so only its changes are used"

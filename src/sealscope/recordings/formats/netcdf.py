@@ -112,7 +112,7 @@ def _parse_label(name: str, data: Any) -> Label:
     unit = next(
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
-    label = Label.parse(name.rpartition("/")[2], unit)
+    label = Label.parse(name, unit)
     return Label(name, label.name, label.unit)
 
 

@@ -12,7 +12,7 @@ from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Figure, FigureCurve, Number, Panel, Role, ThesisTable
-from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, UNITS, DataSheet, mean_leaks
+from sealscope.thesis.sheet import APPENDIX_C, COLUMNS, UNITS, DataSheet, log_change_to_percent, mean_leaks
 
 
 def _percent_change(pairs: Array) -> Array:
@@ -66,13 +66,13 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
             measured_change = measured.log_change(chamber, name)
             log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
             comparison = (
-                float(100 * np.expm1(measured_change.mean())),
+                log_change_to_percent(measured_change),
                 float(np.exp(log_ratio.mean())),
                 float(np.exp(log_ratio.std(ddof=1))),
                 int(np.sum(np.sign(simulated_change) == np.sign(measured_change))),
                 float(np.corrcoef(simulated_change, measured_change)[0, 1]),
             )
-        rows.append((chamber, name, float(100 * np.expm1(simulated_change.mean())), *comparison))
+        rows.append((chamber, name, log_change_to_percent(simulated_change), *comparison))
     return rows
 
 

@@ -15,7 +15,7 @@ from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, ThesisTable
 from sealscope.thesis.engine.texts import format_note, load_texts
-from sealscope.thesis.sheet import COLUMNS, DataSheet
+from sealscope.thesis.sheet import COLUMNS, DataSheet, log_change_to_percent
 
 #: Sign of the change of each chamber's RMS when a leak opens, as section 5.6 states it.
 DIRECTION: Mapping[str, int] = {"p_A": -1, "p_B": 1}
@@ -123,8 +123,7 @@ def column_tests(sheet: DataSheet) -> list[_Row]:
     for chamber, name in COLUMNS:
         change = sheet.log_change(chamber, name)
         down, up = int(np.sum(change < 0)), int(np.sum(change > 0))
-        mean = float(100 * np.expm1(change.mean()))
-        rows.append((chamber, name, down, up, mean, sign_test(down, down + up)))
+        rows.append((chamber, name, down, up, log_change_to_percent(change), sign_test(down, down + up)))
     corrected = holm([p for *_, p in rows])
     return [(*row, p, "yes" if p < 0.05 else "no") for row, p in zip(rows, corrected, strict=True)]
 
@@ -167,8 +166,7 @@ def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: Da
                 row += [None, *_format_count(None)]
                 continue
             fires = sheet.log_change(chamber, detail) * DIRECTION[chamber] > limit
-            limit_percent = 100.0 * float(np.expm1(DIRECTION[chamber] * limit))  # from log to signed percent
-            row += [limit_percent, *_format_count(fires)]
+            row += [log_change_to_percent(DIRECTION[chamber] * limit), *_format_count(fires)]
         rows.append(tuple(row))
     return rows
 

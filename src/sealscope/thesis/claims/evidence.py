@@ -107,11 +107,6 @@ def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
-def log_change_to_percent(change: Array | float) -> float:
-    """Convert a change c of a logarithm, or the mean of several, to the relative change 100 (exp(c) - 1) [%]."""
-    return float(100.0 * np.expm1(np.mean(change)))
-
-
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
     """Compute the p-values of sign tests on the columns of a data sheet, corrected by Holm, by (chamber, detail).
 

@@ -42,13 +42,12 @@ from sealscope.thesis.claims.evidence import (
     holm_p_values,
     is_correlated,
     leave_one_out_r2,
-    log_change_to_percent,
     moves_beyond_chance,
     partial_correlation,
 )
 from sealscope.thesis.engine.products import Claim
 from sealscope.thesis.engine.texts import judge_claim, load_texts
-from sealscope.thesis.sheet import APPENDIX_C, DataSheet, mean_leaks
+from sealscope.thesis.sheet import APPENDIX_C, DataSheet, log_change_to_percent, mean_leaks
 
 _N_TESTS = len(APPENDIX_C)
 #: Largest rounding error of a leak printed with four decimals [L/min].

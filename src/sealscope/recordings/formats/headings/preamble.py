@@ -1,4 +1,4 @@
-"""Remarks on a recording in the header of its file: operator, machine, oil temperature, sampling rate."""
+"""Remarks on a recording in the header of its file, such as operator and machine, and the sampling rate in them."""
 
 from __future__ import annotations
 
@@ -23,11 +23,6 @@ _ENDING = re.compile(r"(?P<name>.{1,60}?)[_ ](?P<unit>[kM]?Hz|[mun\u00b5\u03bc]?
 #: TwinCAT's start of an export: 100 ns since 1601.
 _FILETIME = re.compile(r"(1[23]\d{16})\b")
 _FROM_1601_TO_1970 = 11_644_473_600 * 10**9  # [ns]
-_TEMPERATURE = re.compile(
-    r"(?P<value>[-+]?\d{1,3}(?:[.,]\d{1,3})?)\s*(?P<unit>°\s?[CF]|deg\s?[CF]|[CFK]\b|℃)", re.IGNORECASE
-)
-_UNIT_OF_NAME = re.compile(r"[\[(]\s*([^\])]{1,6}?)\s*[\])]")
-_OIL = re.compile(r"temp|oil|öl|oel|fluid|huile|olio|aceite", re.IGNORECASE)
 _QUANTITY = re.compile(r"(?P<number>[+-]?\d{1,12}(?:[.,]\d{1,12})?(?:[eE][+-]?\d{1,3})?)\s*(?P<unit>\S{0,10}).*")
 
 
@@ -115,23 +110,3 @@ def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
 def _clean_text(text: str, max_length: int) -> str:
     """Make a text printable, on one line, at most `max_length` characters long and without outer quotation marks."""
     return " ".join(printable(text[: 4 * max_length], instead=" ").split()).strip("\"'")[:max_length]
-
-
-def stated_oil_temperature(provenance: Mapping[str, object]) -> float | None:
-    """Find the oil temperature [deg C] in the remarks of a recording's provenance; None if it is not stated.
-
-    The name of the remark contains a word for oil, or "temp". Values outside -60 to 200 deg C are ignored.
-    """
-    for name, text in clean_remarks(provenance).items():
-        if not _OIL.search(name):
-            continue
-        unit_of_name = _UNIT_OF_NAME.search(name)
-        match = _TEMPERATURE.search(text if unit_of_name is None else f"{text} {unit_of_name[1]}")
-        if match is None:
-            continue
-        value = float(match["value"].replace(",", "."))
-        unit = match["unit"].upper().replace("℃", "C")[-1]  # C, F or K
-        celsius = (value - 32.0) / 1.8 if unit == "F" else value - 273.15 if unit == "K" else value
-        if -60.0 < celsius < 200.0:  # temperatures that oil can have
-            return celsius
-    return None

@@ -85,7 +85,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
         if channel == "u" and any(guess.kind == "command" for _, guess in columns):
             columns = [column for column in columns if column[1].kind == "command"]
         if channel == "T_oil":  # prefer the temperature that names the oil
-            columns = [column for column in columns if _split_words(column[0].name) & _KIND["oil"]] or columns
+            columns = [column for column in columns if names_oil(column[0].name)] or columns
         if len(columns) > 1:  # prefer measured columns to computed ones, and to a speed that is only set
             unmeasured = _KIND["made"] | _KIND["wanted"] if channel == "omega" else _KIND["made"]
             columns = [column for column in columns if not _split_words(column[0].name) & unmeasured]
@@ -153,7 +153,7 @@ def split_unit(name: str) -> tuple[str, str | None]:
     return name, None
 
 
-def _find_name_and_unit(label: Label) -> tuple[str, str | None]:
+def find_name_and_unit(label: Label) -> tuple[str, str | None]:
     """Find the name and unit of a column; if its heading has no unit, a unit at the end of the name is split off."""
     return split_unit(label.name) if label.unit is None else (label.name, label.unit)
 
@@ -166,9 +166,22 @@ def ends_in(name: str, words: str) -> bool:
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
+def names_oil(name: str) -> bool:
+    """Test whether a name has a word for oil."""
+    return not _split_words(name).isdisjoint(_KIND["oil"])
+
+
+def is_oil_temperature(name: str) -> bool:
+    """Test whether the name of a temperature is the oil's.
+
+    It has a word for oil, or none but words for a temperature, as in `TT101` or `Temp 1`.
+    """
+    return names_oil(name) or {word for word in _split_words(name) if not word.isdigit()} <= _KIND["temperature"]
+
+
 def is_temperature(label: Label) -> bool:
     """Test whether a column has a unit of temperature, in its heading or at the end of its name."""
-    _name, unit = _find_name_and_unit(label)
+    _name, unit = find_name_and_unit(label)
     return unit is not None and same_dimension(unit, "K")
 
 
@@ -226,15 +239,13 @@ def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
     """
     if len(label.name) > _MAX_NAME:
         return None
-    name, unit = _find_name_and_unit(label)
+    name, unit = find_name_and_unit(label)
     words = _split_words(name)
     side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil
-        # the name has a word for oil, or none but words for a temperature, as in `TT101` or `Temp 1`
-        is_oil = words & _KIND["oil"] or {word for word in words if not word.isdigit()} <= _KIND["temperature"]
-        return _Guess("oil", "", unit) if is_oil else None
+        return _Guess("oil", "", unit) if is_oil_temperature(name) else None
     if words & _MEASURED["spool"]:
         return _Guess("spool", "", unit) if unit is None or _is_command_unit(unit) else None
     if unit is not None and same_dimension(unit, "m^3/s"):
@@ -274,7 +285,7 @@ def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
     `kind`: "before" for upstream, "behind" for downstream. Returns None if the name has no such word, the unit is not
     one of pressure, or the name means a set point.
     """
-    name, unit = _find_name_and_unit(label)
+    name, unit = find_name_and_unit(label)
     words = _split_words(name)
     if unit is None or not same_dimension(unit, "Pa") or not words & _KIND[kind] or words & _KIND["wanted"]:
         return None

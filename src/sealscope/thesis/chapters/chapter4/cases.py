@@ -23,10 +23,8 @@ from sealscope.thesis.engine.context import Context, SimulatedRun
 
 Solver = Literal["converged", "as_published"]
 SOLVERS: tuple[Solver, ...] = ("converged", "as_published")
-#: Labels of the solvers in tables.
-SOLVER_TEXT: dict[Solver, str] = {"converged": "converged", "as_published": "RK4 1e-4 s"}
-#: Labels of the solvers in the legends of figures, in the order of drawing.
-LABELS: dict[Solver, str] = {"as_published": "RK4, 1e-4 s", "converged": "converged"}
+#: Labels of the solvers in tables and figures, in the order of drawing.
+LABELS: dict[Solver, str] = {"as_published": "RK4 1e-4 s", "converged": "converged"}
 #: The runs of one case by solver.
 Runs = dict[Solver, SimulatedRun]
 #: Step [s] of the thesis's Runge-Kutta method (section 4.1.1).
@@ -155,7 +153,7 @@ def all_resolved(runs: Runs) -> bool:
 
 
 def completed_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
-    """List the runs that did not diverge, as (solver, the solver's label in legends, run)."""
+    """List the runs that did not diverge, as (solver, the solver's label, run)."""
     return [(solver, LABELS[solver], run) for solver, run in runs.items() if not run.diverged]
 
 

@@ -214,7 +214,7 @@ def _judge_runs(
         solver: {reading: tuple(test(values)) for reading, values in results[solver].items()} for solver in SOLVERS
     }
     simulation = "; ".join(
-        f"{cases.SOLVER_TEXT[solver]}: {format_results(list(results[solver].values()))}, {count_passed(tests[solver])}"
+        f"{cases.LABELS[solver]}: {format_results(list(results[solver].values()))}, {count_passed(tests[solver])}"
         for solver in SOLVERS
     )
     passed = [test_passed for row in tests["converged"].values() for test_passed in row]
@@ -396,6 +396,6 @@ def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
         numbers = cases.summarise_run(run)
         values = (numbers[name] * factor for name, factor in _TABLE_FACTORS.items())
         cells = (value if math.isfinite(value) else None for value in values)
-        rows.append((reading.title, closed, cases.SOLVER_TEXT[solver], *cells, _HALVING_TEST[run.resolved]))
+        rows.append((reading.title, closed, cases.LABELS[solver], *cells, _HALVING_TEST[run.resolved]))
     table = item.table(rows, format_note("readings", window=cases.WINDOW))
     return (replace(table, claims=tuple(claim.id for claim in judgements)), *judgements)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,7 +17,6 @@ from sealscope.thesis.chapters.chapter4.cases import (
     COMMAND,
     DEFAULT_READING,
     LABELS,
-    SOLVER_TEXT,
     SOLVERS,
     WINDOW,
     Reading,
@@ -68,23 +68,26 @@ def _run_case(context: Context, item: Item) -> tuple[Runs, str]:
     """Simulate by both solvers the case of Table 4.2 or 4.3 in `item.inputs`; return the runs and notes on them."""
     (command, closed_pct), reading = CASES[item.inputs["case"]], item_reading(item)
     runs = run_both_solvers(context, command, closed_pct, reading)
-    return runs, _run_notes(runs, reading if closed_pct is not None else None)
+    return runs, _run_notes([runs], reading if closed_pct is not None else None)
 
 
-def _run_notes(runs: Runs, reading: Reading | None) -> str:
-    """Format the notes on a case: reading of the equations, failed or unresolved runs, and pressures below vacuum.
+def _run_notes(cases: Sequence[Runs], reading: Reading | None) -> str:
+    """Format the notes on some cases: reading of the equations, failed or unresolved runs, and pressures below vacuum.
 
-    `reading`: one way to understand the thesis's inconsistent equations; None for a case without orifices.
+    `reading`: one way to understand the thesis's inconsistent equations; None for cases without orifices.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:
         notes.append(f"Reading: {reading.title}.")
-    for _, label, run in completed_runs(runs):
-        min_MPa = min(float(run.outputs[name].min()) for name in PRESSURES) * 1e-6
-        if min_MPa < _VACUUM:
-            notes.append(format_note("vacuum", label=label, lowest=min_MPa))
-    notes += [f"{run.diverged}." for run in runs.values() if run.diverged]
-    if runs["converged"].resolved and not runs["as_published"].resolved:
+    min_MPa: dict[str, float] = {}  # lowest pressure by the solver's label
+    for _, label, run in itertools.chain.from_iterable(map(completed_runs, cases)):
+        lowest = min(float(run.outputs[name].min()) for name in PRESSURES) * 1e-6
+        min_MPa[label] = min(lowest, min_MPa.get(label, lowest))
+    notes += [
+        format_note("vacuum", label=label, lowest=lowest) for label, lowest in min_MPa.items() if lowest < _VACUUM
+    ]
+    notes += dict.fromkeys(f"{run.diverged}." for runs in cases for run in runs.values() if run.diverged)
+    if all(runs["converged"].resolved and not runs["as_published"].resolved for runs in cases):
         notes.append(format_note("published-unresolved"))
     return " ".join(notes)
 
@@ -137,7 +140,7 @@ def case_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
             row += [None if run.diverged else float(statistic(values)) for statistic in (np.min, np.max, np.std)]
         rows.append((*row, _rms_difference(runs, name)))
     statistics = ("least", "greatest", "rms about mean")
-    heads = [f"{statistic}, {SOLVER_TEXT[solver]}" for solver in runs for statistic in statistics]
+    heads = [f"{statistic}, {LABELS[solver]}" for solver in runs for statistic in statistics]
     columns = ("quantity", *heads, "rms of the difference")
     return (item.table(rows, f"Numbers {WINDOW}. {notes}", columns, resolved=all_resolved(runs)),)
 
@@ -228,7 +231,7 @@ def closing_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     ranges, numbers = _sweep_curves("range at {:g} % closed", sweep, lambda run: steady_range(run, name), SOLVERS)
     panels.append(Panel("closed [%]", f"range of {name} [MPa]", ranges, "(c) Range against closing"))
     resolved = all(map(all_resolved, sweep.values()))
-    return (item.figure(panels, numbers, resolved, _run_notes(sweep[CLOSINGS[-1]], reading)),)
+    return (item.figure(panels, numbers, resolved, _run_notes(list(sweep.values()), reading)),)
 
 
 def volume_figure(context: Context, item: Item) -> tuple[Figure, ...]:
