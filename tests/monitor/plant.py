@@ -16,6 +16,7 @@ import numpy as np
 from sqlalchemy import create_engine, inspect, text
 
 from sealscope.monitor.database.tables import metadata
+from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, read_settings
 from sealscope.recordings import write
@@ -97,6 +98,12 @@ def message(actuator: str, samples: Recording) -> dict[str, Any]:
     if actuator == "press 2" and float(samples.t[0]) % 30.0 < 1.5:  # now and then a sensor tells how warm the oil is
         channels |= {"T_oil": 40.0 + float(samples.t[0]) // 30.0, "units": {"T_oil": "degC"}}
     return {"actuator": actuator, "t": float(samples.t[0]), "rate": samples.rate, **channels}
+
+
+def is_viewed(live: LiveSamples, actuator: str) -> bool:
+    """Test whether samples of an actuator are kept, which they are only while somebody views it."""
+    live.push(actuator, HEALTHY.between(0.0, 1.0))
+    return live.version(actuator) > 0
 
 
 def lines_of(recordings: dict[str, Recording], size: int) -> bytes:

@@ -17,6 +17,7 @@ from scipy.special import ndtr
 from sealscope.diagnosis.live.estimates import BlockEstimate, WatchedLeak
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import MARKS, AlarmJudge
+from sealscope.monitor.database import tables
 from sealscope.monitor.database.store import MonitorStore, StoredRows
 from sealscope.monitor.outputs.events import EventLines
 from sealscope.monitor.settings import WatchSettings
@@ -37,7 +38,7 @@ def through(
     for number, lpm in enumerate(flows):
         interval = None if lpm is None else (lpm, lpm)
         change = judge.update(
-            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, settings
+            BlockEstimate(number, 3.0 * number, "alarm", lpm, interval, lpm, interval), leak, 1, settings, 1.0
         )
         if change is not None and change[1]:
             happened.append(change[1])
@@ -59,7 +60,7 @@ def test_stronger_evidence_is_rarer_by_chance():
     def chance(test: str, score: float) -> float:
         leak = replace(LEAK, test=test, score=score, threshold=4.0)
         block, judge = BlockEstimate(1, 3.0, "alarm"), AlarmJudge("a")
-        alarm, _ = judge.update(block, leak, 1, WatchSettings(false_alarms_per_1000_h=2.0, debounce_blocks=1))
+        alarm, _ = judge.update(block, leak, 1, WatchSettings(debounce_blocks=1), 2.0)
         return alarm.by_chance_per_1000_h
 
     assert chance("step", 4.0) == chance("level", 4.0) == 2.0
@@ -92,9 +93,9 @@ def test_a_clock_that_is_set_back_shelves_no_longer():
     judge = AlarmJudge("a")
     block = BlockEstimate(1, 1e6, "alarm", 0.003, None, 0.003, None)
     for _ in range(2):
-        judge.update(block, LEAK, 1, SETTINGS)
+        judge.update(block, LEAK, 1, SETTINGS, 1.0)
     judge.apply_mark("shelved", 1e6, until=1e6 + 3600.0)
-    shelved = [judge.update(replace(block, t=t), LEAK, 1, SETTINGS)[0].shelved for t in (100.0, 3600.0, 3800.0)]
+    shelved = [judge.update(replace(block, t=t), LEAK, 1, SETTINGS, 1.0)[0].shelved for t in (100.0, 3600.0, 3800.0)]
     assert shelved == [True, True, False]
 
 
@@ -203,6 +204,6 @@ def test_an_actuator_s_latest_events_are_shown_however_many_there_are(tmp_path: 
     row = {"kind": "alarm", "alarm_id": "1", "by_whom": "", "text": "", "alarm": "{}"}
     rows = [{**row, "actuator": ("press", "saw")[number % 2], "t": float(number)} for number in range(2600)]
     with store.writing() as connection:
-        connection.execute(store.tables.events.insert(), rows)
+        connection.execute(tables.events.insert(), rows)
     shown = store.last_events("saw")
     assert [event["t"] for event in shown] == [2599.0 - 2 * k for k in range(200)]

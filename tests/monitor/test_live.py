@@ -21,7 +21,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.signals.streams import DetailStream
 from sealscope.signals.windows import RmsStream
 
-from .plant import until
+from .plant import is_viewed, until
 
 RATE = 500.0
 UNITS = {"p_A": "Pa", "p_B": "Pa", "x": "m", "theta": "rad"}
@@ -65,12 +65,12 @@ def test_nothing_is_kept_of_what_nobody_looks_at_and_little_of_what_somebody_doe
         picture = live.curves("press")
         assert picture["t"] == fast.t[-1] and len(picture["pressures"]["t"]) <= 800
         assert picture["pressures"]["t"][0] == pytest.approx(-MAX_SAMPLES / 1e5, abs=1e-4)
-    assert not live.viewed
+    assert not is_viewed(live, "press")
     watched = [live.viewing(f"press {k}") for k in range(MAX_ACTUATORS + 1)]
     assert [each.__enter__() for each in watched] == [True] * MAX_ACTUATORS + [False]
     for each in watched:
         each.__exit__(None, None, None)
-    assert not live.viewed
+    assert not any(is_viewed(live, f"press {k}") for k in range(MAX_ACTUATORS))
 
 
 def test_what_is_stored_never_takes_the_place_of_what_comes_meanwhile():
@@ -156,14 +156,14 @@ def test_samples_go_to_who_looks_and_to_nobody_else(page: tuple[PageServer, Live
         assert (answer.status, "error" in json.loads(answer.read())) == (status, True)
     browser.request("GET", "/api/changes?actuator=press%20%3C1%3E&pressure=p_B")
     lines = browser.getresponse()
-    until(lambda: live.viewed)
+    until(lambda: is_viewed(live, "press <1>"))
     live.push("press <1>", SENT)
     pictures = []
-    while not pictures or pictures[-1]["t"] is None:
+    while not pictures or pictures[-1]["t"] != SENT.t[-1]:
         line = lines.readline()
         if line == b"event: live\n":
             pictures.append(json.loads(lines.readline().removeprefix(b"data: ")))
-    assert pictures[-1]["t"] == SENT.t[-1] and pictures[-1]["details"]["of"] == "p_B"
+    assert pictures[-1]["details"]["of"] == "p_B"
     browser.close()
     lines.close()
-    until(lambda: not live.viewed)
+    until(lambda: not is_viewed(live, "press <1>"))

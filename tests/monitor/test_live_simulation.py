@@ -54,6 +54,19 @@ def test_a_run_goes_on_after_the_last_block_that_is_known(tmp_path):
     assert handed[-1].identity not in known | {block.identity for block in handed[:-1]}
 
 
+def test_blocks_keep_to_their_seconds_at_a_rate_that_is_no_whole_number(tmp_path):
+    """Together they are the samples of all whole seconds, once each."""
+    rate, handed = 50.4, []
+    store = SimpleNamespace(is_known=lambda name, identity: False)
+    (source,) = make_simulated_sources(settings_of(tmp_path, rate=str(rate), duration="12 s"), lambda text: None)
+    source(SimpleNamespace(stopping=threading.Event(), store=store, submit=handed.append))
+    assert len(handed) == 12
+    for number, block in enumerate(handed):
+        assert np.all(np.abs(block.samples.t - (number + 0.5)) <= 0.5 + 0.5 / rate + 1e-9)
+    times = np.concatenate([block.samples.t for block in handed])
+    assert np.allclose(times, np.arange(round(12 * rate)) / rate)
+
+
 @pytest.mark.parametrize(
     ("words", "names"),
     [

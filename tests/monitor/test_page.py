@@ -8,6 +8,7 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from starlette.testclient import TestClient
 
 from sealscope.diagnosis.verdict.states import state_of
+from sealscope.errors import InputError
 from sealscope.monitor.alarms import rank_actuators
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer, site
@@ -23,7 +25,7 @@ from sealscope.monitor.settings import MonitorSettings, PageSettings
 from sealscope.recordings.recording import Recording
 
 from ..refusals import refusal
-from .plant import HEALTHY, WORN, lines_of, until
+from .plant import HEALTHY, WORN, is_viewed, lines_of, until
 
 HOSTILE = '<img src=x onerror="document.title=1">\\ \n&amp;'
 #: A browser that draws two frames a second, as where many look at many pages.
@@ -179,6 +181,19 @@ def test_a_port_in_use_is_one_line(service: Service):
     service.actuators.closed = False
 
 
+def test_the_address_of_an_ipv6_host_names_its_host_and_port(service: Service):
+    try:
+        server = PageServer(service.actuators, PageSettings(host="::1", port=0))
+    except InputError:
+        pytest.skip("this computer has no IPv6")
+    parts = urlsplit(server.address)
+    assert (parts.hostname, parts.port) == ("::1", server.port)
+    with refusal("page.port", f"[::1]:{server.port}"):
+        PageServer(service.actuators, PageSettings(host="::1", port=server.port))
+    server.close()
+    service.actuators.closed = False
+
+
 def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
     """Pressures, details and the drawing show what comes, say what does not, and stop while nobody looks."""
 
@@ -204,9 +219,9 @@ def look_at_the_live_part(view: Any, live: LiveSamples) -> None:
     # the drawing changes with what is said of it, not a frame later
     assert view.get_attribute("#twin-moving", "transform") == "translate(200.00 0)"
     view.locator("#pause").click()
-    until(lambda: not live.viewed)  # nothing is sent any more
+    until(lambda: not is_viewed(live, HOSTILE))  # nothing is sent any more
     view.locator("#pause").click()
-    until(lambda: live.viewed)
+    until(lambda: is_viewed(live, HOSTILE))
 
 
 @pytest.mark.slow

@@ -68,7 +68,7 @@ def test_an_event_that_is_stored_late_goes_out(url: str):
     def keep(store: MonitorStore, name: str, *, wait: bool) -> None:
         rows, judge = StoredRows(), AlarmJudge(name)
         block = BlockEstimate(1, 3.0, "alarm", 0.003, None, 0.003, None)
-        rows.add_alarm(judge.update(block, LEAK, 1, WatchSettings(debounce_blocks=1))[0], "raised", 3.0)
+        rows.add_alarm(judge.update(block, LEAK, 1, WatchSettings(debounce_blocks=1), 1.0)[0], "raised", 3.0)
         with store.writing() as connection:
             store.write_rows(connection, rows)
             if wait:

@@ -281,7 +281,7 @@ def test_a_clock_that_is_set_back_hides_nothing_that_is_new(tmp_path):
     leak = WatchedLeak(10.0, 9.0, (8.0, 10.0), 0.003, (0.002, 0.004), *sizes, "step", "leak", "", 50.0, 28.0)
     for t in (9e5, 3.0):
         block = BlockEstimate(1, t, "alarm", 0.003, None, 0.003, None)
-        alarm, _ = judge.update(block, leak, 1, WatchSettings(debounce_blocks=1))
+        alarm, _ = judge.update(block, leak, 1, WatchSettings(debounce_blocks=1), 1.0)
         rows.add_alarm(alarm, "raised", t)
         rows.add_alarm(judge.apply_mark("repaired", t), "repaired", t)
     store.commit_rows(rows)

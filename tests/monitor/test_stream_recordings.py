@@ -28,12 +28,12 @@ APRIL = 1.775e9
 FULL_S = 60.0
 
 
-def settings_of(folder: Path, machine_file: Path, more: str = "", recording_s: float = FULL_S):
+def settings_of(folder: Path, machine_file: Path, more: str = "", recording_s: float = FULL_S, rate: float = 20.0):
     """Settings of one machine whose samples come as lines, in recordings of a minute."""
     file = folder / "watch.toml"
     file.write_text(
         f'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
-        f"recording_s = {recording_s}\nfalse_alarms_per_1000_h = 20.0\n{more}",
+        f"recording_s = {recording_s}\nfalse_alarms_per_1000_h = {rate}\n{more}",
         encoding="utf-8",
     )
     return read_settings(file)
@@ -70,6 +70,17 @@ def test_a_leak_from_the_first_sample_on_is_what_diagnose_says(commissioned, tmp
     assert alarm["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.1)
     summary = service.summaries()["press"]
     assert (summary["recording"]["verdict"], summary["state"]["condition"]) == ("leak", "leak")
+
+
+def test_the_chance_of_a_block_s_alarm_is_by_the_blocks_part_of_the_false_alarms(commissioned, tmp_path, leak_lines):
+    """Beside recordings, of which none ends here, the blocks have half the rate: as if it were stated without any."""
+    lines, chances = b"".join(leak_lines.splitlines(keepends=True)[:80]), []
+    for recording_s, rate in ((600.0, 20.0), (0.0, 10.0)):
+        (folder := tmp_path / f"{rate:g}").mkdir()
+        service, _ = served(settings_of(folder, commissioned, "", recording_s, rate), lines)
+        (alarm,) = service.store.alarms()
+        chances.append(alarm["by_chance_per_1000_h"])
+    assert chances[0] == pytest.approx(chances[1])
 
 
 @pytest.mark.slow

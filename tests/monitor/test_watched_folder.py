@@ -63,6 +63,9 @@ def test_a_machine_is_stated_by_its_own_word(commissioned, tmp_path):
     (tmp_path / "rig.toml").write_text((Path(ss.__file__).parent / "parameters/rigs/thesis.toml").read_text("utf-8"))
     with refusal("machine", "rig"):
         stream_settings(tmp_path, 'machine = "rig.toml"')
+    for name in ("press", "thesis"):  # never the name of a packaged rig
+        with refusal("machine", ".toml", name):
+            stream_settings(tmp_path, f'machine = "{name}"')
     with pytest.raises(InputError, match="must be readable, got: No such file"):
         stream_settings(tmp_path, 'machine = "absent.toml"')
 

@@ -29,6 +29,7 @@ from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
 from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
+from sealscope.monitor.database import tables
 from sealscope.monitor.database.machine_files import record_mark
 from sealscope.monitor.database.store import MAX_IDENTITIES, MonitorStore, StoredCheckpoint, StoredRows, outage_reason
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
@@ -112,7 +113,8 @@ class _Actuator:
                 estimates.append(deciding_verdict.restate_block(estimate))
                 continue
             estimates.append(estimate)
-            change = self.judge.update(self.last, leak, self._baseline_version(), settings)
+            allowed_rate = self.watch.false_alarms_per_1000_h
+            change = self.judge.update(self.last, leak, self._baseline_version(), settings, allowed_rate)
             if change is not None:
                 events.append((*change, estimate.t))
                 if change[1] == "raised":  # newer than the verdict on an earlier recording
@@ -274,7 +276,7 @@ class WatchedActuators:
             learn_hours=settings.learn_hours,
             healthy=watched.healthy,
         )
-        n_stored = self.store.last_number(self.store.tables.blocks, name)
+        n_stored = self.store.last_number(tables.blocks, name)
         recorder = StreamRecorder(name, settings.recording_s) if is_cut_into_recordings else None
         actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
         checkpoint = self.store.checkpoint(name)
@@ -297,7 +299,7 @@ class WatchedActuators:
         if (version := require_part(state["watch"], "version", int)) != STATE_VERSION:
             _log.warning("%s: starts anew, as its state has version %s, not %d", name, version, STATE_VERSION)
             baseline_version = require_part(state["watch"], "baseline_version", int)
-            n_blocks = self.store.last_number(self.store.tables.estimates, name)
+            n_blocks = self.store.last_number(tables.estimates, name)
             fresh.continue_from(n_blocks, baseline_version)
             return True
         actuator.load_state(state)

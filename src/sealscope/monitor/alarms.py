@@ -127,16 +127,21 @@ class AlarmJudge:
     evidence: float = 0.0
 
     def update(
-        self, estimate: BlockEstimate, leak: WatchedLeak | None, baseline: int, settings: WatchSettings
+        self,
+        estimate: BlockEstimate,
+        leak: WatchedLeak | None,
+        baseline: int,
+        settings: WatchSettings,
+        allowed_rate: float,
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the estimate of one block of samples; return the alarm and the name of the event.
 
-        `leak`: leak that the detector has found, or None; `baseline`: version of the healthy baseline. An alarm is
-        raised if there is a leak and its flow reaches `warning_lpm` or `error_lpm` of the `settings`. It ends, or an
-        error becomes a warning, when the flow is below `return_share` times the threshold of its level. Each change
-        needs `debounce_blocks` successive blocks. A leak without a flow in L/min is a warning. A leak that comes back
-        before anybody has acknowledged its alarm raises the same alarm again. After a restart of the detector, when
-        `leak` is None, the alarm stays: the leak may last.
+        `leak`: leak that the detector has found, or None; `baseline`: version of the healthy baseline; `allowed_rate`:
+        most false alarms of the detector in 1000 h. An alarm is raised if there is a leak and its flow reaches
+        `warning_lpm` or `error_lpm` of the `settings`. It ends, or an error becomes a warning, when the flow is below
+        `return_share` times the threshold of its level. Each change needs `debounce_blocks` successive blocks. A leak
+        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
+        the same alarm again. After a restart of the detector, when `leak` is None, the alarm stays: the leak may last.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.
@@ -166,7 +171,7 @@ class AlarmJudge:
                 next_check=state_of(_CONDITIONS[level], leak.cause).action,
                 baseline=baseline,
                 # rarity: the fraction of the allowed false alarms that score as high as this leak
-                by_chance_per_1000_h=settings.false_alarms_per_1000_h * leak.rarity,
+                by_chance_per_1000_h=allowed_rate * leak.rarity,
             )
             return alarm, "raised"
         limit = settings.warning_lpm if self.alarm.level == "warning" else (settings.error_lpm or math.inf)
@@ -187,7 +192,7 @@ class AlarmJudge:
             error_state: AlarmState = "valid" if updated.state == "valid" else "new"
             updated, event = replace(updated, level="error", state=error_state), "error"
         if leak is not None:
-            by_chance, interval = settings.false_alarms_per_1000_h * leak.rarity, estimate.leak_interval_lpm
+            by_chance, interval = allowed_rate * leak.rarity, estimate.leak_interval_lpm
             updated = replace(updated, leak_lpm=lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
         return self._set_alarm(updated), event
 
@@ -324,6 +329,11 @@ class AlarmJudge:
         return self._set_alarm(replace(alarm, updated_s=t, **changes[mark]))
 
 
+def latest_alarms(alarms: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+    """Select the latest alarm of each actuator, which is the first of its alarms (`MonitorStore.alarms`)."""
+    return {alarm["actuator"]: alarm for alarm in reversed(alarms)}
+
+
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Sort the summaries of actuators by urgency; add to each the `name` and the open `alarm`, None if there is none.
 
@@ -340,7 +350,6 @@ def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict
         is_new = row["status_word"] & NEW_BIT
         return -row["state"]["severity"], -is_new, false_alarm_rate, -low_lpm, -(row["leak_lpm"] or 0.0), row["name"]
 
-    # of several alarms of an actuator, the first in `alarms` is the latest: reversed, it replaces the others
-    by_actuator = {alarm["actuator"]: alarm for alarm in reversed(alarms)}
+    by_actuator = latest_alarms(alarms)
     rows = [{"name": name, **summary, "alarm": by_actuator.get(name)} for name, summary in summaries.items()]
     return sorted(rows, key=rank)

@@ -132,15 +132,16 @@ class ActuatorSettings(WatchSettings):
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         machine_file = values.get("machine")
-        is_machine = isinstance(machine_file, str)
-        if is_machine:
+        if isinstance(machine_file, str):
+            if not machine_file.endswith(".toml"):
+                raise ValueError(f"machine must be a .toml file that commission wrote, got {machine_file[:100]!r}")
             values = {name: value for name, value in values.items() if name != "machine"} | {"rig": machine_file}
         rig = values.get("rig")
-        if not isinstance(rig, str) or not (rig.endswith(".toml") or is_machine):
+        if not isinstance(rig, str) or not rig.endswith(".toml"):
             return values
         path = Path(info.context["folder"]) / rig if info.context else Path(rig)
         watched = load_watched(os.fspath(path))
-        if is_machine and watched.machine is None:
+        if isinstance(machine_file, str) and watched.machine is None:
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         # a text is "auto": the columns are then found only when a file is read
         columns = {} if isinstance(watched.channel_map, str) else dict(watched.channel_map)

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.machine import CommissionedMachine
-from sealscope.diagnosis.commissioned.watched import load_watched
+from sealscope.diagnosis.commissioned.watched import WatchedMachine, load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
@@ -185,14 +184,18 @@ def _parse_interval(ends: Any) -> Interval | None:
 
 
 def judge_recording(
-    machine: CommissionedMachine, recording: Recording, file: str, shift: float, *, limit_lpm: float | None = None
-) -> RecordingVerdict:
+    watched: WatchedMachine, recording: Recording, file: str, shift: float, *, limit_lpm: float | None = None
+) -> RecordingVerdict | None:
     """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
     `file`: name of its file; `shift` [s]: added to its times to give seconds since 1970; `limit_lpm` [L/min]: leak that
-    calls for a repair, None for the limit in the machine's file.
+    calls for a repair, None for the limit in the machine's file. Returns None if the file has no healthy recordings.
     """
-    if limit_lpm is not None:
+    machine = watched.machine
+    if machine is None:
+        return None
+    # the limit in the machine's file is used in its own unit: a limit of creep is compared with the creep
+    if limit_lpm not in (None, watched.limit_lpm):
         machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")
     diagnosis = replace(machine.diagnose(recording), file=file)
     times = recording.t[np.isfinite(recording.t)]
@@ -207,10 +210,6 @@ def judge_stream(rig: str, recording: Recording, *, limit_lpm: float | None = No
     Returns None if the file has no healthy recordings; raises InputError if it cannot be read.
     """
     watched = load_watched(rig)  # read anew, as the file may have changed
-    if watched.machine is None:
-        return None
     start, end = (float(recording.t[k]) for k in (0, -1))
     name = f"stream from {clock_text(start)} to {clock_text(end)}"
-    # None: the limit in the machine's file is used, in its own unit (a limit of creep is compared with the creep)
-    limit_lpm = None if limit_lpm == watched.limit_lpm else limit_lpm
-    return judge_recording(watched.machine, replace(recording, t=recording.t - start), name, start, limit_lpm=limit_lpm)
+    return judge_recording(watched, replace(recording, t=recording.t - start), name, start, limit_lpm=limit_lpm)

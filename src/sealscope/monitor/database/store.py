@@ -133,11 +133,10 @@ class StoredCheckpoint(NamedTuple):
 
 
 class MonitorStore:
-    """The database of a monitor, from which outputs and the page read; `tables`: module with its tables."""
+    """The database of a monitor, from which outputs and the page read."""
 
     def __init__(self, database: str) -> None:
         """Open the database, a file of SQLite or a URL, and create missing tables; raise InputError if that fails."""
-        self.tables = tables
         is_file = "://" not in database
         # one thread writes at a time: SQLite would make the others wait, and then fail
         self._writing_lock: AbstractContextManager[object] = threading.RLock() if is_file else nullcontext()

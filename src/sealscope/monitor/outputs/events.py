@@ -45,11 +45,11 @@ class EventLines:
         Raises PartAway if the stream refuses the line or a part of it; the next call, for the same event, writes the
         rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
         """
+        if not is_announced(event):
+            return True
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
-            if not is_announced(event):
-                return True
             if self._stream is None:
                 raise OSError("it is closed")
             try:

@@ -17,6 +17,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any, Self
 
 from sealscope.monitor import sparkplug as spb
+from sealscope.monitor.alarms import latest_alarms
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.mqtt_client import MqttLink
 from sealscope.monitor.settings import BrokerSettings, MonitorSettings, SparkplugSettings, read_secret, topic_level
@@ -173,9 +174,9 @@ class SparkplugNode:
         self._store.write_position(_BIRTHS, self._connection_birth_number)
         self._sent_birth_number = self._connection_birth_number
         summaries = self._summaries()
-        # alarms are read latest first: reversed, the latest of each actuator replaces the others
-        latest = {alarm["actuator"]: alarm for alarm in reversed(self._store.alarms())}
+        latest = latest_alarms(self._store.alarms())
         self._seq, self._sent_values = 255, {}  # the birth of the node gets the sequence number 0
+        # a birth that is not sent in time stays in the client's queue, before the data; a new connection sends all anew
         self._send("NBIRTH", [self._birth_number_metric(), spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
         for actuator, summary in summaries.items():
             self._send_device_birth(actuator, summary, latest.get(actuator, {}))

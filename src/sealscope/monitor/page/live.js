@@ -30,7 +30,7 @@ function listen() {
   stream.onmessage = () => {
     // not before: the monitor keeps the samples of an actuator only while a stream asks for them
     if (stream === news) closeReplaced();
-    soon();
+    requestRefresh();
   };
   stream.addEventListener("live", (event) => {
     if (stream === news) showLive(JSON.parse(event.data));
@@ -88,10 +88,11 @@ function plotOf(id, names, unit, colours, values) {
   plots[id] = { key, plot };
 }
 
-function emptied(id, why) {
+// replace a plot by the reason why there is none
+function clearPlot(id, reason) {
   if (plots[id]) plots[id].plot.destroy();
   delete plots[id];
-  byId(id).replaceChildren(element("p", "quiet", why));
+  byId(id).replaceChildren(element("p", "quiet", reason));
 }
 
 function showLive(live) {
@@ -101,8 +102,8 @@ function showLive(live) {
   byId("live-charts").hidden = live.t === null;
   if (live.t === null) {
     says.textContent = live.error || "Waits for samples.";
-    emptied("pressures", "");
-    emptied("details", "");
+    clearPlot("pressures", "");
+    clearPlot("details", "");
     showTwin(live);
     return;
   }
@@ -111,16 +112,17 @@ function showLive(live) {
   if (names.length) {
     const tones = { p_A: "--side-a", p_B: "--side-b" };
     plotOf("pressures", names, "bar", names.map((name) => tones[name]), live.pressures);
-  } else emptied("pressures", "No chamber pressure is recorded.");
+  } else clearPlot("pressures", "No chamber pressure is recorded.");
   const details = live.details;
   if (details.t.length) {
     const levels = ["d1", "d2", "d3", "d4"];
     plotOf("details", levels, "kPa", levels.map((level) => `--${level}`), details);
-  } else emptied("details", `The details need ${details.needs} successive samples, ${details.has} are known.`);
+  } else clearPlot("details", `The details need ${details.needs} successive samples, ${details.has} are known.`);
   showTwin(live);
 }
 
-function drawn() {
+// mark the chosen buttons as pressed, and name the drawn details in their heading
+function updateControls() {
   for (const button of document.querySelectorAll("[data-pressure], [data-drawn]")) {
     const on = button.dataset.pressure === drawing.pressure || button.dataset.drawn === drawing.drawn;
     button.setAttribute("aria-pressed", String(on));
@@ -133,23 +135,23 @@ function drawn() {
 for (const button of document.querySelectorAll("[data-pressure], [data-drawn]")) {
   button.addEventListener("click", () => {
     Object.assign(drawing, { ...button.dataset });
-    drawn();
+    updateControls();
     listen();
   });
 }
 byId("pause").addEventListener("click", () => {
   paused = !paused;
-  drawn();
+  updateControls();
   listen();
 });
 document.addEventListener("visibilitychange", () => {
   listen();
-  if (!document.hidden) soon();
+  if (!document.hidden) requestRefresh();
 });
-const redrawn = () => {
+const redrawLive = () => {
   if (latest) showLive(latest);
 };
-addEventListener("resize", redrawn);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawn);
-drawn();
+addEventListener("resize", redrawLive);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redrawLive);
+updateControls();
 listen();

@@ -126,11 +126,6 @@ class LiveSamples:
             if window is not None:
                 window.add(samples)
 
-    @property
-    def viewed(self) -> frozenset[str]:
-        """Names of the actuators that somebody views."""
-        return frozenset(self._windows)
-
     def version(self, name: str) -> int:
         """Return a number that increases when a viewed actuator gets samples, 0 for other actuators."""
         window = self._windows.get(name)

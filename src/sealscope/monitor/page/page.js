@@ -58,7 +58,8 @@ function clock(t, byFiles = chosenByFiles) {
   return parts.map((part) => String(part).padStart(2, "0")).join(":");
 }
 
-async function asked(address, options) {
+// fetch JSON from the monitor: without a session go to the login form, in an outage show it and throw an error
+async function requestJson(address, options) {
   const answer = await fetch(address, options);
   if (answer.status === 401) location.href = "/login";
   const values = await answer.json();
@@ -145,7 +146,7 @@ function showFleet(fleet) {
   byId("dropped").textContent = dropped.length ? `Since the start: ${dropped.join("; ")}` : "";
 }
 
-function facts(alarm, judged) {
+function showFacts(alarm, judged) {
   const list = byId("alarm-facts");
   list.replaceChildren();
   const rows = [
@@ -287,7 +288,7 @@ function showLife(life) {
   byId("alarm").hidden = !alarm;
   if (alarm) {
     byId("alarm-title").textContent = `${alarm.level}: ${flow(alarm.leak_lpm, alarm.leak_interval_lpm)}, ${alarm.state}${alarm.returned_s == null ? "" : ", over"}`;
-    facts(alarm, judged);
+    showFacts(alarm, judged);
     showWorkflow(alarm);
   }
   const list = byId("events");
@@ -308,14 +309,14 @@ function showLife(life) {
 }
 
 async function refresh() {
-  const fleet = await asked("/api/fleet");
+  const fleet = await requestJson("/api/fleet");
   showOutages(fleet);
   if (chosen === null && fleet.actuators.length) chosen = fleet.actuators[0].name;
   showFleet(fleet);
   listen();
   if (chosen === null) return;
   const query = hours ? `&hours=${hours}` : "";
-  showLife(await asked(`/api/actuator?name=${encodeURIComponent(chosen)}${query}`));
+  showLife(await requestJson(`/api/actuator?name=${encodeURIComponent(chosen)}${query}`));
 }
 
 function choose(name) {
@@ -326,7 +327,7 @@ function choose(name) {
     () => {
       if (matchMedia("(max-width: 60rem)").matches) byId("life").scrollIntoView();
     },
-    soon,
+    requestRefresh,
   );
 }
 
@@ -338,14 +339,14 @@ byId("marks").addEventListener("submit", async (event) => {
     byId("comment").focus();
     return;
   }
-  const answer = await asked(`/api/mark?name=${encodeURIComponent(chosen)}`, {
+  const answer = await requestJson(`/api/mark?name=${encodeURIComponent(chosen)}`, {
     method: "POST",
     headers: { "Content-Type": "application/json", "X-Sealscope": "mark" },
     body: JSON.stringify({ mark, text: byId("comment").value }),
   }).catch((error) => ({ error: `not kept: ${error.message}` }));
   byId("mark-answer").textContent = answer.error || `${answer.id}: ${mark}`;
   if (!answer.error) byId("comment").value = "";
-  soon();
+  requestRefresh();
 });
 
 for (const button of document.querySelectorAll(".spans button")) {
@@ -354,13 +355,14 @@ for (const button of document.querySelectorAll(".spans button")) {
     for (const other of document.querySelectorAll(".spans button")) {
       other.setAttribute("aria-pressed", String(other === button));
     }
-    soon();
+    requestRefresh();
   });
 }
 
+// refresh the page now or, while it is being refreshed, once more afterwards; at most every 0.5 s
 let busy = false;
 let again = false;
-async function soon() {
+async function requestRefresh() {
   if (busy) {
     again = true;
     return;
@@ -378,11 +380,11 @@ async function soon() {
     busy = false;
     if (again) {
       again = false;
-      soon();
+      requestRefresh();
     }
   }, 500);
 }
 
-addEventListener("resize", soon);
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", soon);
-soon();
+addEventListener("resize", requestRefresh);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", requestRefresh);
+requestRefresh();

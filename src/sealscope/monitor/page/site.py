@@ -365,7 +365,7 @@ class PageServer:
         self._proxies = [str(address) for address in settings.proxies]
         self._socket: socket.socket | None = self._open_socket()
         self.port = int(self._socket.getsockname()[1])
-        self.address = f"http://{settings.host}:{self.port}/"
+        self.address = f"http://{self._format_place()}/"
         self._server: uvicorn.Server | None = None
         self._thread = actuators.supervisor.start("page", self._serve)
 
@@ -375,8 +375,12 @@ class PageServer:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
         except OSError as error:
-            place = f"{self._host}:{self.port}"
-            raise InputError(f"page.port must be free, got {error.strerror or error} ({place})") from None
+            reason = error.strerror or error
+            raise InputError(f"page.port must be free, got {reason} ({self._format_place()})") from None
+
+    def _format_place(self) -> str:
+        """Format host and port of the page as in a URL, with an IPv6 address in brackets."""
+        return f"[{self._host}]:{self.port}" if ":" in self._host else f"{self._host}:{self.port}"
 
     def _serve(self) -> None:
         """Serve the page until `leave` is called; uvicorn closes the socket at the end.

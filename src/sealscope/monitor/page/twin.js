@@ -50,8 +50,8 @@ function showTwin(live) {
   byId("twin-scale-most").textContent = `${twin.most} bar`;
   // the text and the drawing change together, not the drawing a frame later
   cancelAnimationFrame(twin.frame);
-  moved(performance.now());
-  described();
+  moveTwin(performance.now());
+  describeTwin();
 }
 
 const between = (values, k, share) =>
@@ -73,7 +73,8 @@ function state() {
   return { x: value("x"), p_A: value("p_A"), p_B: value("p_B"), rpm, flow: litresAMinute };
 }
 
-function moved(now) {
+// draw the actuator at the time of this frame, and go on until the newest samples are drawn
+function moveTwin(now) {
   twin.frame = 0;
   const passed = Math.min(0.1, Math.max(0, (now - twin.last) / 1000));
   twin.last = now;
@@ -108,11 +109,11 @@ function moved(now) {
     for (const line of document.querySelectorAll(".twin-run")) line.setAttribute("stroke-dashoffset", (-twin.flowed).toFixed(1));
   }
   for (const line of document.querySelectorAll(".twin-run")) line.toggleAttribute("hidden", still_);
-  if (twin.at < newest) twin.frame = requestAnimationFrame(moved);
+  if (twin.at < newest) twin.frame = requestAnimationFrame(moveTwin);
 }
 
 // describe the drawing to screen readers, each time that samples come
-function described() {
+function describeTwin() {
   const is = state();
   const parts = ["The actuator as it moves"];
   for (const side of ["A", "B"]) if (is[`p_${side}`] !== null) parts.push(`p_${side} ${bar(is[`p_${side}`])} bar`);

@@ -76,10 +76,8 @@ class WatchedFolder:
         assert settings.folder is not None
         self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
         self.settle_s, self._is_stored = settle_s, is_stored
-        watched = load_watched(settings.rig)
-        self._rig, self._channel_map, self._rate = settings.rig, settings.map or watched.channel_map, settings.rate
-        # None: the limit in the machine's file is used, in its own unit (a limit of creep is compared with the creep)
-        self._limit_lpm = None if settings.error_lpm == watched.limit_lpm else settings.error_lpm
+        self._rig, self._rate, self._limit_lpm = settings.rig, settings.rate, settings.error_lpm
+        self._channel_map = settings.map or load_watched(settings.rig).channel_map
         self._newest_s = self._end_s = newest_s  # start and end of the newest recording [s since 1970]
         # by identity of the file: time at which it was first found [s], and time of its first sample [s since 1970]
         self._first_found: dict[str, float] = {}
@@ -201,7 +199,7 @@ class WatchedFolder:
         if not len(corrected_samples):
             return replace(block, samples=corrected_samples)
         try:
-            machine = load_watched(self._rig).machine  # read anew, as the file may have changed
+            watched = load_watched(self._rig)  # read anew, as the file may have changed
         except (SealscopeError, OSError) as error:
             raise PartAway(escape_text(str(error))) from None
         if _is_midnight_before(start, self._newest_s):
@@ -210,12 +208,11 @@ class WatchedFolder:
         shift = start - float(finite_t[0]) if finite_t.size else 0.0
         times = corrected_samples.t + shift
         verdict = None
-        if machine is not None:
-            try:
-                verdict = judge_recording(machine, recording, escape_text(path.name), shift, limit_lpm=self._limit_lpm)
-            except Exception as error:
-                reason = describe_error(error)
-                _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
+        try:
+            verdict = judge_recording(watched, recording, escape_text(path.name), shift, limit_lpm=self._limit_lpm)
+        except Exception as error:
+            reason = describe_error(error)
+            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
         channels, units = dict(corrected_samples.channels), dict(corrected_samples.units)
         if "T_oil" not in channels and (celsius := oil_temperature(corrected_samples)) is not None:

@@ -102,7 +102,7 @@ class _OpcUaSession:
             for actuator in self._actuators:
                 nodes = {client.get_node(node): channel for channel, node in actuator.nodes.items()}
                 self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
-                rate = float(actuator.rate or 1.0)  # never None: the settings are checked
+                rate = self._gatherers[actuator.name].rate
                 queue_size = math.ceil(2.0 * rate * self._settings.block_s)  # the samples of two blocks
                 results = await subscription.subscribe_data_change(
                     [*nodes],
