@@ -42,8 +42,8 @@ class Demo:
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
-    All files are written into `folder`. `seed` sets the random numbers of all recordings. `progress` is called with the
-    name of a task and its completed fraction.
+    All files are written into `folder`. `seed` sets the random numbers, which differ from recording to recording.
+    `progress` is called with the name of a task and its completed fraction.
     """
     report_progress = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]
@@ -53,7 +53,8 @@ def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> D
         healthy_experiment = Experiment.of(command=COMMAND, duration=SECONDS, seed=run_seed)
         recordings[name] = simulate_experiment(healthy_experiment).recording
         report_progress("simulating healthy recordings", (k + 1) / len(names))
-    experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=seed)
+    leak_seed = seed or len(names)  # the healthy recordings of `seed` 0 have 0 to len(names) - 1
+    experiment = Experiment.of(command=COMMAND, leak=LEAK, duration=60.0, seed=leak_seed)
     result = simulate_experiment(experiment, progress)
     file, page = folder / "recording.nc", folder / "report.html"
     recordings[file.name] = result.recording

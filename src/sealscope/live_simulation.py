@@ -102,13 +102,14 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
                 say(f"simulates {name}")
                 run = simulate_experiment(experiment).recording
             recording = run.only([channel for channel in CHANNELS if channel in run])
-            n_samples = round(BLOCK_S * recording.rate)
             start_time = time.monotonic()
             for number in blocks[first:]:
                 due = start_time + (number + 1 - first) * BLOCK_S / settings.speed
                 if receiver.stopping.wait(max(0.0, due - time.monotonic())):
                     return
-                samples = recording.samples(slice(number * n_samples, (number + 1) * n_samples))
+                # the ends follow the time: a block has one sample more or less if the rate is no whole number
+                begin, end = (round(count * BLOCK_S * recording.rate) for count in (number, number + 1))
+                samples = recording.samples(slice(begin, end))
                 receiver.submit(SourceBlock(name, block_identity(number), samples))
         say(f"{name}: the simulated time is over")
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import re
+from types import SimpleNamespace
 
 import pytest
 from typer.testing import CliRunner
 
 import sealscope
 from sealscope.cli.app import app
+from sealscope.demo import run_demo
 
 from .conftest import Call
 
@@ -100,6 +102,22 @@ def test_another_seed_is_another_recording_with_the_same_verdict(whole, folder, 
     item, two = (sealscope.read(folder / name / "recording.nc") for name in ("whole", "other"))
     assert (item["p_A"] != two["p_A"]).any()
     assert (item["u"] == two["u"]).mean() > 0.9
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_two_recordings_have_the_same_noise(tmp_path, monkeypatch, seed):
+    seeds = []
+
+    def record_seed(experiment, *_):
+        seeds.append(experiment.seed)
+        if experiment.leaks:
+            raise StopIteration  # it is the last one
+        return SimpleNamespace(recording=None)
+
+    monkeypatch.setattr("sealscope.demo.simulate_experiment", record_seed)
+    with pytest.raises(StopIteration):
+        run_demo(tmp_path, seed)
+    assert len(set(seeds)) == len(seeds) > 2
 
 
 def test_a_folder_that_cannot_be_one_is_refused_before_the_work(call, untouched, tmp_path, monkeypatch):

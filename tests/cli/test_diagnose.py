@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.cli.app import spread_baselines
+from sealscope.cli.app import normalise_arguments
 
 KEYS = {
     "file": str,
@@ -182,13 +182,14 @@ def test_two_words_after_baseline_and_no_other_are_a_baseline_and_a_file(call, r
         ("diagnose --rate=5 --baseline b c", "diagnose --baseline b c --rate=5"),
         ("diagnose --baseline=b a", "diagnose --baseline=b a"),
         ("diagnose --baseline b c -- -a", "diagnose --baseline b --baseline c -- -a"),
+        ("diagnose a -- --baseline -v", "diagnose a -- --baseline -v"),
         ("report a -o p --baseline b c", "report --baseline b --baseline c a -o p"),
         ("convert a --baseline b c", "convert a --baseline b c"),
         ("", ""),
     ],
 )
 def test_how_baselines_are_spread(words, spread):
-    assert spread_baselines(words.split()) == spread.split()
+    assert normalise_arguments(words.split()) == spread.split()
 
 
 @pytest.mark.usefixtures("two_methods")

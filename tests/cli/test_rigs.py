@@ -78,9 +78,13 @@ def test_a_rod_on_both_sides_needs_one_area(call, tmp_path):
         (("--bore", "50", "--rod", "50"), "rod must be >= 0 mm and below the bore, 50 mm, got 50 mm"),
         (("--bore", "50", "--valve", "9"), "--valve needs --kind valve, got --kind pump"),
         (("--kind", "valve", "--bore", "50"), "--displacement needs --kind pump, got --kind valve"),
+        (("--rod", "30", "--area-A", "500", "--area-B", "400"), "--rod needs --bore, got --rod 30"),
+        (("--rod", "30"), "--rod needs --bore, got --rod 30"),
+        (("--bore", "50", "--area-A", "500"), "--area-A must stand in place of --bore, got both"),
+        (("--bore", "50", "--rod", "30", "--area-B", "500"), "--area-B must stand in place of --bore, got both"),
     ],
 )
-def test_what_does_not_fit_a_kind_is_one_line(call, words, rule):
+def test_sizes_that_do_not_go_together_are_one_line(call, words, rule):
     assert call("rigs", "new", "press", *words, *SIZES).refused().startswith(rule)
 
 

@@ -11,8 +11,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.parameters import Motor, Rig, load_rig, parse_override, parse_overrides
+from sealscope.parameters import Rig, load_rig, parse_overrides
+from sealscope.parameters.drive import Motor
 from sealscope.parameters.fields import choices_of, unit_of
+from sealscope.parameters.names import parse_override
 from sealscope.parameters.rig import declared_fields
 
 from ..refusals import mentions, refusal

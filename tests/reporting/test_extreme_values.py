@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.reporting.charts import Chart, ChartLine, render_still
+from sealscope.diagnosis.verdict.diagnosis import Diagnosis
+from sealscope.reporting.charts import Chart, ChartLine, draw
 from sealscope.reporting.page import render_page
 from sealscope.reporting.picture import ticks
 
@@ -52,7 +53,8 @@ def test_a_still_chart_of_extreme_values(name: str) -> None:
     chart = Chart("x", "channels", "x", "m", (ChartLine("x", "a", values),))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        still = render_still(chart, T[:2000], [chart.lines[0].values], (0.0, 4.0))
+        recording = ss.Recording(T[:2000], {"x": values}, {"x": "m"}, 500.0)
+        still = draw(recording, [], [chart], Diagnosis("cannot tell", "", false_alarm_probability=0.01), ()).still["x"]
     (path,) = (shape.path for shape in still.shapes if shape.style == "line a")
     heights = [float(y) for y in re.findall(r"[ML]-?\d+ (-?\d+)", path)]
     assert all(0 <= y <= chart.height for y in heights)

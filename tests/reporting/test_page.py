@@ -16,7 +16,7 @@ from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.recordings.quality import Finding
-from sealscope.reporting.charts import Mark
+from sealscope.reporting.charts import Mark, draw
 from sealscope.reporting.page import render_page, report
 from sealscope.reporting.particulars import collect_particulars
 from sealscope.reporting.schematic import build_circuit, schematic
@@ -159,6 +159,17 @@ def test_faulty_data_are_drawn_and_named_not_refused(recording, make_diagnosis):
     Reader(render_page(item, make_diagnosis()))
     with refusal("1 sample"):
         render_page(recording.between(-2, -1), make_diagnosis())
+
+
+@pytest.mark.parametrize("kind", ["out of order", "missing"])
+def test_without_times_in_order_all_samples_in_the_middle_are_drawn(make_recording, make_diagnosis, kind):
+    """The axis is the sample's number over the rate, from 0 s on, whatever the stamps begin with."""
+    recording = make_recording(80.0)
+    t = recording.t + 1000.0
+    t[len(t) // 2] = t[5] if kind == "out of order" else np.nan
+    drawn_charts = draw(replace(recording, t=t), [], [], make_diagnosis(onset_s=None), ())
+    assert drawn_charts.base.width > 1 and drawn_charts.span == (0.0, pytest.approx(80.0, abs=0.01))
+    assert drawn_charts.fine == pytest.approx((40.0 - 6.0, 40.0 + 6.0), abs=0.01)  # 6000 samples of 500 Hz
 
 
 def test_an_unbounded_interval_is_drawn_to_the_recordings_end(recording, make_diagnosis):

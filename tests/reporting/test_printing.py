@@ -29,7 +29,7 @@ BROWSER = next(filter(None, map(shutil.which, printing.BROWSERS)), None)
 @pytest.mark.slow
 @pytest.mark.skipif(BROWSER is None, reason="no browser of Chromium's family on this machine")
 def test_a_browser_prints(tmp_path: Path) -> None:
-    assert printing.print_page(PAGE, tmp_path / "page.pdf") == Path(str(BROWSER)).name
+    printing.print_page(PAGE, tmp_path / "page.pdf")
     data = (tmp_path / "page.pdf").read_bytes()
     assert data.startswith(b"%PDF-")
     assert data.rstrip().endswith(b"%%EOF")
@@ -220,3 +220,20 @@ def test_a_browser_that_fails_leaves_nothing(tmp_path: Path, monkeypatch: pytest
     with refusal("PDF", "status 3", "no display"):
         printing.print_page(PAGE, tmp_path / "page.pdf")
     assert [path.name for path in tmp_path.iterdir()] == ["browser"]
+
+
+def test_a_browser_that_cannot_be_started_is_not_said_to_be_slow(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gone, slow = tmp_path / "gone", tmp_path / "slow"
+    gone.write_text("#!/no/such/interpreter\n")
+    slow.write_text("#!/bin/sh\nexec sleep 60\n")
+    monkeypatch.setattr(printing, "_BROWSER_TIMEOUT", 0.25)
+    for browser, words, other in ((gone, ("starts", "No such file"), "0.25 s"), (slow, ("0.25 s",), "starts")):
+        browser.chmod(0o755)
+        monkeypatch.setattr(printing, "BROWSERS", (str(browser),))
+        with pytest.raises(InputError) as error:
+            printing.print_page(PAGE, tmp_path / "page.pdf")
+        assert all(word in str(error.value) for word in (*words, str(browser)))
+        assert other not in str(error.value)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["gone", "slow"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -49,6 +50,19 @@ def test_the_oil_is_taken_out_where_every_recording_states_it() -> None:
         days = [replace(own, temperature=known) for own, known in zip(life(3), temperatures, strict=True)]
         text = " ".join(trend_text(trend_of(days), whole=True).split())
         assert f"The oil's temperature is {words}." in text
+
+
+@pytest.mark.parametrize("left_out", [0, 10])
+def test_the_limit_is_reached_on_the_same_date_in_words_and_in_json(left_out: int) -> None:
+    """The time until then counts from the last recording that is compared, whether or not others follow it."""
+    days = life(40, wears=0.03, since=10.0)
+    last = len(days) - left_out
+    days[last:] = [replace(day, basis=None, problem="needs theta") for day in days[last:]]
+    result = trend_of(days, healthy=8, limit="60 mL/min")
+    assert (result.verdict, len(result.points), len(result.rows)) == ("leak", 40, last)
+    dates = result.as_dict()["limit_reached"]
+    told = [dates[name][:10] for name in ("value", "low", "high")]
+    assert re.findall(r"\d{4}-\d\d-\d\d", figures(result)["limit"]) == told
 
 
 def test_the_chart_stands_within_its_frame(trend: Trend) -> None:

@@ -75,31 +75,31 @@ def _root(
 def normalise_arguments(arguments: Sequence[str]) -> list[str]:
     """Rearrange the arguments of a call to the form that typer understands.
 
-    `-v` is moved to the beginning, once; `--baseline` is repeated before each baseline (`spread_baselines`); and
+    `-v` is moved to the beginning, once; `--baseline` is repeated before each baseline (`_spread_baselines`); and
     `monitor FILE` becomes `monitor run FILE`. Raises InputError if no file follows `--baseline`.
     """
     end = list(arguments).index("--") if "--" in arguments else len(arguments)  # after `--` there are no options
     verbose = [argument for argument in arguments[:end] if argument in ("-v", "--verbose")]
-    remaining = [argument for argument in arguments[:end] if argument not in ("-v", "--verbose")]
-    remaining += arguments[end:]
+    without_verbose = [argument for argument in arguments[:end] if argument not in ("-v", "--verbose")]
+    remaining = _spread_baselines(without_verbose, arguments[end:])
     if remaining[:1] == ["monitor"] and len(remaining) > 1 and remaining[1] not in monitoring.COMMANDS:
         remaining.insert(1, "run")  # `sealscope monitor FILE`
-    return [*verbose[:1], *spread_baselines(remaining)]
+    return [*verbose[:1], *remaining]
 
 
-def spread_baselines(arguments: Sequence[str]) -> list[str]:
+def _spread_baselines(arguments: Sequence[str], operands: Sequence[str]) -> list[str]:
     """Repeat the option `--baseline` of diagnose and report before each baseline file, as typer requires.
 
     All arguments after `--baseline` up to the next option are baselines. If the call has no other files, only the first
-    file after each `--baseline` is a baseline, and the others are diagnosed. Raises InputError if no file follows.
+    file after each `--baseline` is a baseline, and the others are diagnosed. `operands`: the arguments from `--` on,
+    which stay at the end. Raises InputError if no file follows.
     """
     if "--baseline" not in arguments or arguments[0] not in ("diagnose", "report"):
-        return list(arguments)
-    end = list(arguments).index("--") if "--" in arguments else len(arguments)
+        return [*arguments, *operands]
     baselines: list[list[str]] = []  # the files after each `--baseline`
     remaining: list[str] = []  # all other arguments
     in_baseline = False
-    for argument in arguments[1:end]:
+    for argument in arguments[1:]:
         if argument == "--baseline":
             baselines.append([])
             in_baseline = True
@@ -110,7 +110,7 @@ def spread_baselines(arguments: Sequence[str]) -> list[str]:
             baselines[-1].append(argument)
         else:
             remaining.append(argument)
-    remaining += arguments[end:]
+    remaining += operands
     if not all(baselines):
         raise InputError("--baseline must be followed by one file or more, got none")
     command = _click_command().commands[arguments[0]]

@@ -57,6 +57,11 @@ def new(
     ):  # fmt: skip
         if value is not None and kind != required_kind:
             raise InputError(f"{option} needs --kind {required_kind}, got --kind {kind}")
+    if bore is None and rod is not None:
+        raise InputError(f"--rod needs --bore, got --rod {rod} without it")
+    for option, value in (("--area-A", area_A), ("--area-B", area_B)):
+        if bore is not None and value is not None:
+            raise InputError(f"{option} must stand in place of --bore, got both: {option} {value} --bore {bore}")
     if bore is not None:
         bore_m = _parse_size(bore, "m", "mm", "--bore")
         rod_m = _parse_size(rod or "0", "m", "mm", "--rod")

@@ -6,26 +6,18 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sealscope.parameters.actuator import Cylinder as Cylinder
-    from sealscope.parameters.actuator import Friction as Friction
-    from sealscope.parameters.drive import Fluid as Fluid
-    from sealscope.parameters.drive import Motor as Motor
-    from sealscope.parameters.drive import Pump as Pump
     from sealscope.parameters.instruments import Daq as Daq
     from sealscope.parameters.instruments import PressureTransducer as PressureTransducer
     from sealscope.parameters.load import load_rig as load_rig
     from sealscope.parameters.load import rig_names as rig_names
-    from sealscope.parameters.names import parse_override as parse_override
     from sealscope.parameters.names import parse_overrides as parse_overrides
     from sealscope.parameters.rig import Rig as Rig
     from sealscope.parameters.rig import declared_names as declared_names
 
 _NAMES = {
-    "actuator": ("Cylinder", "Friction"),
-    "drive": ("Fluid", "Motor", "Pump"),
     "instruments": ("Daq", "PressureTransducer"),
     "load": ("load_rig", "rig_names"),
-    "names": ("parse_override", "parse_overrides"),
+    "names": ("parse_overrides",),
     "rig": ("Rig", "declared_names"),
 }
 

@@ -284,7 +284,8 @@ def draw(
     peaks are preserved. Around the onset, or around the middle of the recording if there is no onset, all samples are
     drawn. `chambers`: wavelet details with the times of their RMS windows; `marks`: moments to mark besides the onset.
     """
-    middle = float(recording.t[len(recording) // 2])
+    t, _ = ordered_time(recording.t, recording.rate)  # the time axis of the charts
+    middle = float(t[t.size // 2])
     near = diagnosis.onset_s if diagnosis.onset_s is not None and isfinite(diagnosis.onset_s) else middle
     base = choose_drawn_times(recording.t, recording.rate, POINTS, near=near, near_samples=NEAR_SAMPLES)
     still_base = choose_drawn_times(recording.t, recording.rate, STILL_POINTS)
@@ -309,7 +310,7 @@ def draw(
         series = [{"label": line.label, "style": line.style, **encode_values(values)} for line, values in pairs]
         entries = {name: getattr(chart, name) for name in ("key", "title", "unit", "height", "band", "limits", "level")}
         encoded_charts.append({**entries, "axis": chart.base, "series": series})
-        still[chart.key] = render_still(chart, still_t, still_values, span, moments)
+        still[chart.key] = _render_still(chart, still_t, still_values, span, moments)
     data = {
         "span": span,
         "axes": {name: encode_times(t) for name, t in axes.items() if any(chart.base == name for chart in charts)},
@@ -317,7 +318,6 @@ def draw(
         "marks": [{"t": mark.t, "label": mark.label, "known": mark.known} for mark in marks],
         "charts": encoded_charts,
     }
-    t, _ = ordered_time(recording.t, recording.rate)
     fine = (float(t[base.fine.start]), float(t[base.fine.stop - 1]))
     return DrawnCharts(data, still, base, span, fine)
 
@@ -341,15 +341,14 @@ def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float 
     return float(onset), (low, high)
 
 
-def render_still(
-    chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment] = ()
+def _render_still(
+    chart: Chart, t: Array, lines: list[Array], span: tuple[float, float], moments: Sequence[Moment]
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    `lines`: for each of `chart.lines`, the values (n,) at the times `t` (n,) [s], in place of those in `chart`; `span`
-    [s]: ends of the time axis; `moments`: moments and intervals to be marked.
+    `lines`: for each of `chart.lines`, the values (n,) at the times `t` (n,) [s], in place of those in `chart`, within
+    +-`_MAX_DRAWN`; `span` [s]: ends of the time axis; `moments`: moments and intervals to be marked.
     """
-    lines = [_clip_values(line) for line in lines]
     all_values = np.concatenate(lines)
     finite = all_values[np.isfinite(all_values)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)

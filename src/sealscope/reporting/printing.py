@@ -23,18 +23,17 @@ BROWSERS, _PLACES, _OPTIONS = (tuple(_TABLE[name]) for name in ("names", "places
 _BROWSER_TIMEOUT = 120.0
 
 
-def print_page(page: str, path: str | os.PathLike[str]) -> str:
-    """Write a page (HTML) as a PDF, atomically, and return the name of the program that printed it.
+def print_page(page: str, path: str | os.PathLike[str]) -> None:
+    """Write a page (HTML) as a PDF, atomically, by a browser or, if none is installed, by WeasyPrint.
 
-    This is a browser or, if none is installed, WeasyPrint. Raises MissingExtra if neither is installed, and InputError
-    if printing fails.
+    Raises MissingExtra if neither is installed, and InputError if printing fails.
     """
     browser = _find_browser()
     with atomic_write(path) as temporary:
         if browser is not None:
             options = ["--no-pdf-header-footer", f"--print-to-pdf={temporary}"]
             _write_by_browser(browser, page, temporary, options, "PDF", _is_complete_pdf)
-            return Path(browser).name
+            return
         try:
             from weasyprint import HTML
         except (ImportError, OSError) as error:  # OSError: the C libraries of WeasyPrint are not installed
@@ -45,11 +44,10 @@ def print_page(page: str, path: str | os.PathLike[str]) -> str:
         HTML(string=_inline_styles(page)).write_pdf(temporary)  # runs no scripts: the page shows its still charts
         if not _is_complete_pdf(temporary.read_bytes()):
             raise InputError(f"a PDF must be complete, got one without its end: is the disk full? ({path})")
-        return "WeasyPrint"
 
 
-def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) -> str:
-    """Write a page (HTML) as a PNG of `width` x `height` pixels, atomically, and return the browser's name.
+def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) -> None:
+    """Write a page (HTML) as a PNG of `width` x `height` pixels, atomically, by a browser.
 
     Raises MissingExtra if no browser is installed, and InputError if drawing fails.
     """
@@ -66,7 +64,6 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
             picture.replace(temporary)
         finally:
             picture.unlink(missing_ok=True)
-        return Path(browser).name
 
 
 def _inline_styles(page: str) -> str:
@@ -127,8 +124,10 @@ def _write_by_browser(
             command.append("--no-sandbox")  # the sandbox does not start for the user root
         try:
             result = subprocess.run([*command, source.as_uri()], capture_output=True, check=False, **run_options)
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise InputError(f"a browser must end within {_BROWSER_TIMEOUT:g} s, got: {error} ({browser})") from None
+        except OSError as error:
+            raise InputError(f"a browser must be a program that starts, got: {error.strerror} ({browser})") from None
+        except subprocess.TimeoutExpired:
+            raise InputError(f"a browser must end within {_BROWSER_TIMEOUT:g} s, got no end ({browser})") from None
     data = target.read_bytes() if target.is_file() else b""
     if not is_complete(data):
         # the last line of the messages, as a list of one line

@@ -136,12 +136,12 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it.
 
-    `limit`: in the unit of the trend; `reach` [days]: time from the last recording until then (`Wear.reach`). There is
-    no date if the limit is reached already, the date is too far away (`history.furthest` of the priors), or the
-    recordings are too few. Without an alarm only the earliest date is stated (95 % confidence).
+    `limit`: in the unit of the trend; `reach` [days]: time from the last compared recording until then (`Wear.reach`).
+    There is no date if the limit is reached already, the date is too far away (`history.furthest` of the priors), or
+    the recordings are too few. Without an alarm only the earliest date is stated (95 % confidence).
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
-    first, last = trend.points[0].day, trend.points[-1].day
+    first, last = (trend.points[row].day for row in (trend.rows[0], trend.rows[-1]))
     max_days = TREND.history.furthest
     expected, earliest, latest = (moment(trend, last + days) if days <= max_days else "later" for days in reach)
     if reach.value == 0.0:
@@ -150,7 +150,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
         return f"{limit_text}, reached {expected} ({earliest} to {latest}) at this rate"
     if reach.low > max_days:
         return f"{limit_text}, not within {max_days / DAYS_PER_YEAR:.0f} years"
-    # no date is stated that is nearer than the mean interval between recordings
+    # no date is stated that is nearer than the mean interval between compared recordings
     if reach.low * max(len(trend.rows) - 1, 1) < last - first or math.isnan(reach.value):
         return f"{limit_text}; the recordings are too few to say when"
     return f"{limit_text}, not before {earliest} (95 %)"
