@@ -42,8 +42,7 @@ class HealthyNull:
 
     def chance(self, observable: Observable) -> float:
         """Compute the p-value of an observable, corrected by those of healthy recordings as in `calibrate`."""
-        weights, inflations = self._inflation(null_key(observable))
-        return min(float(weights @ np.exp(-observable.surprisal / inflations)), 1.0)
+        return self.calibrate(null_key(observable), observable.chance)
 
     def calibrate(self, key: str, chance: float) -> float:
         """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings.

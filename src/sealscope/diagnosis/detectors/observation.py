@@ -28,7 +28,6 @@ from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
-from sealscope.recordings.channels import flow_source
 from sealscope.recordings.motion import describe_hold
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -142,8 +141,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
 
     These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance, once for each
-    assumption on the valves at rest that the recording allows. The pressure response is tested, too, if there is no
-    balance, or no channel from which the flow to the cylinder can be computed (`flow_source`).
+    assumption on the valves at rest that the recording allows. Without a balance the pressure response is tested.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -157,7 +155,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     for is_shut, report in reports.items():
         prefix = SHUT if is_shut else ""
         surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
-    if (not reports or flow_source(recording.channels) is None) and PRESSURE_RESPONSE in detectors():
+    if not reports:
         surprisals |= _max_surprisals(run_detector(PRESSURE_RESPONSE, recording, (), rig))
     return surprisals
 
