@@ -3,7 +3,7 @@
 import os
 
 from sealscope.campaigns.cases.case import list_cases
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import run_case
 
 
 def die_on_one(plan, case, folder=None):

@@ -12,8 +12,7 @@ from scipy import stats
 
 from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.machines import experiment_with_flow_leak, size_leaks_on_short_run
-from sealscope.campaigns.cases.scoring import judge_record
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import judge_record, run_case
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.batches import make_step_chooser
@@ -213,6 +212,7 @@ def test_a_leak_that_asks_for_a_shorter_step_gets_it(plan_with):
         ({"detectors": ["diagnose"]}, "'diagnose'"),
         ({"keep_recordings": True}, "keep_recordings, true"),
         ({"records": [{"fault": "sensor p_A offset 2 psi", "count": 1}]}, "fault, sensor p_A offset"),
+        ({"records": [{"leak": "0.01 L/min", "fault": "oil +20 K", "count": 1}]}, "leak, oil"),
         ({"set": {"sensors.p_A.drop_rate": 0.1}}, "sensors.p_A.drop_rate, 0.1"),
         ({"set": {"motor.integrator": "euler"}}, "motor.integrator, euler"),
         ({"factors": {"daq.sample_rate": ["500 Hz", "250 Hz"]}}, "sampling rate, 500 Hz, 250 Hz"),

@@ -8,7 +8,7 @@ import pytest
 
 from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.machines import case_experiment
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import run_case
 from sealscope.campaigns.execution.run import run
 from sealscope.campaigns.execution.store import read_progress
 from sealscope.campaigns.plans.duty import check_controllers

@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.campaigns.cases.case import list_cases, profile_key
 from sealscope.campaigns.cases.machines import SIZING_SECONDS, case_experiment
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import run_case
 from sealscope.campaigns.plans.duty import parse_plan_fault, parse_throttle_values
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.simulation.bench import profile

@@ -116,6 +116,7 @@ def test_a_file_that_cannot_be_judged_is_a_row_with_its_error(folder):
         ("end = 11", "end = 11\nsize = 1.0", "calibrate, 0"),
         ('rate = "500 Hz"', "map = 3", "recordings.map"),
         ("size = 0.3", "colour = 1", "colour"),
+        (PLAN[PLAN.index("[[recordings.sets]]") :], "", "recordings.sets"),
         ('files = "leaky-*.csv"', 'files = ""', "recordings.sets[3].files"),
         ('name = "mine"', 'name = "mine"\nplace = "here"', "campaign.place"),
         ('name = "mine"', 'name = "mine"\nrate = "1 kHz"', "campaign.rate"),

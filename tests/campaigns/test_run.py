@@ -15,7 +15,7 @@ import pytest
 
 from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import run_case
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution import store
 from sealscope.campaigns.plans.reader import load_plan
@@ -204,7 +204,7 @@ def test_a_fault_of_the_program_is_told_in_the_row(tiny, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError("by nought")
 
-    monkeypatch.setattr("sealscope.campaigns.cases.work.case_experiment", broken)
+    monkeypatch.setattr("sealscope.campaigns.cases.scoring.case_experiment", broken)
     assert run_case(plan, case).error == "ZeroDivisionError: by nought"
 
 
@@ -214,7 +214,7 @@ def test_the_code_key_covers_every_source_that_a_case_runs(tiny):
     code = (
         "import sys; from sealscope.campaigns.plans.reader import load_plan\n"
         "from sealscope.campaigns.cases.case import list_cases, iter_sources\n"
-        "from sealscope.campaigns.cases.work import run_case\n"
+        "from sealscope.campaigns.cases.scoring import run_case\n"
         "from sealscope.campaigns.execution.batches import iter_batch_rows\n"
         "plan = load_plan(sys.argv[1]); cases = list_cases(plan)[-1:]\n"
         "assert run_case(plan, cases[0]).error is None and next(iter_batch_rows(plan, cases, 1)).error is None\n"

@@ -44,7 +44,7 @@ def test_a_root_may_be_an_end():
     assert find_root(lambda x: x - 1.0, 0.0, 1.0) == 1.0
 
 
-@pytest.mark.parametrize("function", [lambda x: 1.0, lambda x: float("nan")])
+@pytest.mark.parametrize("function", [lambda x: 1.0, lambda x: float("nan"), lambda x: 1e-200 * (1.0 + x)])
 def test_without_a_change_of_sign_there_is_no_root(function):
     with pytest.raises(ValueError, match="change its sign"):
         find_root(function, 0.0, 1.0)

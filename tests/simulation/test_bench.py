@@ -239,6 +239,8 @@ def test_a_profile_of_one_s_own(tmp_path):
         ('parameters = ["K_oil"]', "parameters = []", "nuisance[1].parameters"),
         ('why = "measured"', "", "nuisance[1].why"),
         ("size = [1, 2]", "size = [-1, 2]", "size"),
+        ("size = [1, 2]", "size = [1, 100]", "oil, size, 1 % to 100 %"),
+        ('size = [1, 2], unit = "%"', 'size = [1, 120], unit = "%", oil = 1', "oil, size, 120 %"),
         ('unit = "%" }', 'unit = "%", oil = 2 }', "drift.oil, 2, 1"),
         ('unit = "%" }', 'unit = "%", shapes = ["zigzag"] }', "'linear', 'wander', 'zigzag'"),
         ('unit = "%" }', 'unit = "%", shapes = ["linear"], oil = 1 }', "shapes, oil"),

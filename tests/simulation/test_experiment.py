@@ -13,7 +13,13 @@ from sealscope.simulation.commands import Sine, polyline_from_table, sampled_sig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run
 from sealscope.simulation.leaks import Leak
-from sealscope.simulation.simulate import prove, simulate, simulate_experiment, simulate_with_truth
+from sealscope.simulation.simulate import (
+    compare_trajectories,
+    prove,
+    simulate,
+    simulate_experiment,
+    simulate_with_truth,
+)
 
 from ..refusals import refusal
 
@@ -122,6 +128,17 @@ def test_the_default_step_proves_itself(values):
     pressures = [one for one in proof.differences if one.unit == "Pa" and not one.name.startswith("RMS")]
     # it is the error of the step, and the error of half the step is a small part of it
     assert all(0 < one.difference < 15.0 for one in pressures)
+
+
+def test_a_proof_asks_for_the_error_that_is_stated():
+    experiment = Experiment.of(command="5 sin(2t)", duration=4.0, set={"sample_rate": "250[Hz]"})
+    run = integrate_run(experiment, ())
+    fine = integrate_run(experiment, (), step=run.step / 2)
+    moved = max(row.difference for row in compare_trajectories(experiment, run, fine) if row.name.startswith("p_"))
+    for error, resolved in ((None, True), (1.1 * moved, True), (0.9 * moved, False)):
+        differences = compare_trajectories(replace(experiment, error=error), run, fine)
+        assert all(row.resolved for row in differences) == resolved, error
+    assert 50.0 < moved < 100.0  # the default error
 
 
 def test_an_under_resolved_run_is_refused_and_says_what_moved():

@@ -81,6 +81,11 @@ def test_warming_oil_warms(unmodelled):
             'parameters = ["cylinder.volumes"]\nvalues = ["moving"]\n',
             "values, fixed, position, 'moving'",
         ),
+        (  # with oil that may cool, a drift along it may fall
+            '[[family]]\nname = "a"\nwhy = "b"\n[[family.nuisance]]\nname = "c"\nwhy = "d"\nparameters = ["G_pump"]\n'
+            'scale = [1, 2]\ndrift = { size = [100, 230], unit = "%", oil = 1 }\n',
+            "family[1], c, size, warms, 100 % to 230 %",
+        ),
     ],
 )
 def test_a_family_that_breaks_a_rule_is_one_line(tmp_path, text, words):

@@ -27,7 +27,7 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
     """
     # a: newest point; b: the root is between a and b; c: point that was dropped last
     a, b, f_a, f_b = high, low, function(high), function(low)
-    if not f_a * f_b <= 0.0:
+    if not (f_a <= 0.0 <= f_b or f_b <= 0.0 <= f_a):
         raise ValueError(f"the function must change its sign between {low!r} and {high!r}")
     if f_a == 0.0 or f_b == 0.0:
         return high if f_a == 0.0 else low

@@ -120,9 +120,10 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
         max_parts = np.maximum(1, (stops - starts) // max(1, round(effect.min_block * rate)))
         needed_parts = np.ceil(change / effect.max_change - 1e-9)  # 1e-9: rounding adds no part
         n_parts = np.maximum(n_parts, np.minimum(needed_parts, max_parts))
-    blocks = zip(starts, stops, n_parts, strict=True)
-    parts = [np.linspace(start, stop, int(n), endpoint=False) for start, stop, n in blocks]
-    return np.unique(np.rint(np.concatenate([*parts, [n_out]])).astype(np.int64))
+    counts = n_parts.astype(np.int64)
+    part = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)  # number of each part in its block
+    part_starts = np.repeat(starts, counts) + part * np.repeat((stops - starts) / counts, counts)
+    return np.unique(np.rint(np.r_[part_starts, n_out]).astype(np.int64))
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
@@ -142,34 +143,51 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
     return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in distinct_rows)
 
 
+def add_needed_laws(base: RigNumbers, effects: Sequence[Effect]) -> RigNumbers:
+    """Add to the parameters `base` the optional laws that effects need: leaks to the outside, and free air.
+
+    They are compiled in, so that every block of a run has them. A factor needs no law: it leaves a parameter at 0.
+    """
+    options: dict[str, Any] = {}
+    for effect in effects:
+        if effect.additive and effect.field.startswith("G_ext"):
+            options["open_circuit"] = (True,)
+        elif effect.additive and effect.field == "air":
+            options["aerated"] = (True,)
+    return base._replace(**options) if options else base  # the same object: runs that share it are told by its id
+
+
+def build_blocks(
+    effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float
+) -> tuple[np.ndarray, dict[str, Array]]:
+    """Divide a run into blocks of constant parameters; return their bounds, and the values of changing parameters.
+
+    `base`: the parameters without effects. The blocks are those of `block_bounds`, merged where neighbours have equal
+    parameters: the bounds (n + 1,) of n blocks are indices of the `n_out` outputs at `rate` [Hz]. The values (n,), by
+    parameter, are those of the blocks' middles.
+    """
+    bounds = block_bounds(effects, n_out, rate)
+    values = changing_values(effects, base, np.asarray(0.5 * (bounds[:-1] + bounds[1:]) / rate, dtype=np.float64))
+    if not values:
+        return bounds, values
+    table = np.array(list(values.values()))  # (parameters, blocks)
+    # for each block: do its parameters differ from those of the block before it? True for the first block
+    differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
+    return np.r_[bounds[:-1][differs], n_out], {name: series[differs] for name, series in values.items()}
+
+
 class Schedule:
-    """The model's parameters over a run of `n_out` solver outputs at `rate` [Hz], block by block.
+    """The model's parameters over a run of `n_out` solver outputs at `rate` [Hz], block by block (`build_blocks`).
 
     `base`: the parameters without effects; `bounds` (n + 1,): bounds of the n blocks as output indices; `numbers`: the
-    parameters in each block. The blocks are those of `block_bounds`, merged where neighbours have equal parameters.
-    Within a block a parameter has the value of the block's middle.
+    parameters in each block.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
-        self.bounds = block_bounds(effects, n_out, rate)
-        self.numbers = [base]
-        if not effects:
-            return
-        middles: Array = np.asarray(0.5 * (self.bounds[:-1] + self.bounds[1:]) / rate, dtype=np.float64)
-        values = changing_values(effects, base, middles)
-        table = np.array(list(values.values()))  # (parameters, blocks)
-        # for each block: do its parameters differ from those of the block before it? True for the first block
-        differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
-        self.bounds = np.r_[self.bounds[:-1][differs], n_out]
-        # optional parts of the model are compiled in, so that every block has the parts that any block needs
-        options: dict[str, Any] = {}
-        if any(name.startswith("G_ext") and np.any(series > 0) for name, series in values.items()):
-            options["open_circuit"] = (True,)
-        if "air" in values and np.any(values["air"] > 0):
-            options["aerated"] = (True,)
-        numbers = base._replace(**options)
-        rows = table[:, differs].T.tolist()
-        self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows]
+        self.bounds, values = build_blocks(effects, base, n_out, rate)
+        numbers = add_needed_laws(base, effects)
+        rows = zip(*(series.tolist() for series in values.values()), strict=True)
+        self.numbers = [numbers._replace(**dict(zip(values, row, strict=True))) for row in rows] or [numbers]
 
     def blocks_between(self, first: int, last: int) -> Iterator[tuple[int, int, RigNumbers]]:
         """Yield (start, stop, parameters) for each span of outputs in first <= k < last with constant parameters."""

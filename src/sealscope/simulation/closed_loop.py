@@ -38,7 +38,8 @@ class Feedback:
     """A controller in feedback with the rig over a run of `duration` [s], which the solver calls through its `loop`.
 
     The controller measures position and angle in whole counts of the rig's encoders, and pressures with the
-    transducers' noise. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate`
+    transducers' noise. Other errors of the sensors, also those by faults and drifts, change the recording but not the
+    control. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate`
     [Hz]: rate of the solver's outputs; `seed`: seed of the noise.
     """
 

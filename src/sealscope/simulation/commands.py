@@ -48,6 +48,10 @@ class Sine:
         return f"{format_number(self.amplitude)} sin({format_number(self.omega)}t{phase}){offset}"
 
 
+#: Command of an experiment or plan that states none, one of the thesis's.
+DEFAULT_COMMAND = Sine(amplitude=3.0, omega=4.0)
+
+
 def _format_addend(value: float) -> str:
     """Format a number that follows another one in a sum, such as " + 2" or " - 0.5"; return "" for 0."""
     return f" {'-' if value < 0 else '+'} {format_number(abs(value))}" if value else ""

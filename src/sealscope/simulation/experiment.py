@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 import numpy as np
@@ -16,7 +16,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.arguments import Arguments, Method
 from sealscope.simulation.changes import Effect, ParameterDrift, Readings
-from sealscope.simulation.commands import Command, Sine, check_command
+from sealscope.simulation.commands import DEFAULT_COMMAND, Command, Sine, check_command
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import Leak, Thinned, parse_leak
 from sealscope.simulation.targets_and_loads import Force, Position, command_or_target, parse_force
@@ -122,7 +122,7 @@ class Experiment:
     """
 
     rig: Rig
-    command: Command | Position = field(default_factory=lambda: Sine(3.0, 4.0))
+    command: Command | Position = DEFAULT_COMMAND
     duration: float = 180.0
     leaks: tuple[Leak, ...] = ()
     seed: int = 0

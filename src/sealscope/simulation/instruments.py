@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
+from sealscope.physics.solvers.loop import quantize
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes import Readings
@@ -163,11 +164,6 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
     return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * cycles))
 
 
-def _quantize(values: Array, resolution: float) -> Array:
-    """Round values down to multiples of an encoder's resolution; 0 leaves them unchanged."""
-    return values if resolution == 0 else np.floor(values / resolution) * resolution
-
-
 def record(
     rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
 ) -> Recording:
@@ -207,7 +203,7 @@ def record(
         return sample_with_jitter(lambda signal: decimate(signal, factor, n, delay), values, jitter_steps)
 
     angle_resolution = 2.0 * np.pi / sensors.theta.counts
-    theta = _quantize(read_instantly(trajectory["theta"]), angle_resolution)
+    theta = quantize(read_instantly(trajectory["theta"]), angle_resolution)
     x_parameter = parameters_of("x")
     scale = 1.0 + x_parameter("scale_error", sensors.x.scale_error)
     x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)
@@ -218,7 +214,7 @@ def record(
         "u": u,
         "omega": np.diff(theta, prepend=theta[:1]) * rate,
         "theta": theta,
-        "x": _quantize(x, sensors.x.resolution),
+        "x": quantize(x, sensors.x.resolution),
     }
     for name in PRESSURES:
         sensor = getattr(sensors, name)

@@ -18,7 +18,7 @@ from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.arguments import Arguments
 from sealscope.simulation.changes import ParameterDrift
-from sealscope.simulation.experiment import PRESSURE_TOLERANCE, Experiment
+from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import (
@@ -252,7 +252,7 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
     Returns the differences of
 
     - speed, angle, position and velocity, by their rms difference, without a tolerance;
-    - the four pressures, by their rms difference, which is to be at most `PRESSURE_TOLERANCE`;
+    - the four pressures, by their rms difference, which is to be at most the experiment's `error_allowed`;
     - the wavelet details d1 to d4 of p_A and p_B, by the change of their RMS, which includes the sensors' noise and is
       to be at most `DETAIL_TOLERANCE` times the RMS.
     """
@@ -264,7 +264,7 @@ def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Traje
     differences = []
     for name, unit in units.items():
         difference = rms(coarse[name][: n * factor] - fine[name][: n * factor])
-        differences.append(Difference(name, difference, unit, PRESSURE_TOLERANCE if unit == "Pa" else None))
+        differences.append(Difference(name, difference, unit, experiment.error_allowed if unit == "Pa" else None))
     for name in CHAMBERS:
         noise_variance = getattr(experiment.rig.sensors, name).noise ** 2 + experiment.rig.sensors.common_noise**2
         coarse_details, fine_details = (details(decimate(run[name], factor, n)) for run in (coarse, fine))

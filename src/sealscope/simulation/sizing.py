@@ -73,6 +73,8 @@ def size_leaks(
     coefficients: Array,
     measure: Callable[[Array], tuple[Array, T]],
     progress: Callable[[str, float], None] | None = None,
+    *,
+    independent: bool = False,
 ) -> tuple[Array, T]:
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
@@ -80,7 +82,8 @@ def size_leaks(
     values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig; it returns
     the mean flow [m^3/s] of each leak per unit of its coefficient (n,), and the run, of any type. For a coefficient of
     0 the flow is that of a leak of coefficient 1 under the pressures of this run. Returns the coefficients found, and
-    the run with them. `progress` is called with the name of the task and its completed fraction.
+    the run with them. `progress` is called with the name of the task and its completed fraction. `independent`: True if
+    each leak is in a run of its own, so that it keeps its coefficient once its error is at most `TOLERANCE`.
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less (`next_coefficient`). The search ends at a relative error of `TOLERANCE`, or after `MAX_RUNS`
@@ -96,7 +99,8 @@ def size_leaks(
             progress("sizing the leak", 1.0 - 0.5**attempt)  # the number of attempts is not known beforehand
         unit_flows, run = measure(coefficients)
         flows = unit_flows * coefficients
-        error = float(np.abs(flows[indices] / means[indices] - 1.0).max(initial=0.0))
+        errors = np.abs(flows[indices] / means[indices] - 1.0)
+        error = float(errors.max(initial=0.0))
         if error < best_error:
             best, best_error = (coefficients, run), error
         if best and (error <= TOLERANCE or attempt == MAX_RUNS - 1):
@@ -104,7 +108,7 @@ def size_leaks(
                 progress("sizing the leak", 1.0)
             return best
         next_coefficients = coefficients.copy()
-        for k in indices:
+        for k in indices[errors > TOLERANCE] if independent else indices:
             previous = previous_coefficients[k], previous_flows[k]
             latest_flow = flows[k] if coefficients[k] > 0.0 else unit_flows[k]  # else the flow of a coefficient of 1
             next_coefficients[k] = next_coefficient(means[k], previous, latest=(coefficients[k], latest_flow))

@@ -13,13 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.plans.duty import CONTROLLER
+from sealscope.campaigns.plans.duty import CONTROLLER, FAMILY
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
 from sealscope.control.registry import find_controller_source
 from sealscope.simulation.bench.profile import load_profile
 
-#: The factor whose levels are families of the plan's profile.
-FAMILY = "family"
 #: Parameters of a rig that only verdicts use; no simulated record depends on them.
 _PRIORS = frozenset({"pump.G_healthy"})
 _PACKAGE = Path(__file__).resolve().parents[2]

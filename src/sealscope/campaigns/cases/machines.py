@@ -5,14 +5,22 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-from sealscope.campaigns.cases.case import FAMILY, CampaignCase
-from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, LOAD, parse_plan_fault, parse_throttle_values
+from sealscope.campaigns.cases.case import CampaignCase
+from sealscope.campaigns.plans.duty import (
+    CLOSED,
+    COMMAND,
+    CONTROLLER,
+    FAMILY,
+    LOAD,
+    parse_plan_fault,
+    parse_throttle_values,
+)
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.parameters import declared_names
 from sealscope.parameters.names import resolve_name
 from sealscope.simulation.bench.machines import BenchMachine, draw
 from sealscope.simulation.bench.profile import Profile
-from sealscope.simulation.commands import Sine
+from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import solve_leak_coefficients
 from sealscope.simulation.leaks import Leak, opening_from
@@ -21,8 +29,6 @@ from sealscope.units import LITRE_PER_MINUTE
 
 #: Length [s] of the run in which a leak's coefficient is found: over two periods of the thesis's slowest command.
 SIZING_SECONDS = 13.0
-#: Command of a plan without profile and without commands, as in the thesis [V]: 3 sin(4 t).
-USUAL = Sine(3.0, 4.0)
 
 
 def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
@@ -51,7 +57,14 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
         )
     else:
         machine = BenchMachine(
-            "none", case.machine_seed, plan.rig, plan.duration_s, overrides={}, drifts=(), command=USUAL, closed=0.0
+            profile="none",
+            seed=case.machine_seed,
+            rig=plan.rig,
+            duration=plan.duration_s,
+            overrides={},
+            drifts=(),
+            command=DEFAULT_COMMAND,
+            closed=0.0,
         )
     values = dict(machine.overrides)
     for name, level in case.levels.items():
@@ -61,7 +74,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: 
             machine = replace(machine, controller=str(level))
         elif name == LOAD:
             machine = replace(machine, load=parse_force(str(level)))
-        elif name == "closed":
+        elif name == CLOSED:
             # closed throttles: `line.orifices` of the drawn machine must not remain, so it is set for a level of 0, too
             values |= {"line.orifices": str(plan.rig["line.orifices"])} | parse_throttle_values(level)
         elif name != FAMILY:

@@ -1,11 +1,16 @@
-"""Run the detectors of a plan on one record, and collect their scores and statements."""
+"""Simulate a record of a plan, run the plan's detectors on it, and collect their scores and statements."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
-from sealscope.campaigns.cases.row import Scores, Statement, ranking_score
+from sealscope.campaigns.cases.case import CampaignCase
+from sealscope.campaigns.cases.machines import case_experiment
+from sealscope.campaigns.cases.row import CaseRow, Scores, Statement, error_text, ranking_score
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.scorers import SplitRms
@@ -16,9 +21,30 @@ from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
+from sealscope.simulation.simulate import simulate_experiment
 
 #: Channels whose defects can invalidate a verdict; the recording is inspected for them first.
 INSPECTED = ("u", "x", "p_A", "p_B")
+
+
+def run_case(plan: SimulatedPlan, case: CampaignCase, folder: Path | None = None) -> CaseRow:
+    """Simulate and judge one case of a campaign, and return the row with its results or any error.
+
+    The recording is written into `folder`, or discarded if `folder` is None.
+    """
+    start_time = time.process_time()
+    try:
+        simulated = simulate_experiment(case_experiment(plan, case))
+        if folder is not None:
+            from sealscope.recordings import write
+
+            write(simulated.recording, folder / f"{case.id}.nc")
+        scores, statements = judge_record(simulated.recording, plan.onset_s, plan, plan.assumed)
+        flow = simulated.truth.mean_leak_lpm if case.leak_lpm else 0.0
+        row = CaseRow.from_case(case, flow_lpm=flow, scores=scores, statements=statements)
+    except Exception as error:  # a program defect in one case must not end the campaign; its row carries the error
+        row = CaseRow.from_case(case, error=error_text(error))
+    return replace(row, seconds=round(time.process_time() - start_time, 4))
 
 
 def judge_record(

@@ -56,7 +56,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     - No recordings are kept, and both sides of the onset have usable samples.
     - Each leak has a single law, and no sensor has a fault.
     - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`). This is
-      tested on the first case of each combination of levels, unless its experiment cannot be built.
+      tested on the first case of each combination of levels, leak and fault, unless its experiment cannot be built.
     """
 
     def refusal(rule: str) -> InputError:
@@ -79,7 +79,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
-    first_cases = {repr(case.levels): case for case in reversed(cases)}  # first of equal levels
+    # first of equal levels, leak and fault
+    first_cases = {repr((case.levels, case.leak_lpm, case.fault)): case for case in reversed(cases)}
     for case in first_cases.values():
         try:
             experiment = experiment_with_flow_leak(plan, case)
@@ -97,8 +98,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
     """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
-    The other cases of the batch can change a row a little; `simulate_batch` states how. `threads`: number of threads of
-    the simulation.
+    A row does not depend on the other cases, except as `simulate_batch` states of leakage coefficients that converge
+    badly. `threads`: number of threads of the simulation.
     """
     profile = load_profile(plan.profile) if plan.profile else None
     choose_step = make_step_chooser(plan, profile)

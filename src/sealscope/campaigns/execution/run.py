@@ -10,7 +10,7 @@ from pathlib import Path
 from sealscope.campaigns.cases.case import interleave_cases, list_cases
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.cases.work import run_case
+from sealscope.campaigns.cases.scoring import run_case
 from sealscope.campaigns.execution import batches, store
 from sealscope.campaigns.execution.workers import iter_results, iter_rows, process_count
 from sealscope.campaigns.plans.duty import check_controllers

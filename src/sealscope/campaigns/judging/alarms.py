@@ -7,9 +7,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sealscope.campaigns.cases.case import FAMILY
 from sealscope.campaigns.cases.row import expected_cause, matches_cause, named_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, drop_other_faults, group_by
+from sealscope.campaigns.plans.duty import FAMILY
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
 

@@ -17,7 +17,8 @@ from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
 from sealscope.units import parse_quantity
 
-COMMAND, CONTROLLER, LOAD = "command", "controller", "load"
+#: Names of the factors that are no parameters of the rig.
+CLOSED, COMMAND, CONTROLLER, FAMILY, LOAD = "closed", "command", "controller", "family", "load"
 #: Rate [Hz] at which a target is sampled to check that the piston can reach it.
 _TARGET_CHECK_RATE = 50.0
 

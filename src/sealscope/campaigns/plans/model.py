@@ -124,23 +124,11 @@ class RecordGroup(_TomlTable):
 
 @dataclass(frozen=True, kw_only=True)
 class _Plan(_TomlTable):
-    """The entries that plans of all types have.
-
-    `name`: name of the plan and of its files; `title`: by default the name; `confidence`: confidence level of
-    all intervals, such as 0.95; `note`: remark of the author; `place`: path of the plan's file.
-    """
-
-    name: FileName
-    title: Text = ""
-    confidence: Fraction = 0.95
-    note: Text = ""
-    place: str = ""
-
-
-@dataclass(frozen=True, kw_only=True)
-class _JudgedPlan(_Plan):
     """The fields that plans of simulated records and plans of recordings have in common.
 
+    - `name`: name of the plan and of its files; `title`: by default the name; `note`: remark of the author
+    - `confidence`: confidence level of all intervals, such as 0.95
+    - `place`: path of the plan's file
     - `false_alarm`: wanted false-alarm probability of each detector
     - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
       they keep it with the probability `confidence` (`quantile_threshold`)
@@ -152,6 +140,11 @@ class _JudgedPlan(_Plan):
     - `assume_set`: values that replace some parameters of this rig
     """
 
+    name: FileName
+    title: Text = ""
+    confidence: Fraction = 0.95
+    note: Text = ""
+    place: str = ""
     false_alarm: Fraction = 0.01
     promise: Promise = "average"
     detectors: Names
@@ -173,7 +166,7 @@ class _JudgedPlan(_Plan):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SimulatedPlan(_JudgedPlan):
+class SimulatedPlan(_Plan):
     """The plan of a simulated campaign.
 
     - `rig_name`, `rig_set`: name or file of the rig, and values that replace some of its parameters
@@ -245,7 +238,7 @@ class RecordingSet(_TomlTable):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RecordedPlan(_JudgedPlan):
+class RecordedPlan(_Plan):
     """The plan of a campaign over recordings of real machines, which are files in a folder.
 
     `channel_map`: by channel, the name of its column; `rate_hz` [Hz]: sampling rate of files without times.

@@ -8,12 +8,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from sealscope.campaigns.plans.detectors import DIAGNOSE, WATCH, check_detector, parse_detector_name
 from sealscope.campaigns.plans.duty import (
+    CLOSED,
     COMMAND,
     CONTROLLER,
+    FAMILY,
     LOAD,
     check_duty,
     parse_plan_fault,
@@ -25,11 +27,11 @@ from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import records_needed
 from sealscope.parameters import load_rig
 from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.targets_and_loads import parse_position
 from sealscope.storage.opening import is_file_path
 from sealscope.storage.toml_file import read_model, read_toml
 
-_T = TypeVar("_T")
 _PACKAGED = Path(__file__).parent / "packaged"
 #: Limits of records and of combinations of levels, so that a mistyped count does not plan a year of computing.
 MAX_RECORDS, MAX_CELLS = 1_000_000, 100_000
@@ -100,7 +102,8 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
             table_names = ", ".join(f"[{name}]" for name in tables)
             raise InputError(f"[{key}] is not known; a plan with [{source}] has {table_names} ({place})")
     entries = {**tree, "place": place}
-    full_names = {name: name for name in tables}  # names in messages, by entry
+    # names in messages, by entry
+    full_names = {name: name for name in tables} | {entry: f"{source}.{entry}" for entry in source_entries}
     merged_tables = ("campaign", source) if source_entries else ("campaign",)  # [[records]] stays as it is
     for table in merged_tables:
         values = entries.pop(table, {})
@@ -112,14 +115,14 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
                 raise InputError(f"{table}.{entry} is not known ({place})")
             full_names[entry] = f"{table}.{entry}"
         entries |= values
-    # an entry without a full name is missing, and is reported as one of [campaign]
+    # an entry without a full name is one of [campaign] that is missing
     return read_model(entries, plan_class, place, lambda entry: full_names.get(entry, f"campaign.{entry}"))
 
 
-def _check_entry(entry: str, place: str, function: Callable[[], _T]) -> _T:
-    """Return the result of `function`; to its InputError, add the plan's `entry`, such as "campaign.rig", and file."""
+def _check_entry(entry: str, place: str, check: Callable[[], object]) -> None:
+    """Call `check`; to its InputError, add the plan's `entry`, such as "campaign.rig", and file."""
     try:
-        return function()
+        check()
     except InputError as error:
         raise InputError(f"{entry}: {error} ({place})") from None
 
@@ -173,25 +176,25 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     """List the commands of a plan's records: the levels of the factor `command`, or else the profile's commands.
 
     With a factor `family`, only the commands of the families that it lists count. Without factor `command` and profile,
-    the only command is '3 sin(4t)'.
+    the only command is `DEFAULT_COMMAND`.
     """
     if COMMAND in plan.factors or not plan.profile:
-        return plan.factors.get(COMMAND, ("3 sin(4t)",))
+        return plan.factors.get(COMMAND, (str(DEFAULT_COMMAND),))
     profile = load_profile(plan.profile)
-    profiles = [profile.of_family(str(family)) for family in plan.factors.get("family", ())] or [profile]
+    profiles = [profile.of_family(str(family)) for family in plan.factors.get(FAMILY, ())] or [profile]
     return tuple(command for family_profile in profiles for command in family_profile.duty.commands)
 
 
 def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
     """Check that `level` is a valid value of the factor `name`; raise InputError otherwise."""
-    if name == "family":
+    if name == FAMILY:
         if not plan.profile:
             raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
         load_profile(plan.profile).family(str(level))
     elif name in (COMMAND, CONTROLLER, LOAD):
         check_duty(name, level, plan.rig, plan.duration_s)
-    else:  # a parameter of the rig, or "closed", the closed fraction of its throttles; raises for an invalid value
-        plan.rig.with_overrides(parse_throttle_values(level) if name == "closed" else {name: level})
+    else:  # a parameter of the rig, or the closed fraction of its throttles; raises for an invalid value
+        plan.rig.with_overrides(parse_throttle_values(level) if name == CLOSED else {name: level})
 
 
 def _check_records(plan: SimulatedPlan) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from math import isfinite, isnan
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,9 +44,9 @@ class Loop(NamedTuple):
 
 
 @law
-def quantize(value: float, count: float) -> float:
-    """Round a value down to a multiple of an encoder's step `count`, in the value's unit; 0 leaves it unchanged."""
-    return np.floor(value / count) * count if count > 0.0 else value  # type: ignore[no-any-return]
+def quantize(value: Any, count: float) -> Any:
+    """Round numbers or arrays down to multiples of an encoder's step `count`; 0 leaves them unchanged."""
+    return np.floor(value / count) * count if count > 0.0 else value
 
 
 @law

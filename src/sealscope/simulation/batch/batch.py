@@ -130,13 +130,9 @@ def simulate_batch(
     Runs with the same choices of the rig (such as the friction law), command waveform, load, method, step and error are
     a set, which is integrated together. If its runs state no step, one is chosen for the set, by the error that they
     state or else by `error`. The results of a run do not depend on `threads`. They depend on the other runs of its set
-    only through
-
-    - the step;
-    - the blocks of time in which changing parameters are taken as constant;
-    - the number of iterations in the search for leakage coefficients.
-
-    The noise of a run differs from its noise in `simulate`.
+    only through a step that is chosen, and through the search for leakage coefficients where it converges for some runs
+    only to a per cent: it then ends with the coefficients that suit the set best. The noise of a run differs from its
+    noise in `simulate`.
 
     Parameters
     ----------
@@ -278,5 +274,6 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
             raise InputError(f"a leak with a mean flow must be open within the run (run {members[never_open[0]].row})")
         return unit_flows, None
 
-    sized_coefficients, _ = size_leaks([member.leak for member in members], coefficients, measure_unit_flows)
+    leaks = [member.leak for member in members]
+    sized_coefficients, _ = size_leaks(leaks, coefficients, measure_unit_flows, independent=True)
     return sized_coefficients

@@ -16,7 +16,7 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect, Readings, block_bounds, changing_values, step_limiting_parameters
+from sealscope.simulation.changes import Effect, Readings, add_needed_laws, build_blocks, step_limiting_parameters
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.experiment import Experiment, choose_method, identity_values
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps, volts_per_pascal
@@ -121,13 +121,8 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
         load = None if experiment.load is None else str(identity_values(experiment.load))
         if (id(experiment.rig), load) not in numbers_by_rig:
             numbers_by_rig[id(experiment.rig), load] = loaded_rig_numbers(experiment.rig, experiment.load)
-        numbers = numbers_by_rig[id(experiment.rig), load]
         effects = experiment.effects()
-        # optional parts of the model that these effects need are compiled in
-        if any(effect.field.startswith("G_ext") for effect in effects):
-            numbers = numbers._replace(open_circuit=(True,))
-        if any(effect.field == "air" for effect in effects):
-            numbers = numbers._replace(aerated=(True,))
+        numbers = add_needed_laws(numbers_by_rig[id(experiment.rig), load], effects)
         shape, gain, offset = experiment.voltage_command, 1.0, 0.0
         if isinstance(shape, Sine):  # sines of one frequency and phase share a waveform
             gain, offset, shape = shape.amplitude, shape.offset, replace(shape, amplitude=1.0, offset=0.0)
@@ -178,19 +173,25 @@ class Cells:
     """Model parameters of the runs of a set over time, constant within cells, which are spans of the solver's outputs.
 
     `bounds` (cells + 1,): outputs at which the cells begin, and the end of the last; `base` (runs, parameters): values
-    without changes; `changing`: indices of the parameters that change; `values` (runs, changing, cells): their values.
+    without changes; `blocks`: for each run the bounds (blocks + 1,) of its own blocks (`build_blocks`), and the values
+    (blocks,) of its changing parameters, by index. A cell begins where a block of any run does.
     """
 
     bounds: np.ndarray
     base: Array
-    changing: tuple[int, ...]
-    values: Array
+    blocks: tuple[tuple[np.ndarray, dict[int, Array]], ...]
 
-    def table(self, first: int, last: int, width: int) -> Array:
-        """Build the table (groups, cells, parameters, width) of the parameters in the cells first <= cell < last."""
-        table = np.repeat(self.base[:, None, :], last - first, axis=1)
-        for k, parameter in enumerate(self.changing):
-            table[:, :, parameter] = self.values[:, k, first:last]
+    def table(self, first: int, last: int, groups: tuple[int, int], width: int) -> Array:
+        """Build the table (groups, cells, parameters, width) of the parameters in the cells first <= cell < last.
+
+        The groups of `width` runs are groups[0] <= g < groups[1].
+        """
+        runs = slice(groups[0] * width, groups[1] * width)
+        table = np.repeat(self.base[runs, None, :], last - first, axis=1)
+        for rows, (bounds, values) in zip(table, self.blocks[runs], strict=True):
+            block = np.searchsorted(bounds, self.bounds[first:last], side="right") - 1
+            for parameter, series in values.items():
+                rows[:, parameter] = series[block]
         return pack_lanes(table, width)
 
 
@@ -202,15 +203,11 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
     distinct_numbers = {id(member.numbers): member.numbers for member in members}
     rows = {key: [float(getattr(numbers, name)) for name in NUMBERS] for key, numbers in distinct_numbers.items()}
     base = np.array([rows[id(member.numbers)] for member in members])
-    effects = [effect for member in members for effect in member.effects]
-    bounds = block_bounds(effects, n_out, rate)
-    middles = 0.5 * (bounds[:-1] + bounds[1:]) / rate
-    changing = tuple(sorted({NUMBERS.index(effect.field) for effect in effects}))
-    values = np.repeat(base[:, list(changing), None], middles.size, axis=2)
-    for run, member in enumerate(members):
-        for name, series in changing_values(member.effects, member.numbers, middles).items():
-            values[run, changing.index(NUMBERS.index(name))] = series
-    return Cells(bounds, base, changing, values)
+    blocks = []
+    for member in members:
+        bounds, values = build_blocks(member.effects, member.numbers, n_out, rate)
+        blocks.append((bounds, {NUMBERS.index(name): series for name, series in values.items()}))
+    return Cells(np.unique(np.concatenate([bounds for bounds, _ in blocks])), base, tuple(blocks))
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
@@ -227,8 +224,8 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     """Build the parameters of the instruments of p_A and p_B for the samples first <= sample < last.
 
     Returns an array (runs, 2, INSTRUMENT_ROWS); constants of `batch.signals` (`GAIN` to `MAX_CODE`) index the last
-    axis. Gain, offset and noises may change within a run; they are stored as the value at sample `first` (such as
-    `GAIN`) and the mean change per sample until sample `last` (such as `GAIN_RISE`).
+    axis. Gain, offset, hum and noises may change within a run; they are stored as the value at sample `first`
+    (such as `GAIN`) and the mean change per sample until sample `last` (such as `GAIN_RISE`).
     """
     from sealscope.simulation.batch.signals import HUM, HUM_PHASE
 
@@ -257,13 +254,14 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
             (signals.GAIN, signals.GAIN_RISE, f"sensors.{name}.gain_error", sensor.gain_error, 1.0),
             (signals.OFFSET, signals.OFFSET_RISE, f"sensors.{name}.offset", sensor.offset, 0.0),
             (signals.NOISE, signals.NOISE_RISE, f"sensors.{name}.noise", sensor.noise, 0.0),
+            (signals.HUM, signals.HUM_RISE, f"sensors.{name}.hum", sensor.hum, 0.0),
             (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
             start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
             # `addend`: the gain is 1 plus the gain error
             row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
-        row[signals.HUM], row[signals.HUM_CYCLES] = sensor.hum, sensor.hum_frequency / daq.sample_rate
+        row[signals.HUM_CYCLES] = sensor.hum_frequency / daq.sample_rate
         row[signals.RANGE_MIN], row[signals.RANGE_MAX] = sensor.range_lo, sensor.range_hi
         row[signals.VOLTS_AT_MIN] = daq.sensor_volts_lo
         row[signals.VOLTS_PER_PASCAL] = volts_per_pascal(sensor, daq)
@@ -271,7 +269,7 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
     return rows
 
 
-#: Most steps of a chunk, which bounds the memory of its arrays. Chunks end at cells unless a cell is longer.
+#: Most steps of a chunk, which bounds the memory of its arrays.
 MAX_CHUNK_STEPS = 4096
 
 
@@ -344,7 +342,7 @@ class SetRun:
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
         taps_by_delay = {delay: anti_alias_taps(self.oversampling, delay % 1.0) for delay in np.unique(delays).tolist()}
-        self.taps_after = max(taps.size // 2 for taps in taps_by_delay.values())
+        self.taps_after = FILTER_REACH * self.oversampling
         self.taps_before = self.taps_after + int(delays.max())
         filters = np.zeros((self.n_runs, self.channels, self.taps_before + self.taps_after + 1))
         for run_and_channel, delay in np.ndenumerate(delays):
@@ -395,22 +393,15 @@ class SetRun:
     def _chunks(self) -> list[tuple[int, int, int, int]]:
         """Divide the solver's outputs into chunks of at most `MAX_CHUNK_STEPS` steps, or of a single output.
 
-        A chunk contains whole cells, which are spans with constant parameters, or a part of a longer cell. Returns for
-        each chunk the first cell, the cell after the last, the first output and the output after the last.
+        Returns for each chunk the first cell that it has a part of, the cell after the last, the first output and the
+        output after the last. The chunks do not depend on the cells, and so not on which runs are in the set.
         """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
-        edges = self.cells.bounds
-        n_cells = edges.size - 1
-        chunks = []
-        first = 0
-        while first < n_cells:
-            end = first + 1
-            while end < n_cells and edges[end + 1] - edges[first] <= max_outputs:
-                end += 1
-            stop = int(edges[end])
-            starts = range(int(edges[first]), stop, max_outputs)
-            chunks += [(first, end, start, min(start + max_outputs, stop)) for start in starts]
-            first = end
+        edges, chunks = self.cells.bounds, []
+        for start in range(0, self.n_outputs, max_outputs):
+            stop = min(start + max_outputs, self.n_outputs)
+            first, last = np.searchsorted(edges, start, side="right") - 1, np.searchsorted(edges, stop, side="left")
+            chunks.append((int(first), int(last), start, stop))
         return chunks
 
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
@@ -441,7 +432,7 @@ class SetRun:
         output_steps = self.steps_per_output
         for first, last, start, stop in chunks:  # cells first <= cell < last, outputs start <= output < stop
             if cells != (first, last):
-                table, cells = self.cells.table(first, last, self.width)[a:b], (first, last)
+                table, cells = self.cells.table(first, last, groups, self.width), (first, last)
             cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * output_steps  # in steps
             advance(
                 local_groups, state, self.step, start * output_steps, self.nodes, self._inputs_at_nodes(start, stop),

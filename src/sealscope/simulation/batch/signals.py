@@ -19,14 +19,14 @@ from sealscope.simulation.batch.noise import half_turn_sine, normals
 LEVELS = 4
 #: Number of quantities with summed squares: d1, d2, d3, d4 and the product d3 d4.
 QUANTITIES = LEVELS + 1
-#: Rows that describe a channel's instrument. First gain, offset, noise of the channel and noise of all channels, and
-#: the changes of these four per sample.
-GAIN, OFFSET, NOISE, COMMON, GAIN_RISE, OFFSET_RISE, NOISE_RISE, COMMON_RISE = range(8)
-#: Standard deviation of the drift per sample; amplitude of the hum, its cycles per sample, and its phase in cycles.
-DRIFT_STEP, HUM, HUM_CYCLES, HUM_PHASE = range(8, 12)
+#: Rows that describe a channel's instrument. First gain, offset, noise of the channel, noise of all channels and
+#: amplitude of the hum, and the changes of these five per sample.
+GAIN, OFFSET, NOISE, COMMON, HUM, GAIN_RISE, OFFSET_RISE, NOISE_RISE, COMMON_RISE, HUM_RISE = range(10)
+#: Standard deviation of the drift per sample; cycles of the hum per sample, and its phase in cycles.
+DRIFT_STEP, HUM_CYCLES, HUM_PHASE = range(10, 13)
 #: Range of pressure [Pa]; volts of the converter at its lower end, per pascal and per code; largest code plus 1.
-RANGE_MIN, RANGE_MAX, VOLTS_AT_MIN, VOLTS_PER_PASCAL, VOLTS_PER_CODE, MAX_CODE = range(12, 18)
-INSTRUMENT_ROWS = 18
+RANGE_MIN, RANGE_MAX, VOLTS_AT_MIN, VOLTS_PER_PASCAL, VOLTS_PER_CODE, MAX_CODE = range(13, 19)
+INSTRUMENT_ROWS = 19
 
 
 @contracted
@@ -46,17 +46,17 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 
 
 @contracted
-def _mains_hum(sensor: np.ndarray, row: int, sample: int) -> Any:
+def _mains_hum(sensor: np.ndarray, row: int, sample: int, amplitude: Any) -> Any:
     """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
     It is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`: table of the parameters of the
-    instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel.
+    instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel; `amplitude` [Pa].
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
     sine = half_turn_sine(cycles)
     cosine = half_turn_sine(0.5 - abs(cycles))  # cos(pi cycles)
-    return load(sensor, row + HUM) * (2.0 * sine * cosine)
+    return amplitude * (2.0 * sine * cosine)
 
 
 @contracted
@@ -81,8 +81,9 @@ def _read_pressure(
     noise = load(sensor, row + NOISE) + samples_since * load(sensor, row + NOISE_RISE)
     common = load(sensor, row + COMMON) + samples_since * load(sensor, row + COMMON_RISE)
     reading = gain * pressure + offset + drift + noise * channel_noise + common * common_noise
-    if any_lane(load(sensor, row + HUM) > 0.0):
-        reading = reading + _mains_hum(sensor, row, sample)
+    hum = load(sensor, row + HUM) + samples_since * load(sensor, row + HUM_RISE)
+    if any_lane(hum > 0.0):
+        reading = reading + _mains_hum(sensor, row, sample, hum)
     return convert_lanes(reading, sensor, row)
 
 

@@ -217,10 +217,8 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
-    can_fall = entry.oil != 1.0  # with weight 1 the drift follows oil that only warms (`Family.warms`)
-    if low < 0 or (not absolute and can_fall and high >= 1):
-        limit = "" if absolute else " and < 100 %"
-        raise InputError(f"size of the drift must be >= 0{limit}, got {low:g} to {high:g}")
+    if low < 0:
+        raise InputError(f"size of the drift must be >= 0, got {low:g} to {high:g}")
     if entry.shapes is not None and entry.oil is not None:
         raise InputError("the drift must have shapes or oil, got both")
     shapes = entry.shapes or (("linear", "wander") if entry.oil is None else ("wander",))
@@ -244,6 +242,22 @@ def _check_distinct_names(entries: _Entries) -> _Entries:
     return entries
 
 
+def _check_falls(nuisances: tuple[AnyNuisance, ...], *, warms: bool = False) -> tuple[AnyNuisance, ...]:
+    """Return the nuisances (differences between machines); raise InputError if a drift may leave a parameter below 0.
+
+    `warms`: True if the oil only warms, so that a drift that follows nothing else (`oil` = 1) only rises.
+    """
+    for nuisance in nuisances:
+        drift = nuisance.drift if isinstance(nuisance, Nuisance) else None
+        if drift and not drift.absolute and drift.size[1] >= 1.0 and not (warms and drift.oil == 1.0):
+            low, high = (100.0 * size for size in drift.size)
+            raise InputError(
+                f"{nuisance.name}: size of the drift must be < 100 %, except with oil = 1 in a family with warms = "
+                f"true, got {low:g} % to {high:g} %"
+            )
+    return nuisances
+
+
 _Nuisances = Annotated[
     tuple[Annotated[AnyNuisance, BeforeValidator(_parse_nuisance)], ...], AfterValidator(_check_distinct)
 ]
@@ -263,6 +277,9 @@ class Family:
     duty: Duty | None = None
     warms: _Flag = False
     why: _Text
+
+    def __post_init__(self) -> None:
+        _check_falls(self.nuisances, warms=self.warms)
 
 
 @dataclass(frozen=True)
@@ -340,7 +357,7 @@ class _File(BaseModel, extra="forbid"):
 
     profile: _Head
     duty: Duty | None = None
-    nuisance: _Nuisances = ()
+    nuisance: Annotated[_Nuisances, AfterValidator(_check_falls)] = ()
     family: Annotated[tuple[Family, ...], AfterValidator(_check_distinct_names)] = ()
 
 
