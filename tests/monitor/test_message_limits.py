@@ -14,6 +14,7 @@ import cbor2
 import numpy as np
 import pytest
 
+from sealscope.monitor.database import tables
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import BrokerSettings
@@ -253,7 +254,7 @@ def test_only_large_and_repeated_messages_are_noted(connection: Any, monkeypatch
     ):
         connection._submit(0, each)
         assert len(noted) == count
-    assert connection._service.store._rows(connection._service.store.tables.decodings.select()) == []
+    assert connection._service.store._rows(tables.decodings.select()) == []
 
 
 @pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")

@@ -6,6 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from importlib import import_module
 from importlib.resources import files
+from inspect import getsource
 from pathlib import Path
 from types import ModuleType
 from typing import Literal, get_type_hints
@@ -107,10 +108,10 @@ def kinds_of(module: ModuleType) -> dict[str, type]:
 
 
 @pytest.mark.parametrize("package", TABLES)
-def test_docstrings_state_the_units_of_the_file(package: str) -> None:
+def test_docstrings_and_comments_state_the_units_of_the_file(package: str) -> None:
     kinds = kinds_of(import_module(TABLES[package]))
     tables = tomllib.loads((files(package) / "priors.toml").read_text("utf-8"))
     for table, kind in kinds.items():
-        text = " ".join((kind.__doc__ or "").split())
+        text = " ".join(getsource(kind).split())
         for name, row in tables[table].items():
             assert row["unit"] == "1" or row["unit"] in text, f"[{table}] {name}: {row['unit']}"

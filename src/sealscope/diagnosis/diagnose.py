@@ -76,12 +76,12 @@ class Examination:
     refusal: str | None = None
     share: float = 1.0
     judged_until: float = 1.0
-    _reports: dict[str, Observed] = field(default_factory=dict, init=False)
+    _reports: dict[str, Observed] = field(default_factory=dict, init=False)  # by detector; `replace` starts anew
 
     def with_channels(self, channels: Iterable[str]) -> Examination:
         """Return a copy in which all recordings have only the given channels.
 
-        Healthy recordings of which only summaries are stored are left out.
+        Healthy recordings of which only summaries are stored are left out, as these may rest on other channels.
         """
         names = set(channels)
 
@@ -104,7 +104,7 @@ class Examination:
 
     @cached_property
     def signals(self) -> Observed:
-        """Report on changes of duty, noise, hum and mean pressures, which may explain an alarm (`observe_rivals`)."""
+        """Report on changes of duty, noise, friction and the like, which may explain an alarm (`observe_rivals`)."""
         return observe_rivals(self.recording, self.baseline, distrust=self.distrust)
 
     @cached_property
@@ -113,6 +113,7 @@ class Examination:
 
         If valves cut the pump off at rest in the judged recording, the same is assumed for the healthy ones.
         """
+        # tests may replace the built-in detectors, so that there is no volume balance
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
         # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then
         is_shut_at_rest = isinstance(leak, BalanceLeak) and (leak.balance.shut or leak.balance.locked)
@@ -121,7 +122,7 @@ class Examination:
     def evidence(self, name: str) -> Evidence:
         """Decide from the observations of the detector called `name` alone if the machine leaks.
 
-        Changes in `signals` compete with a leak, except for the detector `rms change`, whose alarms are always leaks.
+        Changes in `signals` compete with a leak, except for `rms change`: alone, as in the thesis, its alarm is a leak.
         """
         return self._decide_by(name, [self.signals], weigh_rivals=name != RMS_CHANGE)
 

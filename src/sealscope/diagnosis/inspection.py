@@ -70,8 +70,8 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted.
 
-    A recording cannot be trusted if a chamber pressure is constant or stuck, or if the readings of all chamber
-    pressures are mostly clipped, mostly impossible, or implausible for hydraulics.
+    A recording cannot be trusted if a chamber pressure is constant or stuck, if the readings of all chamber pressures
+    are mostly clipped or mostly impossible, or if no hydraulic machine gives such channels (`find_implausibility`).
     """
     chambers = chambers_of(recording)
     # `stuck`: names of chamber pressures that repeat one value for too long
@@ -85,6 +85,7 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
         if len(mostly) == len(chambers):  # one such chamber is no obstacle: the other chamber is judged
             defects += mostly
     distrust = f"the pressures cannot be trusted: {defects[0].text}" if defects else None
+    # a shorter part has a `defect` in any case
     if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
     # fraction of all samples up to the end of `part`
@@ -137,6 +138,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     entries = [healthy[k] for k in sorted(index_of_digest.values())]  # in the order of `baseline`
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
     part = judged.part
+    # without a comparable baseline no channel is left out
     known = SLOW.union(*(entry.units for entry in entries)) if entries else part.channels.keys()
     if unknown := [name for name in part.channels if name not in known]:
         note = f"left out, as no baseline recording has it: {', '.join(unknown)}"
@@ -150,7 +152,7 @@ def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) 
 
     The reason is the severity and the text of a finding.
     """
-    if isinstance(entry, Inspection) and entry.defect is not None:
+    if isinstance(entry, Inspection) and entry.defect is not None:  # no summary is stored with a defect
         return "warning", entry.defect
     if entry.digest == judged.digest:
         return "warning", "the same samples as the recording itself"

@@ -41,7 +41,7 @@ def duty_signal(channels: Sequence[Array]) -> Array:
 def estimate_period(signal: Array, rate: float) -> float | None:
     """Estimate the period [s] of a signal (n,) sampled at `rate` [Hz]; None if nothing repeats.
 
-    A fast signal is first averaged to 50 Hz or a little more. The period is the lag of a peak of the autocorrelation,
+    A signal of 100 Hz or more is first averaged to 50 to 75 Hz. The period is the lag of a peak of the autocorrelation,
     refined by a parabola. Peaks are searched for after the first negative value, and must reach 0.6 of the value at lag
     0. The first one that is at most 0.05 lower than the highest is taken. The period must be between 0.2 s and 20 s,
     and at most a fifth of the signal's duration. Also None for fewer than 32 averaged samples and for missing samples.
@@ -61,7 +61,7 @@ def estimate_period(signal: Array, rate: float) -> float | None:
     negative = np.flatnonzero(correlation[:max_lag] < 0)
     if negative.size == 0:
         return None
-    first = int(negative[0])  # peaks are searched for after the first negative value
+    first = int(negative[0])  # beyond the peak at lag 0
     tail = correlation[first + 1 : max_lag - 1]
     peaks = np.flatnonzero((tail >= correlation[first : max_lag - 2]) & (tail > correlation[first + 2 : max_lag]))
     peaks = peaks[tail[peaks] >= _CYCLE.correlation]

@@ -73,7 +73,7 @@ def _detect_format(path: Path) -> str:
     foreign: str | None = next((words for begins, words in _FOREIGN.items() if begins.match(head)), None)
     if foreign is None and (binary := _find_format(head, is_text=False)):
         return binary
-    if foreign is None and detect_encoding(head) is None:
+    if foreign is None and detect_encoding(head) is None:  # a text with such a suffix (.dat) is read
         foreign = _PROPRIETARY.get(path.suffix.lower())
     if foreign is not None:
         raise UnreadableFile(f"a recording must be in a format that is read, got {foreign} ({path})")

@@ -52,7 +52,8 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
         raise InputError(f"frame must be a pandas.DataFrame, got a {type(frame).__name__}")
     columns = [(str(name), frame.iloc[:, i]) for i, name in enumerate(frame.columns)]
     index = frame.index
-    if index.name is not None or index.dtype.kind in "fmM":  # floats, time differences, dates
+    # floats, time differences, dates; integers without a name only number the rows
+    if index.name is not None or index.dtype.kind in "fmM":
         columns.append(("t" if index.name is None else str(index.name), index.to_series()))
     units = frame.attrs.get("units")
     units = units if isinstance(units, Mapping) else {}
@@ -64,7 +65,7 @@ def read_pandas(frame: pandas.DataFrame, request: Request) -> RecordingFields:
         read_values = partial(_convert_column, pandas.api.types, column, name)
         series.append(Series(group="", label=label, count=len(frame), values=read_values))
     try:
-        description = parse_description({"format": FORMAT_VERSION, **frame.attrs})
+        description = parse_description({"format": FORMAT_VERSION, **frame.attrs})  # `to_pandas` writes no "format"
     except InputError:  # not written by `to_pandas`
         description = None
     remarks = collect_attributes(frame.attrs)

@@ -20,7 +20,7 @@ def find_implausibility(recording: Recording) -> str | None:
 
     There are four such reasons:
 
-    - p_B is a copy of p_A.
+    - p_B is a copy of p_A, up to a constant.
     - The motor speed differs from the rate of the motor angle by a large constant factor.
     - Pressures in Pa stay below `readings.pressure` of `priors.toml`, as those in another unit would.
     - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
@@ -74,8 +74,8 @@ def _is_noise(values: Array, is_zero_known: bool) -> bool:
 
     The noise variance is estimated as a twentieth of the mean square of the third difference. The signal is noise if
     this variance exceeds the fraction `readings.noise` (`priors.toml`) of the signal's variance. With `is_zero_known`,
-    zero means no load, and the signal's mean square is taken instead of its variance, so that a constant load is a
-    signal.
+    i.e. for p_A - p_B, zero means no load, and the signal's mean square is taken instead of its variance, so that a
+    constant load is a signal; a single pressure has the charge pressure as an offset.
     """
     power = np.mean(values**2) if is_zero_known else np.var(values)
     # the third difference of white noise has 20 times its variance; `not <=`: missing samples count as noise

@@ -57,6 +57,7 @@ def file_seconds(recording: Recording, path: Path) -> float:
 
 def _parse_file_name(name: str) -> float | None:
     """Parse the date and time in a file's name to seconds since 1970, as if in UTC; None if it contains no date."""
+    # in `3-14-2024_10-05-30_PM` the other pattern would find 2024-10-05
     match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
     if match is None:
         return None
@@ -71,7 +72,10 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970], the entry `start_epoch_s` or `start` of the provenance; None without."""
+    """Find the time of t = 0 [s since 1970] in the provenance; None if it is not there.
+
+    It is the entry `start_epoch_s`, if this counts from 1970 and not from another origin, or else the entry `start`.
+    """
     epoch = recording.provenance.get("start_epoch_s")
     if isinstance(epoch, int | float) and counts_from_1970(epoch):
         return float(epoch)
@@ -153,7 +157,7 @@ def join(recordings: Sequence[Recording], *, names: Sequence[str] | None = None)
     history = tuple(dict.fromkeys(line for part in parts for line in part.history))
     return replace(
         parts[0],
-        t=np.concatenate([times[number] for number in order]) - offsets[order[0]],  # from the start in the provenance
+        t=np.concatenate([times[number] for number in order]) - offsets[order[0]],  # t = 0 is the first part's
         channels={name: np.concatenate([part[name] for part in parts]) for name in parts[0].channels},
         provenance={**parts[0].provenance, "files": files},
         history=(*history, f"joined from {len(parts)} files: {', '.join(files)}"),

@@ -25,7 +25,7 @@ _MIN_STUCK, _NEIGHBOURHOOD = 5, 100
 _MAX_EXPECTED = 1e-6
 #: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
 _MIN_JUMP = 3.5
-#: Most samples from which the quantisation step is estimated.
+#: A longer channel is thinned to this many samples, or up to twice as many, to estimate the quantisation step.
 _QUANTUM_SAMPLES = 2**15
 
 
@@ -107,8 +107,7 @@ def smallest_step(values: Array) -> float:
 def estimate_quantum(values: Array) -> float:
     """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
 
-    The result is 0 for a constant channel. Of a long channel, only about `_QUANTUM_SAMPLES` evenly spaced samples are
-    compared.
+    The result is 0 for a constant channel. A long channel is thinned evenly (`_QUANTUM_SAMPLES`).
     """
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
@@ -118,10 +117,10 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
 
     Let p be the fraction of samples that equal the previous one, among the 100 samples before or the 100 after the run,
     whichever is larger. By chance, a run of m equal samples begins at a given sample with the probability p^(m-1). A
-    run is too long if fewer than 1e-6 such runs are expected in `values` (n,), and if the value jumps by more than 3.5
-    quantisation steps at one of its ends. The jump excludes a slow quantised signal, which changes in single steps.
-    Runs of fewer than 5 samples, runs within 20 samples of an end of the channel, and runs in a channel of fewer than
-    200 samples are not found.
+    run is too long if fewer than 1e-6 such runs are expected in `values` (n,), all finite, and if the value jumps by
+    more than 3.5 quantisation steps at one of its ends. The jump excludes a slow quantised signal, which changes in
+    single steps. Runs of fewer than 5 samples, runs within 20 samples of an end of the channel, and runs in a channel
+    of fewer than 200 samples are not found.
     """
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:

@@ -11,7 +11,7 @@ class ClockPriors(PriorTable):
     - `regular` [sampling steps]: smallest and largest regular interval; a longer one is a gap.
     - `scatter` [sampling steps]: standard deviation of the intervals above which sampling is irregular.
     - `rate`: largest relative error of the stated rate.
-    - `near` [usual intervals]: longest interval in which no sample is missing.
+    - `near` [usual intervals, i.e. medians]: longest interval in which no sample is missing.
     - `lost`: largest fraction of lost samples in one recording.
     - `late`: largest fraction of samples with a time that is not later than all before.
     """
@@ -77,7 +77,8 @@ class UnsignedPriors(PriorTable):
     - `changes` [1/s]: usual number of reversals per second.
     - `least`: smallest ratio of the motion in the less used direction to that in the other.
     - `correlation`: smallest correlation of the magnitude with the absolute piston speed or command.
-    - `unlike`: smallest logarithm of the ratio of the piston's two areas, i.e. of flow over speed in both directions.
+    - `unlike`: smallest logarithm of the ratio of flow over speed in one direction to that in the other, i.e. of the
+      areas of a single rod.
     - `passes`: smallest flow at rest, over the mean flow in motion, that shows a meter in a valve's supply line.
     - `rests`: largest speed at rest, over the mean speed in motion.
     """
@@ -207,8 +208,8 @@ class GapPriors(PriorTable):
 
     - `motion` [s]: longest gap that is interpolated by a line in positions, angles, speeds and flows.
     - `hole` [s]: length above which a filled gap has less weight in the diagnosis.
-    - `live_zero`: how far below zero a sensor of 4 to 20 mA reads without a supply, over its range.
-    - `dead`: by how much such a reading varies, over its distance from all other readings.
+    - `live_zero`: smallest distance below zero at which a sensor of 4 to 20 mA reads without a supply, over its range.
+    - `dead`: largest variation of such a reading, over its distance from all other readings.
     """
 
     motion: float

@@ -65,7 +65,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     Returns
     -------
     tuple of Finding
-        Findings on the time first, then on each channel; empty if there is no defect.
+        Findings on the time, then on each channel but slow ones (T_oil), then on both chambers; empty without a defect.
 
     Examples
     --------
@@ -120,7 +120,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
         if abs(median_step / step - 1.0) > _CLOCK.rate and not is_coarse:
             text = f"time stamps show {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
             add("rate_mismatch", timed[:1], text, "fatal")
-            step = median_step
+            step = median_step  # gaps and scatter are those of the real clock
         gaps = np.flatnonzero(steps > _MAX_STEP * step)
         n_lost = np.round(steps[gaps] / step - 1.0).sum()  # infinite if a time is absurd
         samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
@@ -205,7 +205,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
         return findings
     stuck = find_stuck(readings)
-    may_be_clipped = is_pressure or name == "q_leak"
+    may_be_clipped = is_pressure or name == "q_leak"  # q_leak at the high end only: without flow it reads 0
     for rail in find_rails(readings, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {format_value(rail.value)}: clipped"
@@ -321,7 +321,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
       as frequent.
     - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
 
-    A channel with fewer than three different values has no clipped end.
+    A channel with fewer than three different values, such as a square wave, has no clipped end.
     """
     if not values.size:
         return []
@@ -403,7 +403,7 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
         is_background = (distance > max(0.5, 2.5 * rate / n)) & (distance <= _HUM.around)
         peak, background = float(amplitudes[is_line].max(initial=0.0)), amplitudes[is_background]
         if (
-            background.size >= 10
+            background.size >= 10  # fewer amplitudes show no background
             and peak > _HUM.over_rest * background.max()
             and peak > _HUM.over_median * np.median(background)
         ):

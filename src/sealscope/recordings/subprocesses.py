@@ -151,7 +151,7 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
     The work gets the absolute path, as the subprocess may run in another folder. If it raises UnreadableFile, the
     message names the path as it was given.
     """
-    place = file.absolute()  # the process may work in another folder
+    place = file.absolute()
     try:
         return run_in_subprocess(work, place, *arguments, **limits)
     except UnreadableFile as error:

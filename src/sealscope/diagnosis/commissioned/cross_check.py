@@ -27,9 +27,9 @@ def cross_check(
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
     out if `keep` is True, or if at least half of the recordings seem to leak, as there is then no healthy majority. A
-    recording in which a leak seems to begin is also kept if no later recording shows a leak (`_has_healed`). Fewer than
-    `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each recording left
-    out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
+    recording in which a leak seems to begin is also kept if there are later ones, none of which leaks (`_has_healed`).
+    Fewer than `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each one
+    left out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
     """
     problems, leaking = dict[str, str](), dict[str, str]()  # texts by the name of the recording's file
     begins_within = set[str]()  # names of the files in which a leak seems to begin

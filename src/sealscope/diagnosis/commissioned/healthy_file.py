@@ -271,8 +271,8 @@ _RECORDING = table_type(
 def _pack_arrays(value: Any) -> Any:
     """Convert a value for JSON: drop entries of mappings that are None, and pack arrays (`plain_array`), at any depth.
 
-    Lists that begin with a float or a list are packed, too, row by row if their rows have unequal lengths. Arrays of
-    other types than numbers become lists.
+    Lists that begin with a float or a list are packed, too, as a line may have few single values (`_MAX_MARKS`), and
+    row by row if their rows have unequal lengths. Arrays of other types than numbers become lists.
     """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
@@ -297,8 +297,8 @@ def _format_json(value: Any) -> bytes:
 def check_summary(method: str, summary: Summary) -> None:
     """Check that the summary by the detector `method` can be stored and read back; its numbers must be finite.
 
-    Raises ArithmeticError otherwise. For a built-in detector, `log_failure` attributes this error to the recording, not
-    to the detector.
+    Raises TypeError for a value that is not plain, else ArithmeticError. For a built-in detector, `log_failure`
+    attributes the latter to the recording, not to the detector.
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))

@@ -173,7 +173,8 @@ class CommissionedMachine:
         """Return a copy of the machine with one more healthy recording.
 
         `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
-        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known recording, or cannot be trusted.
+        is judged leaking by those that the machine has, overlaps in time with a confirmed leak, is a copy of a known
+        recording, or cannot be trusted.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy:
@@ -422,7 +423,10 @@ def commission(
 
 
 def _fits_map(recording: SummarisedRecording, channel_map: ChannelMap) -> bool:
-    """Return True if a recording has all channels that a map names, so that it was read with the map."""
+    """Return True if a recording has all channels that a map names, so that it was read with the map.
+
+    The entry `REST` and the time `t` name no channel; the map "auto" fits any recording.
+    """
     return channel_map == "auto" or channel_map.keys() - {REST, "t"} <= recording.units.keys()
 
 

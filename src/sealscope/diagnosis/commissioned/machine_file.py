@@ -149,6 +149,7 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     """
     target = _resolve_target(path)
     with _lock(target):
+        # a machine that was not loaded from this file replaces it unchecked
         if machine.origin is not None and machine.origin.path == target and target.exists():
             # the tables as they will be read back
             new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
@@ -255,7 +256,8 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     """Hash each part of a machine's file; return a mapping from hash to the description of a change of that part.
 
-    Parts are the statements about the machine, each healthy recording, and each judged alarm.
+    Parts are the statements about the machine, each healthy recording (its summary, not its name), and each judged
+    alarm.
     """
 
     def hash_value(value: Any) -> bytes:
@@ -321,7 +323,10 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file at `path`, which also gives the name of the file of summaries."""
+    """Build the nested tables of a machine's file at `path`, which also gives the name of the file of summaries.
+
+    Values that are None are unknown; `_format_table` does not write them, as TOML has no such value.
+    """
     from importlib.metadata import version
 
     machine_table = {
@@ -364,7 +369,7 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
 
     `path` is the table's dotted name, "" for the outermost table, which is the file itself. In this table a list
     becomes an array of tables. In other tables, an inner table that has only plain values is written on one line.
-    `heading` is the line to write before the table's values.
+    `heading` is the line to write before the table's values. None and empty tables are not written.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():

@@ -49,7 +49,7 @@ class TermEstimate(NamedTuple):
 class SmallestLeak(NamedTuple):
     """The smallest leak that the next recording shows with a stated probability (`power` of `priors.toml`)."""
 
-    lpm: float | None  # flow of the leak [L/min], None if the machine's sizes are not stated
+    lpm: float | None  # flow of the leak [L/min], None if flows are not known in this unit
     share: float  # flow of the leak as a fraction of the pump's mean flow; nan if the pump does not move
     # factor on the number of healthy recordings, and of their days, that halves this leak; None if no tried one does
     halved_by: int | None
@@ -190,7 +190,7 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     problems = [finding.text for finding in findings if finding.severity != "note" or finding.code in _LOGGER_HABITS]
     problems += [
         f"{name} is not read: if it is the oil's temperature, then --map 'T_oil={name}', as warm oil leaks more"
-        for name in recording.unused_temperatures[:1]
+        for name in recording.unused_temperatures[:1]  # only one column can be T_oil
     ]
     problems += [_describe_vacuum(part, name) for name in ("p_A", "p_B") if name in part]
     problems += [_describe_glitches(part, name) for name in ("omega", "u") if name in part]

@@ -76,7 +76,7 @@ def load_watched(rig: str) -> WatchedMachine:
         machine.rate,
         limit_lpm=RepairLimit.parse(machine.limit).flow_lpm(area),
         machine=machine if machine.healthy else None,
-        healthy=_healthy_level(machine.healthy, machine.rig or unstated_rig()),
+        healthy=_healthy_level(machine.healthy, machine.rig or unstated_rig()),  # rig of the stored summaries
     )
 
 

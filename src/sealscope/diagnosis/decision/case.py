@@ -70,9 +70,15 @@ class Case:
         return self.judge.leak
 
     @property
-    def rarest_observable(self) -> Observable:
-        """The observable of the judging detector with the smallest p-value, as stated by the detector."""
-        return min(self.judge.observables, key=lambda observable: observable.chance)
+    def tested_observable(self) -> Observable | None:
+        """Observable by which a judging detector that does not measure leakage is tested for a leak; None without one.
+
+        Of those that a piston leak affects, it has the smallest p-value, as stated by the detector. The other leak
+        event, "pump leak", affects the volume balance alone, which measures leakage.
+        """
+        leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
+        affected = [observable for observable in self.judge.observables if leak.affects(observable)]
+        return min(affected, key=lambda observable: observable.chance, default=None)
 
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
@@ -83,8 +89,8 @@ class Case:
     def leak_probability(self, alarm: LeakTest) -> float:
         """Compute the probability that a leak past piston or pump, rather than another event, caused the `alarm`.
 
-        It is 1 if other causes are not weighed. An alarm by the limit in the rig's file (LEVEL) has the probability of
-        the alarm by the test WITHIN, or 1 if that test raised no alarm.
+        It is 1 if other causes are not weighed. No event explains an alarm by the limit in the rig's file (LEVEL): it
+        has the probability of the alarm by the test WITHIN, or 1 if that test raised no alarm.
         """
         if not self.weigh_rivals:
             return 1.0
@@ -136,12 +142,16 @@ class Case:
     def _data_kind(self, alarm: LeakTest) -> str:
         """Return the kind of data (`Observable.data`) from which the test `alarm` was computed.
 
-        It is `RISE` for a comparison of measured leakage with healthy recordings, and without observables; else the
-        kind of the judging detector's first observable.
+        It is that of `tested_observable` without measured leakage, and `RISE` for a comparison of measured leakage with
+        healthy recordings. Otherwise it is the kind of the judging detector's first observable: volume balance and
+        pressure response list first their tests for steps, all of one kind. For a report without observables, `RISE`
+        merely fills in.
         """
-        if alarm.name == AGAINST and self.leak is not None:
+        if self.leak is None and self.tested_observable is not None:
+            return self.tested_observable.data
+        if alarm.name == AGAINST or not self.judge.observables:
             return RISE
-        return self.judge.observables[0].data if self.judge.observables else RISE
+        return self.judge.observables[0].data
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
@@ -272,7 +282,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     `StepTest.chance` (`inference/onset.py`). In the volume balance it was divided by the prior probability of the
     leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`null.py`) by the p-values that the same
     test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
-    `Rise.chance`, and that of a level follows from the normal distribution.
+    `Rise.chance`, which rests on healthy recordings already; that of a level follows from the normal distribution.
     """
     from scipy.special import ndtr, ndtri  # standard normal distribution and its inverse
 
@@ -307,14 +317,12 @@ def step_key(provider: str) -> str:
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
     """Make the test for a leak from the report of a detector that does not measure leakage.
 
-    Of the observables that a leak changes, the one with the smallest p-value gives the score and the calibrated p-value
-    (`HealthyNull.chance`). If a leak changes none, the result is empty. The detector states no threshold. The threshold
-    is therefore computed as the score with a calibrated p-value equal to the allowed false-alarm probability, assuming
-    that scores are proportional to the logarithm of the detector's p-value.
+    `Case.tested_observable` gives the score and the calibrated p-value (`HealthyNull.chance`). If a leak affects none,
+    the result is empty. The detector states no threshold. The threshold is therefore computed as the score with a
+    calibrated p-value equal to the allowed false-alarm probability, assuming that scores are proportional to the
+    logarithm of the detector's p-value.
     """
-    leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
-    affected = [observable for observable in case.judge.observables if leak.affects(observable)]
-    rarest = min(affected, key=lambda observable: observable.chance, default=None)
+    rarest = case.tested_observable
     if rarest is None:
         return ()
     allowed = case.false_alarm_probability

@@ -46,8 +46,8 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 
     All decisions become the `parts` of the result. The change of RMS decides only if no detector that measures the leak
     can use the recording. If no detector decides, the verdict is `cannot tell`. This verdict also replaces `no leak` if
-    the recording's end is not judged, or if there is a `refusal`: the reason why a measuring detector failed, or why no
-    baseline recording is comparable.
+    more than the last 5 % of the recording (`worth.unjudged` of `priors.toml`) are not judged, or if there is a
+    `refusal`: the reason why a measuring detector failed, or why no baseline recording is comparable.
     """
     ranked = sorted(decisions, key=lambda decision: rank(decision.detector))
     usable = [decision for decision in ranked if decision.usable]
@@ -68,7 +68,7 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
     verdict = CANNOT_TELL if doubts else judge.verdict
     other_parts = [decision for decision in ranked if decision is not judge]
     combined = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
-    # an onset is stated only of a leak
+    # an onset is stated only for a leak
     return combined if verdict == LEAK else replace(combined, onset_s=None, onset_interval_s=None)
 
 

@@ -17,7 +17,8 @@ A detector that measures no leakage has a single test, with the whole probabilit
 
 Otherwise the verdict is `no leak` if the 95 % upper bound of a leak is small enough, i.e. at most the fraction `[worth]
 share` of the pump's flow (`_bound_and_limit`). It is `cannot tell` if the bound is larger, and the reason states the
-bound and the most probable other explanation. No other module states a verdict, but `combination.combine` chooses one.
+bound and the most probable other explanation. Afterwards only `combination.combine` changes a verdict: it chooses one
+detector's, and may replace `no leak` by `cannot tell`.
 """
 
 from __future__ import annotations
@@ -65,10 +66,9 @@ def decide(
 ) -> Evidence:
     """Decide on a recording by the report `judge` of one detector: leak, no leak, or cannot tell.
 
-    `reports` are those of all detectors; they may contain `judge`. Their test results (observables) may show other
-    causes, which compete with a leak unless `weigh_rivals` is False. `null` is the distribution of the test results in
-    healthy recordings of the machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free
-    recording.
+    The test results (observables) in `reports`, which may contain `judge`, may show other causes, which compete with a
+    leak unless `weigh_rivals` is False. `null` is the distribution of the test results in healthy recordings of the
+    machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free recording.
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
@@ -87,7 +87,7 @@ def _decide_without_leak(case: Case) -> Evidence:
 
     The verdict is `no leak` if an undetected leak can only be small (`_bound_and_limit`). If another event explains a
     rare change, the evidence states the event's cause. If leakage is measured, it also states the total leakage and the
-    upper bound of an undetected leak.
+    upper bound of an undetected leak. Score and threshold are those of the first test, even if another raised an alarm.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
@@ -110,13 +110,13 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
     """Make the verdict `leak`, detected by the test `alarm`, with cause, onset and, if measured, flow of the leak.
 
     The onset is that of the step or of the rise over healthy recordings or, without measured leakage, that of the
-    rarest change. No onset is stated after an alarm by the limit in the rig's file, or of a leak that seems older than
-    the recording (`Case.has_onset_within`).
+    change that a leak makes. No onset is stated after an alarm by the limit in the rig's file, or of a leak that seems
+    older than the recording (`Case.has_onset_within`).
     """
     leak = case.leak
     if leak is None:
-        fields: dict[str, Any] = {"cause": "piston leak"}
-        onset = case.rarest_observable.onset
+        fields: dict[str, Any] = {"cause": "piston leak"}  # the only leak that `case._change_tests` tests for
+        onset = None if case.tested_observable is None else case.tested_observable.onset
     else:
         if not case.has_onset_within:
             onset = None
@@ -143,6 +143,7 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     itself, and its leak has a probability below `RAREST`. The outside is added if an external leak has a probability
     above 1 - `sure` (`priors.toml`), or if the data alone, without priors, cannot tell (`Case.resembles_external`).
     """
+    # this observable needs the pressures at the pump's ports (`terms.PUMP_TERM`), which separate pump and piston
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
     is_pump_excluded = is_pump_observed and probability_of(case.explanations, "pump leak") < RAREST
     cause: Cause = "piston leak" if is_pump_excluded and leak.cause == "piston or pump leak" else leak.cause
@@ -176,7 +177,7 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
 
     If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. The result
-    is infinite if leakage was not measured, or if the bound is not below the mean flow of a pump that moves.
+    is infinite ("any size") if leakage was not measured, or if the bound is not below the mean flow of a moving pump.
     """
     leak = case.leak
     if leak is None:

@@ -26,7 +26,11 @@ class Event:
 
     @property
     def is_sized(self) -> bool:
-        """True if the event has a prior on its size (part of `Observable.advantage`), i.e. if a verdict may name it."""
+        """True if priors on the size of a change (in `Observable.advantage`) count for the event.
+
+        They hold for the causes that a verdict names. An event without a cause, such as unsteady motion that looks like
+        free air, may be of any size.
+        """
         return self.cause is not None
 
     def affects(self, observable: Observable) -> bool:
@@ -38,7 +42,7 @@ class Event:
         return _matches(f"{observable.data}: {observable.name}", self.scaled)
 
     def changes(self, observable: Observable) -> bool:
-        """Return True if the event changes an observable freely (`affects`) or by a common scale (`scales`)."""
+        """Return True if the event changes an observable, by itself (`affects`) or by scaling pressures (`scales`)."""
         return self.affects(observable) or self.scales(observable)
 
     def may_disturb(self, observable: Observable) -> bool:

@@ -9,9 +9,9 @@ two events, which do not compete. The Bayes factor of a change is at most 1 / (-
 of the change in a healthy recording, or 1 for p > 1/e (Sellke, Bayarri and Berger). p is calibrated by healthy
 recordings (`null`).
 
-A term of the volume balance describes a change only to within a fraction, the misfit m (`priors.toml`). Therefore the
-logarithms of the Bayes factors of the same data are divided by 1 + 2 m B, where B is the largest of them. Alternative
-explanations then differ no more than this accuracy allows.
+A model describes a change only to within a fraction, the misfit m (`priors.toml`). Therefore the logarithms of the
+Bayes factors of the same data are divided by 1 + 2 m B, where B is the largest of them. Alternative explanations then
+differ no more than this accuracy allows.
 
 Source: T. Sellke, M. J. Bayarri, J. O. Berger, The American Statistician 55 (2001) 62.
 """
@@ -71,8 +71,9 @@ def explain(
 
     `chance` computes the p-value of an observable (`null.HealthyNull.chance`), by default the one that its detector
     states. `rise` is the leakage above that of healthy recordings, None without such recordings. Returns all single
-    events of `events.toml`, such as a sensor drift, and combinations of up to `MAX_EVENTS` events whose own log Bayes
-    factors are above `MIN_LOG_FACTOR`. Their probabilities add up to 1, as they are given that some event has happened.
+    events of `events.toml`, such as a sensor drift, and combinations of up to `MAX_EVENTS` events, each with a log
+    Bayes factor, summed over kinds of data, above `MIN_LOG_FACTOR`. Their probabilities add up to 1, as they are given
+    that some event has happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -164,9 +165,9 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). If the volume balance supports a step, a third mapping is for
-    an older leak that is not laminar. Its size follows from how its flow changes with the pressure, and must agree with
-    the rise.
+    leakage above that of healthy recordings (the rise). If the leak's log factor in the volume balance is above 0, a
+    third mapping is for an older leak that is not laminar. Its size follows from how its flow changes with the
+    pressure, and must agree with the rise.
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
@@ -195,21 +196,22 @@ def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are test results (observables) with the log Bayes factors of a change. For each kind of data the largest
-    factor is returned, with the log odds from the prior on the event's size added, of
+    `factors` are test results (observables) with the log Bayes factors of a change. The result for a kind of data is
+    the largest sum of a log factor and the log odds from the prior on the event's size, over
 
-    - observables that the event affects freely, or by a common scale of both pressures (`_agree_on_scale`). The one
-      with the largest factor gives the time of the event; only changes that may be of that time count (`_coincide`).
-    - side effects (`Event.may_disturb`) on other kinds of data, if an affected observable supports the event. Their
-      factors are limited to the largest one of the affected observables: a much clearer one has another cause.
+    - observables that the event affects, or changes by a common scale of both pressures (`_agree_on_scale`);
+    - side effects (`Event.may_disturb`) on kinds of data in which no observable of the first group has a log factor
+      above `MIN_LOG_FACTOR`, if one of another kind does. Their log factors are limited to the largest one of the first
+      group: a much clearer change has another cause.
 
-    If the event affects no observable, the result is empty.
+    The observable of the first group with the largest log factor, without the odds, gives the time of the event; only
+    changes that may be of that time count (`_coincide`). If the first group is empty, so is the result.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
     if not affected:
         return {}
-    best_explained, best_gain = max(affected, key=lambda pair: pair[1])
+    clearest, best_gain = max(affected, key=lambda pair: pair[1])
     supporting_data = {observable.data for observable, gain in affected if gain > MIN_LOG_FACTOR}
     side_effects = [
         (observable, min(gain, best_gain))
@@ -218,7 +220,7 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
     ]
     gains: dict[str, float] = {}
     for observable, gain in affected + side_effects:
-        if _coincide(observable, best_explained):
+        if _coincide(observable, clearest):
             # advantage: twice the log odds that follow from the prior on the event's size
             size_log_odds = 0.5 * observable.advantage if event.is_sized else 0.0
             gains[observable.data] = max(gain + size_log_odds, gains.get(observable.data, 0.0))

@@ -1,7 +1,7 @@
 """Calibration of the chances that detectors state, by those that they stated for healthy recordings.
 
-A detector states for each statistic a chance P, i.e. the probability that a healthy recording scores as high. If that
-is right, the surprisal u = -log P of a healthy recording is exponentially distributed. In a fraction of machines
+A detector states for each statistic a chance (p-value) P, the probability that a healthy recording scores as high. If
+that is right, the surprisal u = -log P of a healthy recording is exponentially distributed. In a fraction of machines
 (`priors.toml`) the stated chances are too small: there u / lambda is exponential, with an exponential prior on log
 lambda > 0. With the u_1 .. u_n of n healthy recordings, and prior probabilities p_k of values lambda_k, the calibrated
 (predictive) chance is
@@ -34,7 +34,7 @@ NODES = 64
 class HealthyNull:
     """Distribution of p-values in healthy recordings of a machine, by which the p-values of detectors are calibrated.
 
-    `surprisals`: -log(chance) of each observable in each healthy recording, by the observable's key (`null_key`).
+    `surprisals`: -log(chance) of each test in each healthy recording, by the test's key (`null_key`, `case.step_key`).
     """
 
     surprisals: Mapping[str, Sequence[float]] = field(default_factory=dict)

@@ -43,7 +43,8 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
     For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
     upper `bound` of an undetected leak [m^3/s], and the cause of a change. This is the event `other` or, if that is
-    None and there is an alarm, the most probable explanation other than a leak. Remarks on the measured leakage follow.
+    None and there is an alarm against which other causes are weighed, the most probable of these. Remarks on the
+    measured leakage follow.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -66,19 +67,20 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe in words a leak that the test `alarm` detected, or the rarest change if leakage is not measured.
+    """Describe in words a leak that the test `alarm` detected, by the change that it makes if leakage is not measured.
 
     An alarm by the limit in the rig's file is described by the total leakage and this limit, if both are known in
     L/min. The text also says if the leak's flow is not stated in L/min.
     """
     if case.leak is None:
-        rarest = case.rarest_observable
+        rarest = case.tested_observable
+        assert rarest is not None  # it raised the alarm
         if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
         percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
         where = _onset_text(rarest) or _against_text(case.judge.ringing)
         return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
-    test_name = alarm.name if alarm else ""
+    test_name = alarm.name if alarm else ""  # with the verdict `leak` there always is an alarm
     key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
     if key == "within" and not case.has_onset_within:
         key = "older"
@@ -144,7 +146,8 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
 
 def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
     """Describe the rarest change of the pressures' ringing (RMS of wavelet details), and the probability of a leak."""
-    rarest = case.rarest_observable
+    rarest = case.tested_observable
+    assert rarest is not None  # it raised the alarm
     percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
     where = _onset_text(rarest) or _against_text(ringing)
     leak = 100.0 * case.leak_probability(case.alarms[0])
@@ -167,9 +170,9 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation of an `alarm` other than a leak, and the way to tell it from a leak.
 
     The stated probability is that of all explanations without a leak. If the explanation has several events, only the
-    first one is described. If this event has no cause to name, such as a start, the text states only its time, the
-    onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no explanation
-    without a leak.
+    first one in `events.toml` is described. If this event has no cause to name, such as a start, the text states only
+    its time, the onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no
+    explanation without a leak.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)

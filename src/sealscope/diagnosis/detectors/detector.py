@@ -54,8 +54,8 @@ Factory = Callable[["Rig"], Detector]
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
     """Ask a detector for the reason, in one line, why it cannot use a recording; None if it can.
 
-    Line breaks of the detector's text are replaced by blanks. Raises TypeError if `usable` returns neither a text nor
-    None.
+    Line breaks of the detector's text are replaced by blanks; an empty text is a reason, too. Raises TypeError if
+    `usable` returns neither a text nor None.
     """
     reason: Any = detector.usable(recording)
     if reason is None:

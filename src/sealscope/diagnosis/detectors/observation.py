@@ -64,10 +64,11 @@ def _thread_pools(n_modules: int) -> Any:
 
 
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
-    """Test a recording for changes of duty, noise, mains hum and mean pressures, which may be mistaken for a leak.
+    """Test a recording for changes that no internal leak causes, but that may be mistaken for one.
 
-    Changes within the recording and against `baseline` are tested. If there is a reason to `distrust` the pressures,
-    nothing is tested, and the report states this reason.
+    Duty, noise, mains hum, sense of p_A - p_B and mean pressures are tested for changes within the recording; friction,
+    drifts and spectra are compared with those of `baseline`. If there is a reason to `distrust` the pressures, nothing
+    is tested, and the report states this reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -140,8 +141,8 @@ def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
 
-    These are changes of the signals (duty, noise, hum, mean pressures) and of the volume balance, once for each
-    assumption on the valves at rest that the recording allows. Without a balance the pressure response is tested.
+    These are changes of the signals (`observe_signals`) and of the volume balance, once for each assumption on the
+    valves at rest that the recording allows. Without a balance the pressure response, which then judges, is tested.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -155,7 +156,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     for is_shut, report in reports.items():
         prefix = SHUT if is_shut else ""
         surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
-    if not reports:
+    if not reports and PRESSURE_RESPONSE in detectors():
         surprisals |= _max_surprisals(run_detector(PRESSURE_RESPONSE, recording, (), rig))
     return surprisals
 

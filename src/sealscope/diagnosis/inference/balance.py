@@ -1,4 +1,4 @@
-"""Blocks of a volume balance from the samples of a recording or of a stream, with identical results.
+"""Blocks of a volume balance from the samples of a whole recording or of a stream.
 
 A block is a few seconds of samples, reduced to Gram matrices of a linear regression (`blocks.Blocks`). Each row of the
 regression is the volume balance (`equations.terms`), integrated with one test function of the weak form
@@ -78,7 +78,7 @@ BATCH_SAMPLES = 8192
 class BlockStream(SavedAttributes):
     """Division of a stream of samples into blocks, each reduced to Gram matrices of the volume balance.
 
-    The blocks do not depend on how many samples arrive at a time.
+    The blocks do not depend on how many samples arrive at a time, unless `n_first` is None.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ class BlockStream(SavedAttributes):
         self._finds_rests = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
         if self._finds_rests:
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
-        if self._drops_rests:
+        if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
         self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
@@ -168,7 +168,7 @@ class BlockStream(SavedAttributes):
         n_complete = max(0, (self._end - tail) // length)
         is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
         min_blocks = (self._n_first or 1) if is_waiting else 1
-        if n_complete <= self._n_closed or (self._n_closed == 0 and n_complete < min_blocks):
+        if n_complete <= self._n_closed or n_complete < min_blocks:
             return None
         joined = self._join_pieces()
         # groups of blocks whose rows are weighted together, by the index past their last block
@@ -207,6 +207,7 @@ class BlockStream(SavedAttributes):
         super().load_state(state)
         samples = require_part(state, "samples", Mapping)
         self._pieces = [{name: restore_array(values, name) for name, values in samples.items()}] if samples else []
+        # the shortest array, should the lengths in a saved state differ
         self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
 
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
@@ -356,8 +357,9 @@ def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Arra
     """Compute p_A - `area_ratio` p_B in each row of a regression, i.e. the pressures' force over the area of A.
 
     `rows` (r, m): rows of a volume balance; `columns`: roles of their columns; `area_ratio`: area of the piston on side
-    B over that on side A. p_A and -p_B are the columns of the two external leaks. If the balance lacks one of them, or
-    if `area_ratio` is 1, the result is the column of the leak, p_A - p_B. The result has the shape (r,).
+    B over that on side A. p_A and -p_B are the columns of the two external leaks: 0 while the pressure is negative or,
+    with a meter in a valve's supply line, while its side is not fed. If the balance lacks one of them, or if
+    `area_ratio` is 1, the result is the column of the leak, p_A - p_B. The result has the shape (r,).
     """
     names = [f"external leak {side}" for side in "AB"]
     if area_ratio == 1.0 or not set(names) <= set(columns.names):
@@ -647,11 +649,11 @@ def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equati
     """
     signals = Signals(samples, rate)
     is_lowering = flag_lowering(balance.left(signals), signals.step("x"), rate)
-    drive = flow_source(samples)
-    if drive is None or not is_lowering.any():
+    source = flow_source(samples)  # not None: the balance has a recorded flow
+    if source is None or not is_lowering.any():
         return dict(samples)
     is_touched = np.append(is_lowering, False) | np.append(False, is_lowering)  # samples on either side of an interval
-    return {**samples, drive: np.where(is_touched, np.nan, samples[drive])}
+    return {**samples, source: np.where(is_touched, np.nan, samples[source])}
 
 
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
@@ -670,7 +672,7 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
     Both are those of `max_rest_rate`, with two exceptions:
 
     - In a balance with terms of its own at rest (`is_separate_at_rest`) the piston alone decides, with the fraction
-      `rest.moves` (`priors.toml`) of its mean speed in motion, and short stops count.
+      `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
     - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
       valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is then `NEVER`: the
       piston never counts as resting.

@@ -58,7 +58,7 @@ class Blocks:
     Parameters
     ----------
     start, end : array of float, shape (K,)
-        Times of the first and the last row of each block [s].
+        Times of the first and the last row of each block [s], i.e. of the middles of their test functions.
     gram : array of float, shape (K, E, m, m)
         Gram matrices of each block for each of E equations: weighted sums, over the rows, of the products of the m
         columns with each other. The left side is the last column.
@@ -70,7 +70,8 @@ class Blocks:
     pressures : array of float, shape (K, p)
         Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
     zero : array of float, shape (K,)
-        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`).
+        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`), the
+        same in all blocks of a recording.
     """
 
     start: Array
@@ -116,7 +117,8 @@ class Blocks:
     def is_moving(self) -> NDArray[np.bool_]:
         """Flags (K,) of the blocks in which the pump moves the piston.
 
-        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less.
+        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less. If
+        all flows are 0, all blocks are flagged.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
@@ -133,7 +135,7 @@ class Blocks:
         """Merge neighbouring blocks in groups of equal size, so that at most `max_blocks` blocks remain.
 
         The last group may be smaller. Gram matrices and numbers of rows are added, flow is averaged with the numbers of
-        rows as weights, and pressures with `pressure_weights`; `zero` is that of a group's first block.
+        rows as weights, and pressures with `pressure_weights`; `zero` is the same in all blocks.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
@@ -141,7 +143,7 @@ class Blocks:
         first = np.arange(0, len(self), group_size)
         end = np.append(first[1:], len(self))
         rows, sizes = np.add.reduceat(self.rows, first), end - first
-        weights = self.rows / np.maximum(np.repeat(rows, sizes), 1.0)
+        weights = self.rows / np.maximum(np.repeat(rows, sizes), 1.0)  # 1.0 avoids 0/0 in a group without rows
         pressure_weights = self.pressure_weights / np.repeat(np.add.reduceat(self.pressure_weights, first), sizes)
         return Blocks(
             start=self.start[first],
@@ -197,16 +199,18 @@ class ColumnRoles:
     The m columns are the m - 1 terms of the volume balance and, last, its left side. Indices of columns:
 
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
-    - `nuisance`: terms whose coefficients are unknown in any machine;
+    - `nuisance`: terms whose coefficients are unknown in any machine, the leak among them;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
     - `motion`: motion of the piston, or flow of the valve's edges; `compliance`: the chambers' oil and its air;
-    - `hold_leak`: leakage of a pump that holds the load, left out in a comparison of recordings, or None;
+    - `hold_leak`: leakage of a pump that holds the load, left out in a comparison of recordings (`regimes`); None
+      unless valves shut at rest;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
 
     Prior standard deviations of the coefficients (m - 1,):
 
     - `drift_rate`: drift, relative to the coefficient [1/min];
-    - `between_deviation`: relative difference between recordings, infinite without a prior, 0 if it repeats;
+    - `between_deviation`: relative difference between recordings, infinite without a prior, 0 if it repeats, or if the
+      term is not among `compared`;
     - `level_deviation`: constant part, in the coefficient's unit, infinite without a prior (`level_deviations`).
 
     `names` and `drivers` (m - 1,): names and drivers of the terms (`Term`); `healthy_conductance` [m^3/(s Pa)]:
@@ -255,18 +259,19 @@ class ColumnRoles:
 
         They are those of `level_deviation`, with two exceptions: a piston that always moves at one speed and pressure
         does not separate a pump's flow offset, or the delay of the position, from its area. The deviation of the flow
-        offset is therefore `level.bias` (`priors.toml`) times the rms flow, that of the delay's term `level.lag` [s]
-        times the area. `total` (m, m): Gram matrix of the recording.
+        offset is therefore `level.bias` (`priors.toml`) times the rms flow, that of the delay's term (`LAG`)
+        `level.lag` [s] times the area, the rms flow over the rms speed. `total` (m, m): Gram matrix of the recording.
         """
         deviations, energies = self.level_deviation.copy(), np.diag(total)
         piston = [k for k in self.motion if self.names[k].startswith("motion")]
-        if not piston:
+        if not piston:  # behind a servo valve, or in a balance without motion
             return deviations
+        # finite for an external leak, which has a prior of its own (`level.outside`)
         if self.bias is not None and not np.isfinite(deviations[self.bias]) and energies[self.bias] > 0.0:
             deviations[self.bias] = INFERENCE.level.bias * np.sqrt(energies[self.left] / energies[self.bias])
-        moved = float(energies[piston].sum())
-        if LAG in self.names and moved > 0.0:
-            deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / moved)
+        motion_energy = float(energies[piston].sum())
+        if LAG in self.names and motion_energy > 0.0:
+            deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / motion_energy)
         return deviations
 
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
@@ -288,7 +293,10 @@ class ColumnRoles:
             return np.asarray(1.0 / deviations**2)
 
     def with_free_zero(self) -> ColumnRoles:
-        """Return a copy whose flow offset (zero of the flow) may differ freely between recordings."""
+        """Return a copy with an infinite prior deviation of the flow offset between recordings (`between.bias`).
+
+        Balances for shut valves have it already; those for open valves are then compared in the same way.
+        """
         roles = copy(self)
         if self.bias is not None:
             roles.between_deviation = self.between_deviation.copy()
@@ -298,7 +306,8 @@ class ColumnRoles:
     def replace_leak(self, name: str) -> ColumnRoles:
         """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term.
 
-        The prior deviation of the old leak between recordings becomes `between.pump` (`priors.toml`).
+        The prior deviation of the old leak between recordings, infinite for the tested term, becomes `between.pump`
+        (`priors.toml`).
         """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
@@ -308,9 +317,10 @@ class ColumnRoles:
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the leak coefficient of `column` in a healthy machine.
 
-        The result is in the unit of the coefficient, and infinite if no pressure drives the flow of this column. The
-        coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`. This
-        conductance is at most that of a healthy piston, since the pump's leakage is laminar.
+        The result is in the unit of the coefficient. It is infinite if no pressure drives the flow of this column, and
+        for a laminar leak if `healthy_conductance` is. The coefficient of an orifice is converted from a laminar
+        conductance by equal mean flows over `blocks`. This conductance is at most that of a healthy piston, since the
+        pump's leakage is laminar.
         """
         driver = self.drivers[column]
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -409,10 +419,10 @@ def information(
 ) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    For a leak the result also contains the prior standard deviation of the coefficient in a healthy machine (`level`).
-    The likelihoods of the equations are multiplied. `columns`: roles of the columns of each equation; `test`: index of
-    the coefficient's column; `with_expansion`: add the errors of the coefficient by an imperfect model of the oil's
-    expansion (`_expansion_errors`).
+    The likelihoods of the equations are multiplied. The result also contains the prior standard deviation of the
+    coefficient in a healthy machine (`level`), infinite unless it is that of a leak (`ColumnRoles.leak_deviation`).
+    `columns`: roles of the columns of each equation; `test`: index of the coefficient's column; `with_expansion`: add
+    the errors of the coefficient by an imperfect model of the oil's expansion (`_expansion_errors`).
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
@@ -433,7 +443,8 @@ def information(
         schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
         moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
         if with_expansion:
-            # (S^-1 + E)^-1 = (I + S E)^-1 S, without the inverse of the precision S, which may not exist
+            # the squared errors, a diagonal matrix E, are added to the covariance, the inverse of the precision S:
+            # (S^-1 + E)^-1 = (I + S E)^-1 S, without S^-1, which may not exist
             widening = np.linalg.inv(np.eye(count) + schur * _expansion_errors(fit, roles) ** 2)
             schur, moment = widening @ schur, widening @ moment
         precision += 0.5 * (schur + schur.T)
@@ -450,17 +461,16 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     pressures rise and fall again, and large where they only relax.
     """
     n_polynomials = fit.polynomials.shape[1]
-    is_compliance = np.repeat(
-        [*(k in roles.compliance for k in fit.nuisance), False], n_polynomials
-    )  # last: the offset
+    # a flag for each polynomial of each nuisance column, and of the offset's, which is the last
+    is_compliance = np.repeat([*(k in roles.compliance for k in fit.nuisance), False], n_polynomials)
     coupling = np.where(is_compliance, fit.normal.coupling, 0.0)
     gram, _, _ = fit.normal.eliminate_tested()
     covariances = solve(gram + np.diag(fit.prior_precision), coupling.T) * fit.variance
-    # squared product of the tested column and the fitted volume, minus the part that errors of the fit cause
+    # squared product of the tested column and the fitted volume of expansion, minus its variance by errors of the fit
     squares = (coupling @ fit.coefficients) ** 2 - np.einsum("kc,ck->k", coupling, covariances)
     has_energy = fit.normal.energy > 0.0
-    volumes = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
-    return np.asarray(INFERENCE.blocks.expansion * volumes / np.where(has_energy, fit.normal.energy, 1.0))
+    products = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
+    return np.asarray(INFERENCE.blocks.expansion * products / np.where(has_energy, fit.normal.energy, 1.0))
 
 
 def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
@@ -527,8 +537,9 @@ class _Prior(NamedTuple):
     """Prior standard deviations of c nuisance coefficients: `level` of their constant parts and `drift`, (c,) each.
 
     The last coefficient is the error [Pa] that remains of the sensor offset of p_A - p_B. The prior standard deviation
-    of the whole offset is `offset` [Pa]. `current_offset` [Pa] is already subtracted, so that the remaining error has
-    the prior mean -`current_offset`.
+    of the whole offset is `offset` [Pa], 0 if it has no effect. `current_offset` [Pa] is already subtracted, so that
+    the remaining error has the prior mean -`current_offset`. If an orifice is tested, all three are errors of the root
+    of p_A - p_B [Pa^0.5].
     """
 
     level: Array
@@ -575,8 +586,8 @@ class _EquationFit(NamedTuple):
     """Fit of one equation to K blocks: sensor offset of p_A - p_B and nuisance coefficients.
 
     - `nuisance`: indices of the nuisance columns; `polynomials` (K, n): those of their drifts;
-    - `normal`: normal equations after subtracting `offset` [Pa], which is relative to the one already removed;
-    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the offset's error [Pa];
+    - `normal`: normal equations after subtracting `offset` (unit: see `_Prior`), relative to that already removed;
+    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the offset's error;
     - `prior_precision` (c,): prior precision times `variance`; `prior_moment` (c,): its product with the prior mean;
     - `variance`: variance of a row's residual, inflated for overlapping rows.
     """
@@ -607,7 +618,7 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     level = roles.level_deviations(total)[nuisance]
-    magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation
+    magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation, which `constants` may exceed
     # standard deviations of the drifts over the recording; the last is 0, since the sensor offset does not drift
     drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
@@ -634,11 +645,11 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
 def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
     """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
 
-    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure times the sampling
-    interval dt, from which `offset` [Pa] times dt is subtracted; `coefficients` (K,): coefficient g of this column in
-    each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the volume balance with
-    respect to the offset. In a balance without a flow offset, whose column is dt, nothing is corrected, and the last
-    column is zero.
+    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure or its root times the
+    sampling interval dt, from which `offset` [Pa] or [Pa^0.5] times dt is subtracted; `coefficients` (K,): coefficient
+    g of this column in each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the
+    volume balance with respect to the offset. In a balance without a flow offset, whose column is dt, nothing is
+    corrected, and the last column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))

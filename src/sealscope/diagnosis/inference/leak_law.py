@@ -123,6 +123,7 @@ def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Infor
     blocks.
     """
     shapes = apparent_conductances(blocks, columns)
+    # the mean only sets the unit of the fitted constant
     return np.array(
         [
             constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
@@ -168,7 +169,9 @@ def estimate_older_flow(
     where d is the difference between the two flows and v its variance, and by the largest likelihood ratio in
     `log_ratios` (those of `older_log_ratios`).
     """
-    log_ratio = float(log_ratios.max())  # of any e < 1: the data tell these from e = 1, but hardly from each other
+    # one ratio for every e < 1: the data tell these from e = 1, whose ratio is 0 without a prior on the level of the
+    # leak (`onset.constant_log_ratio`), but hardly from each other
+    log_ratio = float(log_ratios.max())
     weights, flows = list[float](), list[Estimate]()
     for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
         flow, weight = by_rise, float(log_prior)

@@ -157,7 +157,7 @@ class LeakMeasure:
 
     The standard errors of flows exclude the errors of the piston's area and the pump's displacement, which scale all
     flows (`size_deviation`). A subclass may replace fields by properties, which are computed when they are first read
-    (`BalanceLeak`).
+    (`BalanceLeak`), and overrides the methods, which here return `total_leakage` or None.
 
     Parameters
     ----------
@@ -226,7 +226,8 @@ class LeakMeasure:
     def total(self, detectable_flow: float | None) -> TotalLeakage | None:
         """Return the total leakage and the smallest detectable leak; None if both are unknown.
 
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected, None if it is unknown.
+        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected, None if it is unknown; a stated
+        `total_leakage` does not depend on it.
         """
         return self.total_leakage
 

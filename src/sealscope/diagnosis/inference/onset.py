@@ -258,8 +258,9 @@ def fit_history(information: Information, test: StepTest | None, *, with_step: b
 
     `information`: likelihood of the coefficient in the blocks; `test`: step test of the coefficient, whose fitted
     variances of walk and noise are used. Without a test there is no walk, and the noise has the variance 1. With fewer
-    than `MIN_BLOCKS` blocks there is no slope. `with_step`: add a step at the best onset of `test`, and use the
-    variances that were fitted together with a step.
+    than `MIN_BLOCKS` blocks there is no slope. Of the priors of `information` only that on the slope is used; the noise
+    inflates its variance, too. `with_step`: add a step at the best onset of `test`, and use the variances that were
+    fitted together with a step.
     """
     time = information.time
     count = len(time)
@@ -349,7 +350,7 @@ def constant_log_ratio(information: Information, shape: Array) -> float:
     A leak that is older than the recording adds to the coefficient a constant times `shape` (K,), its apparent
     coefficient in each block. `shape` varies with the pressure unless the flow is laminar. The result is the log
     likelihood ratio of the best positive constant to no constant, each with the random walk that fits best. It is at
-    least 0, and 0 if `shape` hardly varies or too few blocks have information.
+    least 0, and 0 if too few blocks have information, or if `shape` hardly varies and the level has no prior.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:
@@ -357,6 +358,7 @@ def constant_log_ratio(information: Information, shape: Array) -> float:
     whitening, z, _ = whitened
     n_prior_blocks = whitening.transform.shape[1] - len(shape)  # 1 with a prior on the level before the recording
     steps = whitening.transform_steps(np.array([float(n_prior_blocks)]), shape)  # a step at the first block
+    # without a prior on the level, a constant `shape` is projected out with the level
     if not (steps**2).sum() > RANK_TOLERANCE * float((whitening.transform**2).sum() * (shape**2).max()):
         return 0.0
     fits, n = _fit_steps(z, steps, whitening.eigen), len(z)
@@ -379,7 +381,7 @@ def step_sizes(
     the standard error of the size, (o,) each.
     """
     whitened = _whiten_blocks(information)
-    assert whitened is not None
+    assert whitened is not None  # else there is no step test with onsets
     whitening, z, _ = whitened
     n = len(z)
     fit = _fit_steps(z, whitening.transform_steps(whitening.positions[onsets], shape, growth), whitening.eigen)
@@ -445,10 +447,12 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     """Compute the mean of a unit step in each of `count` = K blocks, for each of o onsets, shape (K, o).
 
     `positions` (o,): onsets, counted in blocks from the start. From its onset within a block on, the step grows
-    linearly from 1 to 1 + `growth` at the end of the last block. If `growth` is infinite, it grows from 0 to 1.
+    linearly from 1 to 1 + `growth` at the end of the last block. If `growth` is infinite, it grows from 0 to 1. The
+    growth within a block is that in its middle.
     """
     end_since_onset = np.arange(count)[:, None] + 1.0 - positions  # end of each block minus onset, (K, o)
     steps, middle_since_onset = np.clip(end_since_onset, 0.0, 1.0), end_since_onset - 0.5
+    # 1.0: no division by zero for an onset at the end
     grown_fraction = np.clip(middle_since_onset / np.maximum(count - positions, 1.0), 0.0, 1.0)
     growing = grown_fraction if np.isinf(growth) else 1.0 + growth * grown_fraction
     return np.asarray(steps * growing)
@@ -494,12 +498,13 @@ class _Whitening(NamedTuple):
         """Compute the change of the n whitened values by a unit step at each of o onsets, shape (n, o).
 
         `positions`, `growth`: as in `step_shapes`; `shape`: factor on the step in each block of the recording, by
-        default 1. If a prior on the level counts as a further first block, it has no entry in `shape`.
+        default 1. A prior on the level is one more block, before those of the recording (`_prepend_level_prior`). It
+        needs no factor, since it precedes every onset: the step is 0 in it.
         """
         count = self.transform.shape[1]
         steps = step_shapes(count, positions, growth)
         if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]
+            steps[count - len(shape) :] *= shape[:, None]  # the blocks of the recording
         return np.asarray(self.transform @ steps)
 
 
@@ -507,14 +512,14 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
     """Transform the estimates of a coefficient in blocks to independent values of variance 1.
 
     Returns the matrices of this transform, the values z (n,), and the times of the possible onsets (o,) [s]. Returns
-    None if too few blocks determine the coefficient.
+    None if too few blocks determine the coefficient, or if the precision is not finite.
     """
     time, precision, vector = _prepend_level_prior(information)
     if not np.isfinite(precision).all():
         return None
     slope, walk, shape = information.slope, information.walk, information.shape
     if shape is not None:
-        shape = np.append(np.zeros(len(time) - len(shape)), shape)  # a prior on the level is one more block
+        shape = np.append(np.zeros(len(time) - len(shape)), shape)  # 0 in the block that a prior on the level adds
         whitening = _build_whitening(precision, slope, walk, shape, information.disturbance)
     elif np.array_equal(precision, np.eye(len(time))):  # the matrices of this frequent case are cached
         whitening = _unit_whitening(len(time), slope, walk)
@@ -589,7 +594,8 @@ def _build_whitening(
 def _prepend_level_prior(information: Information) -> tuple[Array, Array, Array]:
     """Return `time`, `precision` and `vector`, with a finite prior on the level added as a block before the first.
 
-    They are returned unchanged if the prior is infinite, or if there are fewer than `MIN_BLOCKS` blocks.
+    They are returned unchanged if the prior is infinite, or if there are fewer than `MIN_BLOCKS` blocks: the added one
+    must not count towards this number.
     """
     time, precision, vector, level = information[:4]
     if not np.isfinite(level) or len(time) < MIN_BLOCKS:

@@ -46,7 +46,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
-    coarse = blocks.merge(INFERENCE.blocks.coarse)
+    coarse = blocks.merge(INFERENCE.blocks.coarse)  # fewer blocks: the time of the leak's onset need not be exact
     equations = [
         whitened
         for k, roles in enumerate(columns)
@@ -55,7 +55,8 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     if not equations:
         return blocks
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
-    unit = columns[0].offset_deviation(columns[0].leak, blocks)  # usual standard deviation of the offset [Pa]
+    # usual standard deviation of the offset [Pa], smaller for pressures in counts
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)
     offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
     gram = blocks.gram.copy()
     for k, roles in enumerate(columns):
@@ -93,7 +94,10 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant."""
+        """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant.
+
+        In the prior, a relative offset of 1 is `usual` [Pa], also for pressures in counts.
+        """
         return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)

@@ -49,7 +49,7 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
     - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
       (`BIAS`), as in `balances.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
       load, remains if some hold lasts for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set
-      to zero.
+      to zero, and the leak's coefficient describes the holds as well.
 
     If all holds are short and the pump is off at other times, the machine is a press, whose pump builds up the pressure
     through open valves in these holds. If its valves are certainly shut at rest (`is_certain`), holds count as motion:
@@ -175,7 +175,8 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
     """Fit coefficients (c,) by least squares, with White's covariance (c, c) for errors that differ between K blocks.
 
-    `gram` (K, m, m): Gram matrix of each block; `columns`, `left`: indices of the columns to fit and of the left side.
+    `gram` (K, m, m): Gram matrix of each of K > 1 blocks; `columns`, `left`: indices of the columns to fit and of the
+    left side.
     """
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
     total = grams.sum(axis=0)

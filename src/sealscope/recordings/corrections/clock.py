@@ -1,8 +1,8 @@
 """An even clock for samples that were polled at uneven times.
 
-The diagnosis integrates over an even clock. Uneven samples are interpolated linearly to the median rate; integrated,
-that is the trapezoidal rule over the recorded times. Between samples that are far apart, values are missing;
-`corrections.gaps` bridges and marks them. Called by the inspection.
+The diagnosis integrates over an even clock. Uneven samples are interpolated linearly to the recording's rate;
+integrated, that is about the trapezoidal rule over the recorded times. Between samples that are far apart, values are
+missing; `corrections.gaps` bridges and marks them. Called by the inspection.
 """
 
 from __future__ import annotations

@@ -69,10 +69,10 @@ def remove_dropouts(recording: Recording) -> Recording:
 def remove_unsupplied(recording: Recording) -> Recording:
     """Set to NaN the samples of a recording during which the sensors had no supply.
 
-    A sensor of 4 to 20 mA then reads a quarter of its range below zero. With the fraction `gaps.live_zero`
-    (`priors.toml`), these samples are
+    A sensor of 4 to 20 mA then reads a quarter of its range below zero; the fraction `gaps.live_zero` (`priors.toml`),
+    a little less, is enough. These samples are
 
-    - all channels, where both chamber pressures are below vacuum by more than this fraction of their maximum;
+    - all channels, where each chamber pressure is below vacuum by more than this fraction of its own maximum;
     - the position alone, where it is constant from the first sample or up to the last one, and outside of all its other
       values by more than this fraction of their range, if these are at least `_MIN_POSITIONS` different ones. It may be
       so at both ends.
@@ -108,7 +108,8 @@ def _flag_dead_ends(position: Array) -> Flags:
     if known.size < 2:
         return is_dead
     values = position[known]
-    *_, second, largest = 0, *np.argsort(np.abs(np.diff(values))) + 1  # first samples after the largest steps
+    # first samples after the two largest steps; 0 if there is only one step
+    *_, second, largest = 0, *np.argsort(np.abs(np.diff(values))) + 1
     for start, stop in ((largest, values.size), (0, largest), (min(second, largest), max(second, largest))):
         live, ends = values[start:stop], [end for end in (values[:start], values[stop:]) if end.size]
         if all(_is_dead_end(end, live) for end in ends) and np.unique(live).size >= _MIN_POSITIONS:

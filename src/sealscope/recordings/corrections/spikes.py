@@ -23,7 +23,7 @@ _PRIORS = RECORDINGS.spike
 _NEIGHBOURS, _MIN_SAMPLES = 10, 50
 #: Smallest spike, in quantisation steps.
 _MIN_QUANTA = 10.0
-#: Most changes from which the usual size of a change is estimated.
+#: More changes are thinned to this many, or up to twice as many, to estimate the usual size of a change.
 _N_CHANGES = 2**15
 
 

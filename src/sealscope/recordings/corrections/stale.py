@@ -34,7 +34,7 @@ _MAX_REPEAT = 3
 def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Replace samples that repeat the previous one by linear interpolation between new readings; also return findings.
 
-    Either a channel holds each reading for a fixed time (`estimate_holding_period`), or the logger repeats whole rows.
+    A channel may hold each reading for a fixed time (`estimate_holding_period`), and the logger may repeat whole rows.
     Slow channels and the command u stay as they are.
     """
     names = [name for name in recording.channels if name not in SLOW and name != "u"]
@@ -85,11 +85,11 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 
     All channels are constant or missing there, and both chamber pressures for longer than their noise allows
     (`find_holds`). No channel jumps at the first of these rows, but one does after the last, as the machine moved on.
-    Nothing is flagged without both chamber pressures, or with fewer than `stale.runs` (`priors.toml`) rows in all.
+    Nothing is flagged without both chamber pressures.
     """
     flags = np.zeros(len(recording), dtype=bool)
     pressures = [recording[name] for name in CHAMBERS if name in recording]
-    if len(pressures) < len(CHAMBERS) or len(recording) < _PRIORS.runs:
+    if len(pressures) < len(CHAMBERS):
         return flags
     holds_a, holds_b = (find_runs(find_holds(values, recording.rate).flags) for values in pressures)
     begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
@@ -101,7 +101,7 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
         inner = slice(first + _MAX_REPEAT, stop - _MAX_REPEAT)
         if (
             coincide
-            and first > 1
+            and first > 1  # a row before the repeated one shows if a channel jumps
             and stop < len(recording)
             and all(np.isnan(values[inner]).all() or np.ptp(values[inner]) == 0.0 for values in channels)
             and not any(_jumps_at(values, first) for values in channels)
@@ -114,7 +114,8 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
 def _jumps_at(values: Array, row: int) -> bool:
     """Test whether a channel (n,) changes around `row` by more than the quantile `stale.leap` of its usual changes.
 
-    Changes are those over 7 sampling steps, here from 4 rows before `row` to 3 rows after it.
+    Changes are those over 7 sampling steps, here from 4 rows before `row` to 3 rows after it, as the holds of p_A and
+    p_B may begin or end up to 3 rows apart.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -189,6 +190,7 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     by more than `_MIN_JUMP` quantisation steps both before and after these rows. Nothing is flagged unless there are at
     least `stale.repeats` (`priors.toml`) times as many places as rows that are expected to repeat by chance. The
     expected fraction of rows is that for channels that repeat independently of each other, but at least `stale.fewest`.
+    Fewer than `stale.runs` rows show no habit of a logger; none of them is flagged.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:

@@ -63,7 +63,7 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
 def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     """Test whether a flow meter without a sign is in the supply line of a valve, and not in a line of the cylinder.
 
-    Command and piston must move both ways, and one of two signs of the supply line is enough. The flow over the
+    Command and piston must move both ways, and one of two marks of the supply line is enough. The flow over the
     piston's speed, i.e. the area of the fed chamber, may differ between the directions, as with a single rod: its
     logarithm by more than `unsigned.unlike` (`priors.toml`). Or oil passes the valve while the piston rests, more than
     the fraction `unsigned.passes` of the mean flow in motion. `sign` (n,): signs of the flow into chamber A.
@@ -75,13 +75,13 @@ def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
         return False
     directions = ((speed > 0.0) & (sign > 0.0), (speed < 0.0) & (sign < 0.0))
     # flow over speed in each direction [unit of the flow per m/s]; 0 without motion that has the flow's sign
-    gains = [
+    areas = [
         float(magnitude[moves] @ np.abs(speed[moves])) / max(float(speed[moves] @ speed[moves]), np.finfo(float).tiny)
         for moves in directions
     ]
-    if min(gains) > 0.0 and abs(float(np.log(gains[0] / gains[1]))) > _PRIORS.unlike:
+    if min(areas) > 0.0 and abs(float(np.log(areas[0] / areas[1]))) > _PRIORS.unlike:
         return True
-    # over the mean speed, weighted by the speed itself, so that rests do not count
+    # faster than a fraction of the mean speed, which is weighted by the speed itself, so that rests do not count
     is_moving = np.abs(speed) > _PRIORS.rests * float(speed @ speed) / float(np.abs(speed).sum())
     flow_at_rest = float(magnitude[~is_moving].mean()) if not is_moving.all() else 0.0
     return flow_at_rest > _PRIORS.passes * float(magnitude[is_moving].mean())
@@ -99,7 +99,7 @@ def _has_one_sign(values: Array) -> bool:
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
-    They are fitted to the position (`_fit_signs`) or, if there is no position, are those of the command. Returns (None,
+    The signs are fitted to the position (`_fit_signs`) or, without a position, are those of the command. Returns (None,
     "") if neither is recorded, or if the one used does not move in both directions or hardly correlates with the
     `magnitude` (n,) of the speed or flow.
     """

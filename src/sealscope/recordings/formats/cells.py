@@ -55,7 +55,7 @@ def is_missing(cell: str) -> bool:
 
 
 def is_number(cell: str, decimal: str) -> bool:
-    """Test whether a cell is a number with the decimal separator `decimal`, with or without thousands separators."""
+    """Test whether a cell is a number, or `inf`, with the decimal separator `decimal`; thousands may be separated."""
     cell = cell.strip()
     return len(cell) <= _MAX_NUMBER and bool(_NUMBER[decimal].fullmatch(cell) or is_grouped(cell, decimal))
 

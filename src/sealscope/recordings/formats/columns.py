@@ -134,8 +134,8 @@ def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
     """Reconstruct the map that "auto" has chosen for a recording, channel -> column, from its provenance.
 
-    A column has its unit if its name ends in one; units in a user's map are not in the provenance. Without an entry
-    `columns` in the provenance, the map is empty.
+    A unit at the end of a column's name is added, as in `PA_bar[bar]`; units in a user's map are not in the provenance.
+    Without an entry `columns` in the provenance, the map is empty.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
@@ -198,7 +198,7 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
             return Formula({column: 1.0}, 0.0, _find_unit(labels[column], channel) if unit is None else unit)
     try:
         formula = parse_formula(column_text)
-    except InputError:  # without an operator the text is meant as a name
+    except InputError:  # without an operator the text is meant as a name, which may contain - and /
         if any(operator in column_text for operator in "*+"):
             raise
         formula = Formula({column_text: 1.0})
@@ -301,7 +301,7 @@ def _find_time(labels: Sequence[Label]) -> int | None:
     """Find the index of the time column; None if there is none.
 
     It is a column named `t`, else one with another usual name (`WORDS["time"]`, in this order), else one that `is_time`
-    accepts and that is not named as a date. Of several columns with one name, the first with a unit is preferred.
+    accepts and that is not named as a date. Of several such columns, the first with a unit is preferred.
     Raises InputError if several are called `t`.
     """
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
@@ -327,7 +327,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
     """
     labels, used = choice.labels, choice.channel_of
     parts = find_time_parts(labels, used)
-    if "hour" in parts and choice.time in (None, *parts.values()):
+    if "hour" in parts and choice.time in (None, *parts.values()):  # a time column besides them takes precedence
         dates = [i for i in _date_columns(choice) if i not in parts.values()]
         time = parts["hour"] if choice.time is None else choice.time
         time = dates[0] if dates and "year" not in parts else time  # the date to which the parts are added
@@ -419,7 +419,8 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     if rate is not None:  # the time is named in the notes, but not read
         choice.time = choice.time_label = choice.date = None
     elif "t" not in columns and not choice.parts and choice.time is not None:
-        # without columns of hours, minutes, ... (`parts`) a time column that is called a date may have only dates
+        # without columns of hours, minutes, ... (`parts`) a time column that is called a date may have only dates, and
+        # is then refused (`convert_columns`), unless the user has mapped it
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
     choice.channels = dict(sorted(choice.channels.items(), key=lambda item: next(iter(item[1].factors))))

@@ -113,7 +113,7 @@ def _parse_label(name: str, data: Any) -> Label:
         (_decode_text(data.attrs[key]) for key in ("units", "unit", "Units", "Unit") if key in data.attrs), None
     )
     label = Label.parse(name, unit)
-    return Label(name, label.name, label.unit)
+    return Label(name, label.name, label.unit)  # `whole` is the exact name in the file
 
 
 def _read_values(data: Any, name: str, file_size: int) -> NDArray[Any]:

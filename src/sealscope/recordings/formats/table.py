@@ -145,6 +145,7 @@ def build_fields(
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
+    # sampling times of series count as one more column, unless a series is called t
     uses_clock = any(member.clock is not None for member in candidates) and not any(
         label.name == "t" for label in labels
     )
@@ -212,7 +213,7 @@ def convert_columns(
                 "a recording must have a time column such as t [s] or be given a rate, "
                 f"got dates alone in column {label.whole}"
             )
-        if description is None and is_falling(time):
+        if description is None and is_falling(time):  # what Sealscope has written is read back unchanged
             time, columns = time[::-1], {column: cells[::-1] for column, cells in columns.items()}
             notes.append("rows begin with the last sample: taken in the order of time")
     channels, units, log_units = _convert_channels(choice, columns)
@@ -236,7 +237,8 @@ def convert_columns(
     details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
     details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
     details["log_units"] = log_units
-    provenance = {key: value for key, value in details.items() if value or key in start}  # no empty ones
+    # no empty ones, but a start of 0
+    provenance = {key: value for key, value in details.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
 
 
@@ -356,7 +358,7 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     ambiguous = {name for name, count in Counter(names).items() if count > 1} & channel_names
     notes = []
     if ambiguous:
-        group = preferred[min(ambiguous)].group
+        group = preferred[min(ambiguous)].group  # of one of these channels, as it often has all
         other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
     unique_names = [
@@ -437,7 +439,8 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
 
     Samples that are slower than `t` or equally fast are interpolated linearly, with NaN within long intervals and
     beyond the ends; faster ones are averaged around the times. Samples that have the times `t` already are returned
-    unchanged. Also returns a note for the history, or "". Raises InputError unless the series' times increase.
+    unchanged. If the start of either clock is unknown, both are assumed to count from one moment. Also returns a note
+    for the history, or "". Raises InputError unless the series' times increase.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -528,6 +531,7 @@ def _pivot_long_table(
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
+    # names and units are not to be chosen as channels or times
     labels = [Label("", "") if column in text_columns else member.label for column, member in enumerate(series)]
     if "timestring" in {label.name.casefold() for label in labels}:  # WinCC's exact times, in 1e-6 days
         days = Label("Time_ms", "t", "microday since 1899-12-30")

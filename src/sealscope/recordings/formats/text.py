@@ -113,6 +113,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
         except InputError:
             if choice is None:
                 raise
+            # else the columns called times are not one for each channel: the log is read with a single time
         else:
             yield table
             return
@@ -303,7 +304,7 @@ class _Log:
         """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
         Lines that are not samples are left out. `first_line`: number of the block's first line, from 1; `is_cut`: the
-        file ends within the block's last line, and an incomplete number at its end is left out.
+        file ends within the block's last line. If this is shorter than the row before, its last number is left out.
         """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
@@ -414,7 +415,7 @@ class _Log:
         """Remove short rows of text, such as a note by the logger; return the other rows and their line numbers.
 
         A row of text has fewer cells than a sample needs, no value and at most `_MAX_TEXT_LINE` characters; these rows
-        are counted. Raises InputError for any other row with too few or too many cells.
+        are counted. Raises InputError for any other row with too few cells, or with too many that are not blank.
         """
         layout, max_cells = self.layout, len(self.layout.labels)
         if min(map(len, rows)) >= self.min_cells and max(map(len, rows)) <= max_cells:

@@ -37,7 +37,7 @@ COMMENTS = ("#", "%", "//", '"#', "!")
 _N_ROWS = 100
 #: Delimiters, each with the decimal separator of the dialect to try.
 _DIALECTS = (*product("\t;", ".,"), (",", "."), *product("|", ".,"), (",", ","), *product(" ", ".,"))
-#: A number and possibly its unit in one cell.
+#: A digit and a letter after it, which may begin a unit or be an SI prefix, but not the exponent of the number.
 _QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
 #: Most lines of a heading.
@@ -88,7 +88,7 @@ def detect_encoding(head: bytes) -> str | None:
         names = [name for i, name in enumerate(("utf-16-be", "utf-16-le")) if head[i::2].count(0) / n_pairs > 0.8]
         return names[0] if len(names) == 1 else None
     try:
-        codecs.getincrementaldecoder("utf-8")().decode(head)
+        codecs.getincrementaldecoder("utf-8")().decode(head)  # incremental, as the last character may be cut
     except UnicodeDecodeError:
         for name in ("gb18030", "shift_jis"):
             try:
@@ -265,7 +265,7 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
         and not any(Label.parse(text).name.casefold() in channel_names for text in names)
         and any(map(is_quantity, rows_above[0]))
     ):
-        # the name of a group stands only above its first column
+        # a group is named above its first column only; names that are channels already need no group
         groups = accumulate(chain(rows_above[0], repeat("")), lambda group, cell: cell.strip() or group, initial="")
         names = [f"{group} {text}".strip() for text, group in zip(names, islice(groups, 1, None), strict=False)]
         n_rows += 1
@@ -314,6 +314,7 @@ def detect_layout(head: bytes, encoding: str, place: str, *, is_complete: bool) 
     if prefixed := any(map(has_prefixes, _iter_splits(rows))):
         body = [expand_prefixes(line) for line in body]
         lines = [_expand_sample_prefixes(line) for line in lines]
+    # by the delimiter that gives most columns with units, as the dialect is found only after the units are removed
     cell_units = {} if prefixed else max(map(find_cell_units, _iter_splits(body)), key=len, default={})
     if cell_units:
         lines, body = ([remove_units(line, cell_units.values()) for line in part] for part in (lines, body))

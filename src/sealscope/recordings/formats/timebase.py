@@ -388,6 +388,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     seconds = to_si(values, unit, "s", name="time")
     epoch = float(seconds[np.isfinite(values)][0])
     if epoch >= _MIN_EPOCH:
+        # the difference is taken before the conversion, which would round such large times
         return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, []
     return seconds, {}, []
 

@@ -10,8 +10,9 @@ samples near its lowest values, the "low pressure" of the chamber, are fitted by
 with the position x, whose rod volume moves oil into the accumulator, and the flow q of the pump, which drops pressure
 in lines and check valves; without the pump's angle or speed there is no fit, as behind a valve. The fit is robust
 (Cauchy weights) and gives samples above it less weight than those below: where valves shut a chamber off, its
-pressure lies above the charge pressure. Standard errors are those of a jackknife. Called for healthy and judged
-recordings by `healthy_levels`.
+pressure lies above the charge pressure. A standard error has two parts: that of a jackknife, and the scatter between
+parts of the recording. Called for healthy and judged recordings by `healthy_levels`, and for a step that looks like a
+loss of oil by `volumes`.
 """
 
 from __future__ import annotations
@@ -85,12 +86,12 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
-    `charge.near` (`priors.toml`) of the chamber's lowest pressure and change more slowly than `charge.steady` [Pa/s]: a
-    load that swings through zero lowers the pressure only for a moment. While the pump rests no sample counts, as shut
-    valves may enclose any pressure. The drift of a chamber is unknown if its lowest pressure exceeds that of the other
-    chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples of a turning pump counts.
-    Return None if neither drift is known, if the recording is shorter than `MIN_SAMPLES`, or if a pressure, or both
-    angle and speed of the pump, are not recorded.
+    `charge.near` (`priors.toml`) of the chamber's lowest pressure, its quantile `LOWEST`, and change more slowly than
+    `charge.steady` [Pa/s]: a load that swings through zero lowers the pressure only for a moment. While the pump rests
+    no sample counts, as shut valves may enclose any pressure. The drift of a chamber is unknown if its lowest pressure
+    exceeds that of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples
+    of a turning pump counts. Return None if neither drift is known, if the recording is shorter than `MIN_SAMPLES`, or
+    if a pressure, or both angle and speed of the pump, are not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -98,6 +99,7 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
     drive, rate = recording[flow_channel], recording.rate
     turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate  # [rad] in each interval
+    # one flag for each sample, that of the interval after it; none follows the last sample
     is_turning = np.append(~find_rests(turned, rate, max_rest_rate(turned, rate)), False)
     is_known = np.isfinite(regressors).all(axis=1) & is_turning
     pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
@@ -139,7 +141,7 @@ class ChargeTrend(NamedTuple):
     def loss_support(self, flow: float, onset: float) -> float:
         """Compute twice the log likelihood ratio of a loss of oil to no loss, by the fall of the charge pressure.
 
-        A constant loss `flow` = q [m^3/s] since `onset` [s] empties an accumulator, whose gas volume at the charge
+        A constant loss q = abs(`flow`) [m^3/s] since `onset` [s] empties an accumulator, whose gas volume at the charge
         pressure p, divided by the polytropic exponent of the gas, is V. A straight line fitted to the pressure over the
         whole recording then falls at the rate
 
@@ -166,8 +168,7 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     """Estimate the rate [Pa/s] at which the charge pressure of a closed circuit falls, from both low pressures.
 
     The rate is minus the mean of the drifts of both pressures (`estimate_low_drifts`), weighted by their precisions.
-    Return None if neither chamber is at times near the charge pressure, or if neither angle nor speed of the pump is
-    recorded.
+    Return None where `estimate_low_drifts` does, or if no drift has a finite standard error.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
@@ -176,7 +177,7 @@ def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     if fall is None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
-    pressure = max(lowest, 0.0) + P_ATM
+    pressure = max(lowest, 0.0) + P_ATM  # gauge to absolute pressure; a reading below 0 counts as 0
     begin, end = float(recording.t[0]), float(recording.t[-1])
     return ChargeTrend(fall=fall.value, error=fall.deviation, pressure=pressure, begin=begin, end=end)
 
@@ -209,7 +210,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     if len(rows) < MIN_SAMPLES:
         return np.nan, np.nan
     time, values = t[rows] - t[rows].mean(), pressure[rows]
-    varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]
+    varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]  # a constant one cannot be told from level
     design = np.column_stack([time, np.ones(len(rows)), varying])
     equations = stack_equations(design, values)
     weight = np.zeros(len(rows))  # at first 1 for the lowest samples of each part of the recording, else 0
@@ -254,7 +255,9 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     comes from a prior on its size. A fall does not explain a difference between the two drifts; if both are known, its
     p-value is
 
-        chance = min(1, chance of the weighted mean of both drifts / chance of their difference).
+        chance = min(1, chance of the weighted mean of both drifts / chance of their difference),
+
+    or 1 if too few healthy recordings have both.
     """
     prior = CHANGES.charge
     scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
@@ -269,7 +272,7 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
             yield replace(change, advantage=-size_penalty(CHANGES.zero_drift, change.size))
-    # variance of each side's drift, including the variance between the healthy recordings
+    # of each side's drift: prior variance between days, squared standard error, variance between healthy recordings
     healthy_var = {side: float(np.var([drift.value for drift in known[side]])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
     falls = [mean for other in healthy if (mean := _mean_fall(other, variances)) is not None]

@@ -1,12 +1,13 @@
 """Tests for a step of features that no volume balance contains: amplitude of motion, sensor noise, hum.
 
 Each feature is one number in each block with motion, tested against its scatter between blocks. Blocks at rest, with a
-pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak changes none of the
-features:
+pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak is not taken for
+such a step:
 
-- The operator gives the command.
-- A leak damps the ringing, but the noise is measured at higher frequencies.
+- It changes the amplitude of the command or of the motion, not of both (`signals.duty_observables`).
+- It damps the ringing, but the noise is measured at higher frequencies.
 - The hum is measured in p_A + p_B, which does not ring.
+- With a leak, too, friction keeps p_A - p_B in phase with the flow.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from sealscope.signals.smoothing import TINY, average_over
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
-#: Channels of the command and of the motion, in the order of preference.
+#: Channels of the command and of the motion, in the order of preference; a single channel stands for both.
 COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
 #: Distances [bins] from a spectral line to bins outside of its main lobe with a Hann window.
 _NEIGHBOURS = _PRIORS.neighbours
@@ -88,8 +89,8 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
     """Yield the names "command" and "motion", each with the log amplitude (K,) of its channel in K blocks.
 
     The amplitude is the range from the 10 % to the 90 % quantile, which neither a short transient nor a short rest
-    changes much; NaN for a block without samples. `blocks`: samples (K, length) by channel. "command" or "motion" is
-    left out if none of its channels is recorded.
+    changes much. Its log is NaN for a block without samples, and -inf for constant samples. `blocks`: samples (K,
+    length) by channel. "command" or "motion" is left out if none of its channels is recorded.
     """
     for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
         if channel := next((candidate for candidate in candidates if candidate in blocks), None):
@@ -112,7 +113,7 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 
 
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
-    """Test features of the pressures, such as their noise, for a lasting change that only a sensor causes.
+    """Test features of the pressures, such as their noise, for a lasting change that no leak causes.
 
     Returns pairs of a feature's name and its test, without features that cannot be tested. The list is empty if a
     chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
@@ -121,7 +122,7 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
         return []
     length = len(recording) // BLOCKS
     time, blocks = _split_blocks(recording, length)
-    if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples
+    if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples, in which no channel has any
         return []
     is_moving = _find_moving_blocks(recording, length)
     tests = (
@@ -156,19 +157,22 @@ SENSOR_FEATURES = (
 
 
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield the name and the values (K,) of each feature of the pressures that only a change of a sensor shifts.
+    """Yield the name and the values (K,) of each feature of the pressures: sense, noise and hum, which no leak shifts.
 
-    The features (`SENSOR_FEATURES`) are the correlation of p_A - p_B with the flow, the noise of both pressures, the
-    difference of their noise, and the hum at the frequencies of the mains. The correlation is left out if no motion is
+    The features (`SENSOR_FEATURES`) are the sense of p_A - p_B, the noise of both pressures, the difference of their
+    noise, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
+    into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. A change of a sensor
+    shifts the features, and a load that changes its side shifts the sense. The sense is left out if no motion is
     recorded, and a hum if the sampling rate is too low. Noise is a log variance. The first word of a name is its kind
     of data (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate
     [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
-        # friction puts p_A - p_B in phase with the flow into A, so that their correlation is near 1; with exchanged or
-        # reversed sensors it is near -1
+        # friction puts p_A - p_B in phase with the flow into A, so that the sense is near 1; with exchanged or reversed
+        # sensors it is near -1
         flow = blocks[channel] if channel in ("omega", "u") else np.gradient(blocks[channel], axis=1)
+        # without a steady load or a sensor offset, which the mean over all blocks contains
         difference = p_A - p_B - np.nanmean(p_A - p_B)
         covariance, pressure_variance, flow_variance = (
             _row_statistic(np.mean, np.nanmean, products) for products in (difference * flow, difference**2, flow**2)
@@ -222,7 +226,7 @@ def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
     `time` (K,): middles of the blocks [s]. Return None if the values are constant or fewer than `MIN_BLOCKS`, or if one
-    of them is missing.
+    of them is not finite.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None

@@ -44,13 +44,15 @@ _PRIORS = CHANGES.levels
 #: Iterations of the scatter of differences between blocks.
 _SCATTER_ITERATIONS = 20
 _TINY = float(np.finfo(float).tiny)
+#: Unit changes of level_A, level_B, half_A and half_B.
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
 #: Name of a change of the friction, which changes with the direction of motion.
 FRICTION = "friction"
-#: Name of each pattern, and bases of its subspace. If the subspace contains simpler patterns, each of them supplies the
-#: first vectors of one basis.
+#: Name of each pattern, and bases of its subspace. If the subspace of the load contains simpler patterns, each of them
+#: supplies the first vector of one basis (`_test_patterns`). Friction has three patterns: both half differences change,
+#: with the mean level, alone and oppositely, or with any levels.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
     (FRICTION, [[A + B, HALF_A, HALF_B]]),
@@ -134,7 +136,7 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
     if cycle is not None:  # try blocks of whole cycles first
         cycle_samples = cycle * recording.rate
         lengths.insert(0, round(math.ceil(lengths[0] / cycle_samples) * cycle_samples))
-    min_count = _PRIORS.blocks[-1]
+    min_count = _PRIORS.blocks[-1]  # long cycles may leave fewer blocks
     for length in lengths:
         count = len(recording) // max(length, 1)
         if length < 2 or count < min_count:
@@ -209,8 +211,8 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 
     A step takes time, so that the block in which it begins shows neither the old nor the new levels. The tests are
     therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
-    second pass. The p-values are those of the first pass, with all blocks. With fewer than `MIN_BLOCKS` + 2 blocks
-    there is no second pass.
+    second pass. All else, such as the p-values, is from the first pass, with all blocks. With fewer than `MIN_BLOCKS` +
+    2 blocks there is no second pass.
     """
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]
@@ -240,7 +242,8 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     changes = list[LevelChange | None]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
-        # a pattern with several bases must be supported by each of them, so that the lowest rank counts
+        # the rank depends on the basis, as each direction has a random walk of its own: a pattern must be supported by
+        # each of its bases, so that the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if change is not None:
             # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
@@ -310,12 +313,14 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     n_blocks, n_directions = len(time), basis.shape[1]
     if not n_directions:
         return None
+    # followed by the directions in which the pattern changes nothing
     directions = np.column_stack([basis, np.linalg.qr(basis, mode="complete")[0][:, n_directions:]])
     components = [Information(time, np.eye(n_blocks), whitened @ direction) for direction in directions.T]
     tests = [test for component in components if (test := step_test(component, signs=(1.0, -1.0))) is not None]
     if len(tests) < len(components):
         return None
-    # variance of each direction without a step, and with a step at each onset: v for the log likelihood -n log(v) / 2
+    # variance of each direction without a step, and with a step at each onset, which is at most as large: v for the log
+    # likelihood -n log(v) / 2
     likelihood = np.array([test.likelihood for test in tests])
     likelihood_without = likelihood.max(axis=1) - 0.5 * np.array([test.score for test in tests])
     variance_without = np.exp(-2.0 / n_blocks * likelihood_without)

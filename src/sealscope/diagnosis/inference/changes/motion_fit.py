@@ -96,7 +96,7 @@ def select_motion(recording: Recording) -> Motion | None:
     top_speed, top_acceleration = (
         max(float(np.percentile(np.abs(signal[rows]), 99.0)), TINY) for signal in (speed, acceleration)
     )
-    position = values[rows] if name == "x" else np.zeros(len(rows))
+    position = values[rows] if name == "x" else np.zeros(len(rows))  # without x the level is constant
     design = np.column_stack(
         [
             np.sign(speed[rows]),
@@ -214,7 +214,7 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
     is_free = eigenvalues < FREE * eigenvalues[:, -1:]  # combinations of coefficients that the rows do not determine
     inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
     coefficients = np.einsum("kij,kj,klj,kl->ki", vectors, inverse, vectors, moments, optimize=True) / scale
-    # a coefficient is undetermined if it takes part in a free combination
+    # a coefficient is undetermined if it takes part, beyond rounding, in a free combination
     is_undetermined = np.einsum("kij,kj->ki", vectors**2, is_free.astype(float)).max(axis=0) > np.sqrt(FREE)
     errors = np.sqrt((n_groups - 1.0) / n_groups * ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0))
     return np.asarray(np.where(is_undetermined, np.inf, errors)[list(columns)])

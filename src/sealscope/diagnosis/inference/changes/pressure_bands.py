@@ -52,7 +52,7 @@ PAIRS = {
 MIN_OCTAVES = 3
 #: Number of samples of the median that removes single wrong ones.
 GLITCH = 3
-#: Minimum power that is divided by, of pressures [Pa^2], the position [m^2] and the pump's speed [rad^2/s^2].
+#: Power added before dividing or taking a logarithm: of pressures [Pa^2], position [m^2], pump's speed [rad^2/s^2].
 MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
 #: Minimum coherence, since its square is a divisor.
 MIN_COHERENCE = 1e-3
@@ -213,7 +213,7 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
 
     `sides`: channels that may be filtered, 0 for A and 1 for B. Each is combined with several cut-off frequencies and
     levels of the sensor's white noise, which is not filtered: a fraction (`filtered.noises` in `priors.toml`) of the
-    lowest power density of any octave in the `healthy` recordings.
+    lowest power density of an octave, averaged over the `healthy` recordings.
     """
     from itertools import product
 

@@ -60,8 +60,9 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
     `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must change: the smaller step
-    must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size
-    are those of the test with the lower score. The p-value is twice the higher one, since a step may be up or down.
+    must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size,
+    here without its sign, are those of the test with the lower score. The p-value is twice the higher one, since a step
+    may be up or down.
     """
     steps = np.abs([test.fitted.value for test in tests])
     if tests and steps.min() > _MIN_STEP_RATIO * steps.max():

@@ -83,6 +83,7 @@ def volume_observables(
     - `with_orifice`: also test the coefficient of an orifice's flow; false with few blocks, in which this flow looks
       like a change of the motion's scale.
     """
+    # these steps need be dated only to a fraction 1 / `blocks.coarse` of the recording
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
@@ -188,6 +189,7 @@ def _step_hypotheses(
         if _is_tested(term, first, has_accumulator):
             index = first.names.index(term.name)
             blocks = centred if term.name in (LEAK, PUMP) else recorded
+            # a leak only grows, but a constant flow is positive for a loss from side A and negative for one from side B
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
             name = term.name
             if name == BIAS:  # the cause of a constant flow: an external leak, or an offset of the flow's sensor

@@ -3,9 +3,8 @@
 The Gram matrices are divided by the residual variance of a row (`RecordingSums.sums`), so that their Schur complements
 are precisions of coefficients. Those of the healthy recordings are added up and give the coefficients of all terms of
 the balance. A recording's residual under these coefficients, projected on the leak's column, is its rise. The
-recording's other coefficients may differ from the healthy ones within a prior (`priors.toml`). The zero of the flow
-repeats: a free one would absorb a leak whose flow is nearly constant, and its changes from day to day are part of the
-scatter.
+recording's other coefficients may differ from the healthy ones within a prior (`priors.toml`). The flow offset repeats:
+a free one would absorb a leak whose flow is nearly constant, and its changes from day to day are part of the scatter.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None
 
 def _limit_precisions(prior: Array, gram: Array) -> Array:
     """Limit prior precisions (c,), which may be infinite, to 1e9 times those of the data, the diagonal of `gram`."""
-    return np.minimum(prior, 1e9 * np.diag(gram))
+    return np.minimum(prior, 1e9 * np.diag(gram))  # enough to fix a coefficient
 
 
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
@@ -136,6 +135,7 @@ def subtract_reference(
     matrix, leak = reference[np.ix_(compared, compared)].copy(), compared.index(roles.leak)
     matrix[leak, leak] += roles.healthy_conductance**-2  # precision of the prior; 0 if the healthy leakage is unknown
     coefficients = solve(matrix, reference[compared, roles.left])
+    # of the laminar leak, even if another term takes its place in `roles.leak` (`ColumnRoles.replace_leak`)
     leak_coefficient = coefficients[compared.index(roles.names.index(LEAK))]
     is_nuisance = [has_leak or k != roles.leak for k in compared]
     nuisance = [*compress(compared, is_nuisance)]
@@ -177,7 +177,8 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
         w_k = (N_k - C (G + P)^-1 C_k') / (N - C (G + P)^-1 C').
 
     N and C are the sums over the blocks, G is the Gram matrix of the other columns, and P the prior precision of their
-    coefficients. The weight of a block in which the other terms explain the leak is small, and may be negative.
+    coefficients. The weight of a block in which the other terms explain the leak is small, and may be negative. Without
+    information all weights are equal.
 
     `grams` (K, E, m, m): Gram matrices of the blocks for E equations; `reference` (E, m, m): that of the sum of the
     reference recordings; `columns`: roles of their columns.

@@ -51,8 +51,9 @@ def compare_laws(
     if not energies.min() > 0.0 or not cross > 0.0:
         return None
     min_square = 1e-9 * abs(square_without_leak) + TINY  # above rounding errors
-    laminar, orifice = np.maximum(square_without_leak - moments**2 / energies, min_square)
-    return LawFit(regression=float(cross / energies[0]), log_ratio=float(-0.5 * np.log(orifice / laminar)))
+    square_laminar, square_orifice = np.maximum(square_without_leak - moments**2 / energies, min_square)
+    log_ratio = float(-0.5 * np.log(square_orifice / square_laminar))
+    return LawFit(regression=float(cross / energies[0]), log_ratio=log_ratio)
 
 
 def compare_with_leak(

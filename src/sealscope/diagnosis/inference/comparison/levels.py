@@ -96,6 +96,7 @@ def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise 
     The leak may have begun within the recording, whose mean then contains only a part of it (`Rise.may_be_partial`).
     Return None if no load is held in the judged recording, or in fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
+    # a healthy piston alone leaks about nothing: such levels compare by their differences, not by their ratios
     min_crossover = INFERENCE.scatter.largest * judged.conductance_of_flow
     held = _compare_held(judged, baseline, "held", min_crossover=min_crossover)
     return None if held is None else held._replace(may_be_partial=True)
@@ -153,7 +154,8 @@ class _Estimates(NamedTuple):
     - `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
     - `errors` (s,): smallest plausible scatter of one rise, by its standard error;
     - `level`, `level_error`: mean coefficient of the healthy recordings, and its standard error;
-    - `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero;
+    - `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero, which makes z
+      linear in them;
     - `session_deviation`: prior standard deviation between sessions with the same oil, None for that of the whole
       leakage (`scatter.session` of `priors.toml`).
     """
@@ -218,7 +220,7 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
         predicted = Population(*candidates).predict(
             judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, log_priors + oil.log_probability
         )
-        predictions.append(scale.to_levels(predicted, judged_z))
+        predictions.append(scale.to_levels(predicted, judged_z))  # with the effect of the oil again
     all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
     return rise_of_mixture(all_oils, values)
 
@@ -308,9 +310,11 @@ def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequ
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
     It is (n - 1)/n times the difference from the common leak coefficient of the other n - 1 recordings. The other
-    coefficients of the balance may differ between recordings within their usual priors, and the flow offset freely.
+    coefficients of the balance may differ between recordings within their priors (`between` in `priors.toml`), and the
+    flow offset by any amount, as it does in any case behind valves that shut at rest. Both assumptions on the valves,
+    which are compared by these deviations, are thus treated alike.
     """
-    columns = [roles.with_free_zero() for roles in columns]  # without a prior on the flow offset
+    columns = [roles.with_free_zero() for roles in columns]  # so that `eliminate_unshared` eliminates the flow offset
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]
     total = np.sum(all_sums, axis=0)
     rises = [estimate_leak_excess(sums, total - sums, columns, widths=np.ones(1))[0] for sums in all_sums]

@@ -70,7 +70,8 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
 
     `recordings`: the healthy ones, then the judged one. The resistance to the motion at the top speed v, friction +
     drop v, is known well. Friction and viscous drop are known less well, since friction varies with speed and load.
-    There are two hypotheses, only the first if the judged or the usual healthy friction is not positive:
+    There are two hypotheses, in which the healthy friction and v are medians over the healthy recordings. Only the
+    first counts if the judged or the healthy friction is not positive:
 
     - Friction changed, as if seals wore, and the drop is the fitted one.
     - Friction was what it is in the healthy recordings, and drop = (resistance at v - healthy friction) / v.
@@ -83,7 +84,7 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small prior
     probability `oil.drop_misleads`, without this sign, as if something else, such as a swollen seal, had changed the
     judged drop. What swells or wears a seal changes its friction, too, so that in the second case the friction has the
-    density of the first hypothesis: a judged friction that is as usual makes this case less probable.
+    density of the first hypothesis: a judged friction like the healthy one makes this case less probable.
 
     A drop predicts the thinning -`oil.per_drop` r (log drop - mean of the healthy ones), with the reliability r, the
     variance of true drops over that of measured ones. A drop below its standard error is replaced by this error. A
@@ -99,13 +100,14 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     if not (is_known[-1] and is_known[:-1].any()):
         return []
     healthy = np.flatnonzero(is_known[:-1])
-    sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0  # friction resists the motion
+    # friction resists the motion: the sign depends on the channel that shows the motion
+    sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0
     friction, drop = sign * friction, sign * drop
-    usual_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
+    healthy_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
     drops, log_densities, log_changed = [drop], np.zeros(1), 0.0
-    if min(usual_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
-        drops.append(drop + (friction - usual_friction) / top_speed)
-        change = float(np.log(friction[-1] / usual_friction))
+    if min(healthy_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
+        drops.append(drop + (friction - healthy_friction) / top_speed)
+        change = float(np.log(friction[-1] / healthy_friction))
         # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)

@@ -27,7 +27,7 @@ class Population:
     ----------
     candidates : array of float, shape (g, n + 1, n + 1)
         Candidate covariances between the values, the judged one last. They are in addition to the variance sigma^2 of
-        each value; n may be 0.
+        each value; n is at least 1.
     log_priors : array of float, shape (g,)
         Log prior probability of each candidate.
     """

@@ -103,7 +103,11 @@ def is_separate_at_rest(equation: Equation) -> bool:
 
 
 def _supply_volume(s: Signals) -> Array:
-    """Compute the volume [m^3] through a meter in a valve's supply line in each interval, positive into chamber A."""
+    """Compute the volume [m^3] through a meter in a valve's supply line in each interval, with the sign of `q_supply`.
+
+    The meter reads no sign. The inspection (`corrections.unsigned`) makes the flow negative while the valve feeds
+    chamber B, if it can tell when; otherwise the volume counts as fed to A throughout.
+    """
     return np.asarray(s.mean("q_supply") * s.dt)
 
 
@@ -121,7 +125,7 @@ def _supply_equation(rig: Rig) -> Equation:
         return _mask_terms(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
 
     def direction(s: Signals) -> Array:
-        """Compute the sign of the flow in each interval; the meter reads none, so its offset changes sign with it."""
+        """Compute the sign of the flow in each interval; the meter's offset, part of a magnitude, has the same sign."""
         return np.sign(s.mean("q_supply"))
 
     air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
@@ -185,6 +189,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     of the rig if neither p_2 nor a flow meter is recorded. In all other cases there is one balance of the cylinder,
     whose flow follows from the pump's angle, its speed, a flow meter or, without these, the command.
     """
+    # without p_2, a metered flow is preferred to an assumed pressure of the return
     has_return = "p_2" in channels or not channels & {*METERS}
     if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
         if not channels.issuperset(PRESSURES):

@@ -31,7 +31,7 @@ from sealscope.recordings.recording import Array
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Kinds of coefficients: each has priors on its drift and on its differences between recordings.
+#: Kinds of coefficients: each has a prior on its differences between recordings and, but for "speed", on its drift.
 Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "pump", "outside", "edge"]
 
 
@@ -42,8 +42,8 @@ class Term(NamedTuple):
       increments;
     - `increments`: computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,);
     - `cause`: cause of a sudden change of the coefficient, for example "external leak";
-    - `drift`: entry of `priors.toml` with the prior on the coefficient's drift; "" if the coefficient is zero unless
-      `cause` is present;
+    - `drift`: kind of the coefficient, with its priors in `priors.toml`; "" if the coefficient is zero unless `cause`
+      is present;
     - `needs`: channels from which the increments are computed;
     - `driver`: "pressure" or "root" if the flow is driven by a pressure or its square root, so that an offset of a
       pressure sensor changes the increments; "" if such an offset is neglected.
@@ -122,7 +122,7 @@ MOVING_BIAS = "bias in motion"
 STATES = TURNING, HOLDING, MOVING_BIAS
 #: Flow from the supply past a valve while the piston rests: a constant part, and one in proportion to p_A - p_B.
 NULL_FLOW, LOADED_NULL_FLOW = "flow past the valve at rest", "flow past the valve at rest, under load"
-#: Names of two balances: of a pump-controlled cylinder with a recorded position, and of a load held by valves.
+#: Names of two balances: of a cylinder, by its position and the flow of a pump or meter, and of a load held by valves.
 CYLINDER, LOCKED = "cylinder", "locked"
 #: Name of a derived signal: the decay, with the drive's time constant, of the speed loop's unknown initial state.
 START = "start"

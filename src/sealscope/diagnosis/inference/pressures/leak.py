@@ -114,7 +114,8 @@ class ResponseLeak(LeakMeasure):
         if not count:
             return None
         total = sum(self.healthy)
-        # each healthy level minus the mean of the others: the judged level is compared with a mean in the same way
+        # each healthy level minus the mean of the others: the judged level is compared with a mean in the same way; a
+        # single healthy level has no others, and counts by its number only
         differences = [level - (total - level) / (count - 1) for level in self.healthy] if count > 1 else [0.0]
         judged_level, _ = self.level
         return student_rise(judged_level - total / count, differences, PRESSURE.conductance.level)
@@ -124,8 +125,8 @@ class ResponseLeak(LeakMeasure):
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above that of these recordings, otherwise on a leak that
-        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance, and the
-        largest usual error of the scale (`conductance_scale_error`).
+        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance, and a
+        scale at the upper end of its 95 % interval (`conductance_scale_error`).
         """
         test = self.step if self.rise is None else self.rise
         if test is None:

@@ -99,7 +99,8 @@ def _advance_friction(
 
     The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
     compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
-    with a = h |v|/(c F_m), the steady friction F_s at the speed v, and F_s0 before the step,
+    with a = h |v|/(c F_m), where |v| is at least the creep speed `m.v_th`, the steady friction F_s at the speed v, and
+    F_s0 before the step,
 
         F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2).
 

@@ -314,7 +314,8 @@ class Follower:
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
-        # the squared coefficients (1, -3, 3, -1) of a third difference have the sum 20
+        # p_A + p_B has the noise of p_A - p_B but does not ring; the squares of the coefficients (1, -3, 3, -1) of a
+        # third difference have the sum 20
         noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
         follower = Follower(Machine.from_rig(rig, recording.rate), response_priors(rig), sense)
         segment = follower.next_segment(beginning)
@@ -336,7 +337,8 @@ class Follower:
     def _converge_on_beginning(self, recording: Recording) -> None:
         """Refine the parameters by filtering the beginning of a recording, then return to its first sample.
 
-        The refined `theta` is kept; covariance and states are those from before, and there is no previous sample.
+        The refined `theta` is kept; covariance and states are those from before, since the same samples are filtered
+        again, and there is no previous sample.
         """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)

@@ -60,7 +60,11 @@ def half_width(rate: float) -> float:
 
 
 def strides_in(seconds: float, rate: float) -> int:
-    """Convert a time [s] to a number of strides, the distances of neighbouring test functions; at least `SPAN`."""
+    """Convert a time [s] to a number of strides, the distances of neighbouring test functions.
+
+    It is at least `SPAN`, the length of a test function. A stride is taken as `STRIDE`, or as its length in samples if
+    that is longer, as for slow loggers.
+    """
     return max(SPAN, round(seconds / max(STRIDE, stride_samples(rate) / rate)))
 
 
@@ -133,4 +137,4 @@ def weights_near_holes(holes: Array, rate: float) -> Array:
     # function of integral 1, is the fraction of the function in holes
     hole_time = np.maximum(holes[1:], holes[:-1]) / rate
     weights = 1.0 - weak_form_rows([hole_time], rate).values[:, 0]
-    return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))
+    return np.where(weights < MIN_WEIGHT, 0.0, np.minimum(weights, 1.0))  # at most 1, but for rounding

@@ -20,7 +20,7 @@ class Label:
     """Heading of a column of a table."""
 
     whole: str  # the heading as written
-    name: str  # the heading without the unit
+    name: str  # the heading without the unit, or a remark in brackets at its end
     unit: str | None = None
     called: str = ""  # the logger's name of the column if `name` is the description that the user has entered
 

@@ -21,7 +21,8 @@ _KIND = {name: frozenset(words) for name, words in WORDS["kind"].items()}
 _UNSPACED = frozenset(
     word for words in (*_MEASURED.values(), *_SIDE.values()) for word in words if ord(word[0]) > 0x2E7F
 )
-#: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool's unit is any.
+#: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool may have any unit of
+#: a command (`_is_command_unit`).
 _CHANNELS: dict[str, str] = WORDS["channel"]
 _UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANNELS.items() if kind != "spool"}
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
@@ -159,7 +160,10 @@ def find_name_and_unit(label: Label) -> tuple[str, str | None]:
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` in `ch2` and `Main_Pa` in `Pa`."""
+    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` in `ch2` and `Main_Pa` in `Pa`.
+
+    False unless `words` begins with a letter: a number alone would fit many names.
+    """
     token_lists = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if word in WORDS["input"] else word for word in tokens] for tokens in token_lists)

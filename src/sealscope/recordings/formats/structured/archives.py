@@ -25,7 +25,7 @@ T = TypeVar("T")
 _SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")
 #: Suffixes of documents that accompany a recording in an archive.
 _DOCUMENTS = (".pdf", ".md", ".png", ".jpg", ".jpeg", ".doc", ".docx", ".html", ".xml", ".json", ".toml", ".ini")
-#: A workbook is a ZIP archive with one of these members.
+#: A ZIP archive with one of these members, of Office Open XML and OpenDocument, is taken for a workbook.
 _WORKBOOK = ("[Content_Types].xml", "mimetype")
 #: Longest time to unpack an archive: _BASE_TIME [s] + size / _MIN_SPEED [bytes/s].
 _BASE_TIME, _MIN_SPEED = 20.0, 1e6
@@ -46,7 +46,7 @@ def _run_limited(work: Callable[..., T], path: Path, *arguments: Any) -> T:
 
 
 def _is_workbook(path: Path) -> bool:
-    """Test whether a ZIP archive has a member that only spreadsheets have."""
+    """Test whether a ZIP archive has a member that spreadsheets and other office documents have (`_WORKBOOK`)."""
     with zipfile.ZipFile(path) as archive:
         return any(name in archive.NameToInfo for name in _WORKBOOK)
 

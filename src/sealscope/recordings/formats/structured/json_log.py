@@ -68,6 +68,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
     if not members:
         raise InputError("a recording must have samples, got empty JSON")
     first, remarks = members[0], dict[str, str]()
+    # a single object is a tree of signals, unless it is a flat record
     if len(members) == 1 and isinstance(first, Mapping) and not all(map(_is_cell, first.values())):
         remarks = collect_attributes(first)
         series = list(iter_series(_convert_lists(first, place)))

@@ -51,7 +51,10 @@ def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: i
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
-    """Return the fields of a struct by name, or the structs in an array by `(1)`, `(2)`, ...; None for other values."""
+    """Return the fields of a struct by name, or the structs in an array by `(1)`, `(2)`, ...; None for other values.
+
+    An array of more than `_MAX_COLUMNS` structs also gives None.
+    """
     properties = getattr(value, "properties", value)  # those of an object of mat-io
     if isinstance(properties, Mapping):
         return properties
