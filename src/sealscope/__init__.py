@@ -31,5 +31,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """List the exported names of the package."""
+    """List the names that `import *` loads, i.e. all exports but LeakDetector."""
     return __all__

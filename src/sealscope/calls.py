@@ -83,10 +83,10 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 def take_fields_of(arguments_class: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Build a decorator that makes the fields of a dataclass the parameters of a function.
 
-    `arguments_class`: the dataclass, whose fields are declared by `argument`; its annotation as a constructor tells
-    type checkers the parameters. The function is written with one parameter, an instance of this dataclass; its callers
-    pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the section
-    "Returns". Wrong arguments raise InputError (`checked_call`).
+    `arguments_class`: the dataclass, whose fields are declared by `argument`; it is annotated as a callable, from which
+    type checkers take the parameters. The function is written with one parameter, an instance of this dataclass; its
+    callers pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the
+    section "Returns". Wrong arguments raise InputError (`checked_call`).
     """
     lines: list[str] = []
     for declared_field in fields(arguments_class):  # type: ignore[arg-type]

@@ -38,7 +38,7 @@ numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
 _MESSAGE_LIMITS = "monitor/sources/message_limits.py"
-#: Packages and modules with compiled code.
+#: Packages and modules with compiled code that is cached. That of `fmu` is compiled anew for each unit (`plain_code`).
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py"),
     *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
@@ -73,6 +73,7 @@ def source_hash(root: Path) -> str:
     for package in _COMPILED_PACKAGES:
         files = [root / package]
         if files[0].is_dir():
+            # .toml: numbers, such as priors, that are compiled into kernels as constants
             files = sorted(path for path in files[0].rglob("*") if path.suffix in (".py", ".toml"))
         for path in files:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
@@ -130,7 +131,8 @@ def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
     The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary files
-    is used. Older folders are removed (`_prune`). Returns None if caching is off, or after a warning if none is usable.
+    is used. Older folders are removed (`_prune`). Returns None if `_user_cache_folder` does, or after a warning if no
+    folder is usable.
     """
     base = _user_cache_folder()
     if base is None:

@@ -83,8 +83,8 @@ def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> 
 def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, say: Callable[[str], None]) -> Source:
     """Build a source that simulates the actuator `name` and submits its samples to the monitor in blocks of 1 s.
 
-    The blocks arrive at `settings.speed` times real time; those that the monitor has already stored are left out.
-    `say`: called with a message at the start and at the end.
+    The blocks arrive at `settings.speed` times real time. Those that the monitor has already stored are left out, and
+    so is the rest after the last whole block. `say`: called with a message at the start and at the end.
     """
 
     def play(receiver: BlockReceiver) -> None:
@@ -101,7 +101,7 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
                     return
                 say(f"simulates {name}")
                 run = simulate_experiment(experiment).recording
-            recording = run.only([channel for channel in CHANNELS if channel in run])
+            recording = run.only([channel for channel in CHANNELS if channel in run])  # the monitor stores no others
             start_time = time.monotonic()
             for number in blocks[first:]:
                 due = start_time + (number + 1 - first) * BLOCK_S / settings.speed

@@ -1,9 +1,9 @@
 """Convert the units of files, options and figures to the SI doubles used inside, and back.
 
-A unit is parsed to powers of base units and a factor, an exact fraction times a power of pi. The conversion of a number
-is exact: ``234 cm^3`` is the double ``2.34e-4``. Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``,
-``m^3/rev`` is not ``m^3``, and raw counts are not a pressure. The units of hydraulics are in `units.toml`; others are
-looked up by pint, which is loaded only then.
+A unit is parsed to powers of base units and a factor, a fraction times a power of pi. The conversion of a number is
+exact, except for pi, for roots such as ``bar^0.5`` and for factors from pint: ``234 cm^3`` is the double ``2.34e-4``.
+Angles and raw counts are dimensions: ``Hz`` is not ``rad/s``, ``m^3/rev`` is not ``m^3``, and raw counts are not a
+pressure. The units of hydraulics are in `units.toml`; others are looked up by pint, which is loaded only then.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ _NUMBER = re.compile(
     r"\s*(?P<number>[+-]?(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|[+-]?(?:inf|nan)\b)(?P<rest>.*)",
     re.DOTALL | re.IGNORECASE,
 )
-#: Marks of absolute and gauge pressures: `bar abs`, `MPa(g)`, `bar\u00fc`.
+#: Marks of absolute and gauge pressures: `bar abs`, `MPa(g)`, and `bar\u00fc` (gauge, in German).
 _MARKED = re.compile(
     r"(?P<unit>.{1,40}?)[\s_]*\(?(?:(?P<absolute>a|A|abs\.?|absolute?)|g|G|gauge|gage|rel\.?|relative?|\u00fc|\u00dc)\)?"
 )
@@ -140,6 +140,7 @@ def _parse_name(name: str) -> Unit:
         raise InputError(f"got {name}, which is not proportional to an SI unit")
     result = Unit(Fraction(repr(float(factor))))
     for base_name, power in base._units.items():
+        # pint's name of a base unit is a word, such as meter; a unit that `units.toml` lacks is a dimension of its own
         unit = _ATOMS.get(_SPELLINGS.get(base_name, base_name), Unit(powers=((base_name, Fraction(1)),)))
         result = result.times(unit, Fraction(power).limit_denominator(12))  # pint's powers are floats, such as 0.5
     return result
@@ -158,10 +159,10 @@ def _tokenize(text: str) -> list[str]:
             tokens.append(match["op"])
         elif match["power"]:
             tokens.append(f"^{match['power']}")
-        elif digit and name + digit not in _SPELLINGS:  # a power without `^`, such as m3
+        elif digit:  # a power without `^`, such as m3
             tokens += [name, f"^{digit}"]
         else:
-            tokens.append(name + digit)
+            tokens.append(name)
     return tokens
 
 
@@ -229,7 +230,7 @@ def parse_unit(text: str) -> Unit:
         unit = _parse_product(tokens)
         if not tokens:
             return unit
-    except InputError:
+    except InputError:  # a ValueError, too, but with a message
         raise
     except ValueError:
         pass
@@ -313,8 +314,8 @@ def to_si(
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
     One number is converted exactly and rounded once, except for units with pi, such as rpm. An array is converted with
-    an error of up to 2 units in the last place. Raises InputError for a unit of another dimension; the message states
-    `name`, the unit, the expected dimension and the file `place`.
+    an error of up to 2 units in the last place, or more for a unit with an offset, such as degF. Raises InputError for
+    a unit of another dimension; the message states `name`, the unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:

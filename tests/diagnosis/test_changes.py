@@ -91,7 +91,7 @@ def resting(recording: Recording, seconds: float, noise: float) -> Recording:
 def test_a_rest_changes_neither_duty_nor_noise_nor_sense(seconds: float) -> None:
     """A drive that is off is another regime: quieter, without a size of the duty, friction or its sign."""
     at_rest = resting(machine(), seconds, 200.0)
-    assert {observable.data for observable in observe_signals(at_rest).observables} >= {"duty", "noise", "hum"}
+    assert {observable.data for observable in observe_signals(at_rest).observables} >= {"noise", "hum"}
     assert other_event(at_rest) is None
 
 

@@ -186,6 +186,17 @@ def test_a_unit_of_our_own_is_recorded_as_simulate_records(tmp_path):
         assert (apart > 0.0).mean() < 0.01
 
 
+@pytest.mark.parametrize(("rate", "frequency"), [(100.0, 398.0), (2000.0, 1990.0)])
+def test_a_command_faster_than_the_samples_is_no_slow_motion(plant, rate, frequency):
+    """The plant's drive turns by 30 times the integral of the command, whose mean over time is amplitude/omega."""
+    omega = 2.0 * np.pi * frequency
+    experiment = ss.Experiment.of(command=f"2 sin({omega:.6f}t)", duration=2.0, rate=rate)
+    theta = ss.record_fmu(plant, experiment, map=MAP)["theta"]
+    count = 2.0 * np.pi / experiment.rig.sensors.theta.counts
+    settled = theta[theta.size // 2 :]
+    np.testing.assert_allclose(settled, 30.0 * 2.0 / omega, rtol=0.1, atol=count)  # held, it would turn by some radians
+
+
 def test_what_a_unit_cannot_do_is_one_line(plant, tmp_path):
     def refused(error=InputError, path=plant, map=MAP, **options):
         with pytest.raises(error) as caught:

@@ -107,6 +107,38 @@ def test_a_soft_sensor_says_what_the_live_balance_says(version, recording, tmp_p
     unit.free()
 
 
+@pytest.mark.slow
+def test_the_sign_of_the_angle_is_found_in_motion(recording, tmp_path):
+    """A machine may stand still for the first minutes, with an angle that is constant or jumps by a count.
+
+    An encoder the other way round changes no bit of the results.
+    """
+    pytest.importorskip("fmpy", reason="FMPy runs the units: pip install 'sealscope[fmu]'")
+    from .test_unit import Unit
+
+    path, h, random = tmp_path / "leak.fmu", 1.0 / recording.rate, np.random.default_rng(1)
+    ss.write_sensor_fmu(path)
+    for seconds, jump in ((20.0, 0), (80.0, 1)):  # 80 s: long enough to learn from the standstill
+        size, readings = round(seconds * recording.rate), {}
+        for name in INPUTS:
+            count = abs(np.diff(np.unique(recording[name]))).min() * {"theta": jump, "x": 0}.get(name, 1)
+            rest = recording[name][0] + count * random.integers(0, 2, size)
+            readings[name] = np.r_[rest, recording[name]]
+        results = []
+        for sign in (1.0, -1.0):
+            unit = Unit(path, 2)
+            unit.start()
+            rows = np.stack([*(readings[name] for name in INPUTS)], axis=1)
+            rows[:, INPUTS.index("theta")] *= sign
+            for k, row in enumerate(rows.tolist()):
+                unit.set(**dict(zip(INPUTS, row, strict=True)))
+                unit.step(k * h, h)
+            results.append(dict(zip(RESULTS, unit.get(*RESULTS), strict=True)))
+            unit.free()
+        assert results[0] == results[1]
+        assert results[0]["q"] == pytest.approx(LEAK / 6e4, rel=0.1)
+
+
 @pytest.mark.parametrize("rig", ["thesis", "single-rod-eha"])
 @pytest.mark.parametrize("rate", [16.0, 500.0, 10e3])
 def test_the_code_has_the_terms_of_the_balance_and_a_bounded_memory(rig, rate):

@@ -368,6 +368,28 @@ def test_a_line_that_was_written_in_part_is_finished(watched: Service, tmp_path:
     assert [json.loads(line) for line in written] == [event for _, event in watched.store.events_since(0)]
 
 
+@pytest.mark.parametrize("kind", ["memory", "file"])
+def test_a_line_is_not_repeated_when_its_position_is_not_stored(kind, watched: Service, tmp_path: Path, monkeypatch):
+    from sealscope.monitor.outputs.events import EventLines
+
+    watched.store.write_position("lines", 0)
+    write_position, outages = watched.store.write_position, [OSError("the database is away")]
+
+    def fail_once(output: str, number: int) -> None:
+        if outages:
+            raise outages.pop()
+        write_position(output, number)
+
+    monkeypatch.setattr(watched.store, "write_position", fail_once)
+    with io.StringIO() if kind == "memory" else (tmp_path / "lines").open("w+") as stream:
+        lines = EventLines(watched.store, stream)
+        with pytest.raises(OSError, match="the database is away"):
+            lines.deliver()
+        lines.deliver()
+        stream.seek(0)
+        assert [json.loads(line) for line in stream] == [event for _, event in watched.store.events_since(0)]
+
+
 @pytest.mark.parametrize(
     "words",
     ["-v monitor m.toml", "monitor -v m.toml", "monitor m.toml -v", "monitor run m.toml -v", "-v monitor run m.toml"],

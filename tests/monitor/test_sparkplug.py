@@ -264,6 +264,21 @@ def test_aliases_units_and_names_are_those_of_the_birth():
     assert not plant.counted
 
 
+@pytest.mark.parametrize("value", [2.0, np.array([2.0, 2.0])], ids=["single", "array"])
+def test_a_unit_stated_with_samples_holds_until_another_is_stated(value):
+    plant, kind = Plant(), DOUBLES if isinstance(value, np.ndarray) else sparkplug.DOUBLE
+    plant.born(*births())
+
+    def sent(at: int, unit: str | None) -> float:
+        block = plant.send("DDATA", SparkplugMetric("p_A", value, kind, timestamp=at, unit=unit))
+        return float(block.samples["p_A"][0])
+
+    read = [sent(1000 * k, unit) for k, unit in enumerate([None, "bar", None, "MPa"])]
+    assert read == pytest.approx([2.0, 2e5, 2e5, 2e6])
+    plant.born(*births())
+    assert sent(5000, None) == pytest.approx(2.0)
+
+
 def test_single_samples_by_exception_keep_what_did_not_change():
     plant = Plant()
     plant.born(*[SparkplugMetric(name, float(k), 10, unit=UNITS[name]) for k, name in enumerate(CHANNELS)])
@@ -329,6 +344,7 @@ X1 = SparkplugMetric("x", 1.0, 10, timestamp=1)
         ([X3, SparkplugMetric("p_A", "a", 12, timestamp=1)], NO_SAMPLES),
         ([SparkplugMetric("x", "1, 2", 12, timestamp=1)], NO_SAMPLES),
         ([SparkplugMetric("x", 1.0, 10, timestamp=1, unit="bar")], WRONG_UNITS),
+        ([SparkplugMetric("x", np.ones(3), DOUBLES, timestamp=1, unit="bar")], WRONG_UNITS),
         ([SparkplugMetric("rate", -1.0, 10), X1], NO_CLOCK),
         ([SparkplugMetric("rate", "a", 12), X1], NO_CLOCK),
     ],

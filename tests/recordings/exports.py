@@ -148,6 +148,7 @@ MS = [(moment, moment.microsecond // 1000) for moment in MIDNIGHT]
 CLOCKS: dict[str, Dialect] = {
     "time, date and clock and ms": Dialect(table("Date,Time,ms", (f"{m:%d.%m.%Y,%H:%M:%S},{ms}" for m, ms in MS))),
     "time, stamp and ms": Dialect(table("Date&Time,ms", (f"{m:%Y-%m-%d %H:%M:%S},{ms}" for m, ms in MS))),
+    "time, minutes and seconds": Dialect(table("Time", (f"{m.minute}:{m:%S}.{ms:03d}" for m, ms in MS))),
     "time, clock and ms": Dialect(table("Uhrzeit,Millisekunden", (f"{m:%H:%M:%S},{ms}" for m, ms in MS))),
     "time, American date, clock and Millitm": Dialect(
         table("Date,Time,Millitm", (f"{m:%m/%d/%Y,%I:%M:%S %p},{ms}" for m, ms in MS))

@@ -136,6 +136,11 @@ def test_what_was_recorded_and_not_used_survives_a_round_trip(tmp_path: Path, su
     assert Recording(recording.t, recording.channels, recording.units, RATE).unused == ()
 
 
+def test_a_count_of_the_rows_is_no_speed_that_was_not_used(tmp_path: Path) -> None:
+    path = table(tmp_path, "t [s];n;motor_n;p_A_bar", np.hstack([np.arange(len(COLUMNS))[:, None], COLUMNS[:, :2]]))
+    assert read(path, map={"p_A": "p_A_bar"}).unused == ("motor_n",)
+
+
 def test_a_verdict_names_what_was_not_used(tmp_path: Path) -> None:
     path = table(tmp_path, "t [s];p_bottom;p_rod_bar;p_tank_bar")
     arguments = ["diagnose", str(path), "--map", "p_A=p_bottom", "--map", "p_B=p_rod_bar"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import zipfile
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from .dialects import (
     lvm,
     matlab,
     pack,
+    structs,
+    tdms,
     tdms_other_groups,
     timeseries,
     vectors,
@@ -197,3 +200,88 @@ def test_packets_of_several_days_have_one_order_of_day_and_month(tmp_path: Path)
     recording = read(path)
     assert recording.provenance["start"].startswith("2024-06-12T12:00:00.25")
     assert recording.t[[0, -1]] == pytest.approx([0.0, 86400 + T[-1]])
+
+
+@pytest.mark.parametrize("kind", ["TDMS", "JSON"])
+def test_groups_with_stamps_of_their_own_begin_when_they_say(kind: str, tmp_path: Path) -> None:
+    start = np.datetime64("2024-05-31T12:00:00.250", "us")
+    early, late = (start + np.round(1e6 * (T + delay)).astype("timedelta64[us]") for delay in (0.0, 0.2))
+    if kind == "TDMS":
+        fast = {"Time": (early, ""), "p_A": (P_A, "bar"), "p_B": (P_B, "bar")}
+        path = tdms(tmp_path, {"Fast": fast, "Late": {"Time": (late, ""), "x": (X, "mm")}})
+    else:
+        groups = {
+            "Fast": {"Time": early.astype(str).tolist(), "p_A [bar]": P_A.tolist(), "p_B [bar]": P_B.tolist()},
+            "Late": {"Time": late.astype(str).tolist(), "x [mm]": X.tolist()},
+        }
+        path = tmp_path / "log.json"
+        path.write_text(json.dumps(groups))
+    recording = read(path)
+    assert recording.provenance["start"] == "2024-05-31T12:00:00.25"
+    assert recording["p_A"] == pytest.approx(1e5 * P_A)
+    assert np.isnan(recording["x"][:100]).all()
+    assert recording["x"][100:] == pytest.approx(1e-3 * X[:100], abs=1e-9)
+
+
+def lvm_of_lengths(path: Path, columns: str, clocks: list[tuple[float, np.ndarray]], names: str) -> Path:
+    """Write a LabVIEW file of channels with these steps [s] and samples, which end in blanks; `names` of columns."""
+    lines = [f"LabVIEW Measurement\nX_Columns\t{columns}\n***End_of_Header***\n", "Channels\t3", "X0\t0\t0\t0"]
+    lines += ["\t".join(["Delta_X", *(repr(step) for step, _ in clocks)]), "Y_Unit_Label\tbar\tbar\tmm"]
+    lines += ["***End_of_Header***", names.replace(" ", "\t")]
+    for k in range(N):
+        cells = {
+            name: repr(float(values[k])) if k < len(values) else ""
+            for name, (_, values) in zip(("p_A", "p_B", "x"), clocks, strict=True)
+        }
+        cells["X_Value"] = repr(k * clocks[0][0]) if columns == "Multi" else ""
+        lines.append("\t".join(cells[name] for name in names.split(" ")))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("slow", ["x", "p"])
+def test_labview_channels_without_times_have_steps_of_their_own(slow: str, tmp_path: Path) -> None:
+    coarse = (10 / RATE, N // 10)
+    pressure, position = ((1 / RATE, N), coarse) if slow == "x" else (coarse, (1 / RATE, N))
+    signals = [(P_A, *pressure), (P_B, *pressure), (X, *position)]
+    clocks = [(step, np.interp(np.arange(count) * step, T, values)) for values, step, count in signals]
+    recording = read(lvm_of_lengths(tmp_path / "log.lvm", "No", clocks, "X_Value p_A p_B x"))
+    assert recording.rate == 1 / pressure[0]
+    assert len(recording) == pressure[1]
+    t = recording.t
+    for name, values, unit in (("p_A", P_A, 1e5), ("p_B", P_B, 1e5), ("x", X, 1e-3)):
+        known = np.isfinite(recording[name])
+        assert known.mean() > 0.9
+        assert recording[name][known] == pytest.approx(unit * np.interp(t, T, values)[known], rel=0.01, abs=2e-4)
+
+
+def test_labview_channels_that_follow_one_column_of_times_may_end_early(tmp_path: Path) -> None:
+    clocks = [(1 / RATE, P_A), (1 / RATE, P_B[:-10]), (1 / RATE, X)]
+    recording = read(lvm_of_lengths(tmp_path / "log.lvm", "Multi", clocks, "X_Value p_A p_B X_Value x"))
+    assert recording["p_A"] == pytest.approx(1e5 * P_A)
+    assert recording["p_B"][:-10] == pytest.approx(1e5 * P_B[:-10])
+    assert np.isnan(recording["p_B"][-10:]).all()
+
+
+def test_of_two_simulink_scopes_that_with_most_channels_is_read(tmp_path: Path) -> None:
+    def scope(t: np.ndarray, **signals: np.ndarray) -> dict[str, object]:
+        rows = [(values[:, None], label) for label, values in signals.items()]
+        return {"time": t[:, None], "signals": structs(("values", "label"), rows)}
+
+    held = {"trial": scope(T[::2], p_A=np.zeros(N // 2)), "run": scope(T, p_A=P_A, p_B=P_B, x=X)}
+    recording = read(matlab(tmp_path, held, "v7"))
+    assert recording.rate == RATE
+    assert recording["p_A"] == pytest.approx(P_A)
+    assert any("run" in line and "trial" in line for line in recording.history)
+
+
+def test_a_formula_without_a_value_is_a_missing_sample(tmp_path: Path) -> None:
+    openpyxl = pytest.importorskip("openpyxl")
+    book = openpyxl.Workbook()
+    book.active.append(["t [s]", "p_A [bar]", "x [mm]"])
+    for k in range(N):  # a sheet's =IF(test, value) is FALSE where the test fails
+        book.active.append([float(T[k]), float(P_A[k]), float(X[k]) if k % 2 else False])
+    book.save(tmp_path / "log.xlsx")
+    recording = read(tmp_path / "log.xlsx")
+    assert recording["p_A"] == pytest.approx(1e5 * P_A)
+    assert np.array_equal(np.isnan(recording["x"]), np.arange(N) % 2 == 0)

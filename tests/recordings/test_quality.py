@@ -124,6 +124,25 @@ def test_faults_of_the_time(t: np.ndarray, rate: float, expected: tuple) -> None
     assert named[expected[0]][3] == pytest.approx(expected[3], abs=1.1 / RATE)
 
 
+@pytest.mark.parametrize(("lost", "gaps"), [(0, []), (10, [(1, 10)]), (500, [(1, 500)])])
+def test_a_clock_that_two_samples_share_has_gaps_only_where_samples_are_lost(lost: int, gaps: list[tuple]) -> None:
+    t = np.delete(np.repeat(np.arange(5000) * 2 / RATE, 2), slice(2000, 2000 + lost))
+    result = inspect(recording({"p_A": healthy()["p_A"][: t.size]}, t))
+    assert codes(result) == ["duplicated_time"] + ["gap"] * len(gaps)
+    assert [(f.count, f.text) for f in result if f.code == "gap"] == [
+        (count, f"1 gap, about {samples} samples lost, the longest {(samples + 2) / RATE:g} s")
+        for count, samples in gaps
+    ]
+
+
+@pytest.mark.parametrize("rate", [250.0, 1000.0])
+def test_one_repeated_stamp_hides_no_wrong_rate(rate: float) -> None:
+    t = np.arange(5000) / rate
+    t[1000] = t[999]
+    result = inspect(recording({"p_A": healthy()["p_A"][:5000]}, t))
+    assert [f.code for f in result if f.severity == "fatal"] == ["rate_mismatch"]
+
+
 def test_all_missing_and_infinite() -> None:
     p, q = healthy()["p_A"], healthy()["p_B"]
     p[:], q[77] = np.nan, np.inf

@@ -47,6 +47,8 @@ LAYOUTS = {
     + body(";", ",").replace("\n", ";\n"),
     "time without unit": "time,p_A [bar]\n" + body(","),
     "text beside": "who,t [s],p_A [bar],remark\n" + "".join(f"N,{t},{p!r},a b\n" for t, p in zip(T, P, strict=True)),
+    "rows end in a separator": "t [s],p_A [bar]\n" + body(",").replace("\n", ",\n"),
+    "columns left out of the rows": "t [s],p_A [bar],Comment,Event\n" + body(","),
     "empty columns at the end": "t [s],p_A [bar],,\n" + body(",").replace("\n", ",,\n"),
     "padded numbers": "t [s],p_A [bar]\n" + "".join(f"  {t} ,  {p!r} \n" for t, p in zip(T, P, strict=True)),
     "Fortran exponents": "t [s],p_A [bar]\n"

@@ -5,7 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.recordings.corrections.unsigned import _is_in_supply_line, _most_likely_signs, restore_signs
+from sealscope.recordings.corrections.unsigned import (
+    _is_in_supply_line,
+    _most_likely_signs,
+    _noise_variance,
+    _piston_speed,
+    restore_signs,
+)
 from sealscope.recordings.recording import Recording
 
 RPM = 2.0 * np.pi / 60.0
@@ -59,6 +65,15 @@ def test_a_pump_that_turns_one_way_keeps_the_signed_noise_of_its_sensor() -> Non
     rest = np.abs(speed) < 1e-9
     assert abs(restored["omega"][rest].mean()) < 0.05 * RPM
     assert np.mean(restored["omega"][~rest] * speed[~rest] > 0.0) > 0.98
+
+
+@pytest.mark.parametrize("rate", [50.0, 100.0, 500.0])
+def test_noise_of_a_speed_is_that_of_its_positions(rate: float) -> None:
+    """The speed is (x_(k+n) - x_(k-n)) rate / 2 n, with a variance of sigma^2 rate^2 / 2 n^2 for white noise of x."""
+    sigma, n = 1e-4, round(0.05 * rate)
+    x = sigma * np.random.default_rng(7).standard_normal(round(400 * rate))
+    variance = 0.5 * (sigma * rate / n) ** 2
+    assert _noise_variance(_piston_speed(x, rate), rate) == pytest.approx(variance, rel=0.1)
 
 
 def test_signs_are_those_of_the_most_likely_path() -> None:

@@ -60,7 +60,7 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
     rows = tuple(store.read_plan_rows(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
-    head = store.read_head(folder) or store.collect_row_inputs(plan)
+    head = store.read_head(folder) or {}  # rows without a head are refused above
     judgement = judge(
         rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence,
         onset_s=plan.onset_s, hours=plan.duration_s / 3600.0,

@@ -8,8 +8,8 @@ test that `diagnose` uses (`StepTest.detectable_step`),
 
 with the standard error s of a step (its median over all onsets), the threshold of the likelihood ratio at the
 false-alarm probability, and the normal quantile z_detection. Flows are stated at the mean pressure difference of the
-usual duty.
-The smallest step that can be told from a step of the pump's leakage follows from the Fisher information of both.
+usual duty. The smallest step that can be told from a step of the pump's leakage follows from the Fisher information of
+both.
 """
 
 from __future__ import annotations
@@ -217,10 +217,11 @@ def _detectable_steps(
     balance = detector.balance(recording)
     if balance is None or balance.test is None:
         raise InputError("no balance: the recording is too short, or no block tells anything about a leak")
-    # if the healthy leakage is known, a part of the false-alarm probability is reserved for a comparison with it
+    # without healthy recordings, the fraction `within` of the false-alarm probability is reserved for the comparison
+    # with the healthy leakage that the rig states, if it states one
     level_fraction: float = DECISION.questions.within
     step_false_alarm = false_alarm * (1.0 - level_fraction if healthy_leakage(rig) > 0.0 else 1.0)
-    scale = balance.size.scale  # conductances and flows of the balance are relative to the size of the machine
+    scale = balance.size.scale  # from flows that are computed with the machine's assumed sizes to the true ones
     step = balance.test.detectable_step(step_false_alarm, detection) * scale
     separable_step = step * _separation_ratio(balance.blocks, balance.columns)
     return step, separable_step, balance.mean_pressure(), balance.mean_flow * scale

@@ -75,8 +75,9 @@ def _root(
 def normalise_arguments(arguments: Sequence[str]) -> list[str]:
     """Rearrange the arguments of a call to the form that typer understands.
 
-    `-v` is moved to the beginning, once; `--baseline` is repeated before each baseline (`_spread_baselines`); and
-    `monitor FILE` becomes `monitor run FILE`. Raises InputError if no file follows `--baseline`.
+    `-v` is moved to the beginning, the place of options of all commands, once; `--baseline` is repeated before each
+    baseline (`_spread_baselines`); and `monitor FILE` becomes `monitor run FILE`. Raises InputError if no file follows
+    `--baseline`.
     """
     end = list(arguments).index("--") if "--" in arguments else len(arguments)  # after `--` there are no options
     verbose = [argument for argument in arguments[:end] if argument in ("-v", "--verbose")]
@@ -164,7 +165,7 @@ def main() -> None:
         sys.stdout.flush()
     except OSError:  # discard the rest, or Python's flush at exit would complain
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(status if isinstance(status, int) else 0)
+    sys.exit(status if isinstance(status, int) else 0)  # a command that succeeds returns None
 
 
 @contextmanager
@@ -180,6 +181,7 @@ def _repeating_lost_interrupts() -> Iterator[None]:
         if unraisable.exc_type is not KeyboardInterrupt:
             original_hook(unraisable)
             return
+        # later: an interrupt within this hook would be ignored, too
         timer = Timer(_REPEAT_SECONDS, os.kill, (os.getpid(), signal.SIGINT))
         timer.daemon = True
         timer.start()

@@ -1,4 +1,4 @@
-"""The command that writes a rig as a functional mock-up unit."""
+"""The command `fmu`, which writes a rig, or a soft sensor of its leakage, as a functional mock-up unit."""
 
 from __future__ import annotations
 

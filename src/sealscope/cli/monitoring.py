@@ -43,7 +43,7 @@ def run(
     once: Annotated[bool, Option("--once", help="End when standard input and folders hold nothing new.")] = False,
 ) -> None:
     """Watch the actuators of FILE: read blocks of samples, and print alarms as JSON lines on standard output."""
-    if not logging.getLogger("sealscope").handlers:
+    if not logging.getLogger("sealscope").handlers:  # -v adds one
         logging.basicConfig(stream=sys.stderr, level=logging.WARNING, format="%(message)s")
     from sealscope.monitor.supervisor import LimitedLines
 

@@ -215,7 +215,7 @@ class StatedMachine:
             raise UnreadableFile(f"a recording must be a file, got a folder: {remedy} ({file})")
         if file != STANDARD_INPUT:
             return self._read(file)
-        with TemporaryDirectory() as folder:
+        with TemporaryDirectory() as folder:  # readers need a file
             path = Path(folder) / "standard input"
             with path.open("wb") as copy:
                 shutil.copyfileobj(sys.stdin.buffer, copy)

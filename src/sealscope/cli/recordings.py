@@ -84,7 +84,7 @@ def diagnose(
             form = "table"
     work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm_probability=false_alarm)
     is_piped = _reads_standard_input([*files, *stated.baseline])
-    # one process: others would read each baseline again, and have no standard input
+    # one process: joined files are one recording; others would read each baseline again, and have no standard input
     is_serial = join or is_piped or stated.baseline or stated.commissioned or len(files) < _MIN_PARALLEL_FILES
     results: Iterable[tuple[str, Iterable[DatedDiagnosis | None]]]
     results = [("", work(files))] if is_serial else _diagnose_in_parallel(work, files)
@@ -413,7 +413,7 @@ def _convert_parts(source: Path, folder: Path, stated: opt.StatedMachine, every:
         raise InputError(f"with --every, TARGET must be a new or empty folder, got {folder}")
     n_parts, n_samples = 0, 0
     for part in read_parts(source, length, map=stated.channel_map or None, rate=stated.rate):
-        if not n_parts:
+        if not n_parts:  # not before a part is read, so that an unreadable source leaves no folder
             folder.mkdir(exist_ok=True)
         n_parts += 1
         n_samples += len(part)

@@ -64,7 +64,7 @@ def new(
             raise InputError(f"{option} must stand in place of --bore, got both: {option} {value} --bore {bore}")
     if bore is not None:
         bore_m = _parse_size(bore, "m", "mm", "--bore")
-        rod_m = _parse_size(rod or "0", "m", "mm", "--rod")
+        rod_m = _parse_size(rod or "0", "m", "mm", "--rod")  # without the option no rod is subtracted
         areas = piston_areas(bore_m, rod_m, double_rod=double_rod)
     else:
         m2_A = _parse_size(area_A, "m^2", "mm^2", "--area-A", "Piston area on side A")

@@ -130,6 +130,7 @@ def demo(
     echo(str(result.machine) if shows_all else f"  smallest leak it will show: {result.machine.summary.smallest}")
     for diagnosis in (result.healthy, result.diagnosis):
         text = diagnosis_text(diagnosis) if shows_all else short_text(diagnosis)
+        # without a leak only the verdict and the state, which are the first two lines
         echo(text if shows_all or diagnosis.verdict == "leak" else "\n".join(text.splitlines()[:2]))
     echo(f"truth:     {result.truth.mean_leak_lpm:.4f} L/min from {result.truth.onset_s:.1f} s")
     echo(f"recording: {result.recording}\npage:      {result.page}")

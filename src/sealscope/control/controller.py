@@ -98,7 +98,8 @@ class _PythonLaw:
         """Compute the controller's voltage [V] from the numbers of a `Measured` at the address `measured`.
 
         The leakage flow that the controller compensates is stored in `self._memory[0]`, or NaN if it reports none. If
-        the controller raises an exception, it is stored in `self.raised`, and the result is NaN.
+        the controller raises an exception, it is stored in `self.raised`, and the result is NaN. `_memory`: address of
+        `self._memory`, not used.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)

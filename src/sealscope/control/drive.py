@@ -92,8 +92,8 @@ class _Invertible(ABC):
     def inverse(self, rate: float) -> Callable[[float, float], float]:
         """Build a function that computes the voltage [V] for a flow [m^3/s] at p_A - p_B [Pa].
 
-        The function must be called once per sample, `rate` [Hz] times a second: each call advances a filter by one
-        sample.
+        The function must be called once per sample, `rate` [Hz] times a second: each call advances the high-pass filter
+        of a pump's drive by one sample.
         """
         (coefficients,) = self.coefficients(rate)
         return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
@@ -218,7 +218,7 @@ class ValveDrive(_Invertible):
 
     def unloaded_flow(self, u: float) -> float:
         """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""
-        return u / self.steady_voltage(flow=1.0)  # the flow is proportional to the voltage
+        return u / self.steady_voltage(flow=1.0)  # flow and voltage are proportional, so any flow will do
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -79,7 +79,7 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
         m.compensated = 0.0
         return u
     m.compensated = m.G * mean_dp
-    added_u = drive_voltage(m.drive, m.compensated, 0.0)  # for the leak's flow alone, without a load (dp = 0)
+    added_u = drive_voltage(m.drive, m.compensated, 0.0)  # dp = 0: the inner controller's voltage meets the load
     return min(max(u + added_u, -m.u_max), m.u_max)
 
 
@@ -130,6 +130,7 @@ class FaultTolerant:
             K=rig.fluid.K_oil,
             x_step=sensors.x.resolution,
             noise=math.hypot(max(sensors.p_A.noise, sensors.p_B.noise), sensors.common_noise),
+            # a plain check valve feeds the lower pressure only
             shut=SHUT * (makeup.p_crack + makeup.p_open) if makeup.check_valves == "pilot-operated" else 0.0,
         )
         inner = inner or PositionPI.from_rig(rig)

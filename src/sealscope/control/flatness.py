@@ -63,7 +63,8 @@ class Flatness:
     The position is a flat output of the machine: the target, its speed v and its acceleration a determine
 
     - the force on the piston, F = M a + F_f(v) + F_load;
-    - the pressure difference dp = F/A and the flow Q = A v + G dp + C d(dp)/dt;
+    - the pressure difference dp = F/A, with A the piston area on the side that carries the load, and the flow Q = A v +
+      G dp + C d(dp)/dt;
     - the voltage for this flow against dp, by the model `drive`.
 
     The PI controller `feedback` provides the voltage for A v and for the correction of the error. The feed-forward adds
@@ -71,8 +72,8 @@ class Flatness:
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
     averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
-    are assumed; V is the volume of a chamber and K the bulk modulus of the oil. A speed of the target above `v_max`
-    [m/s] is taken as a jump, to which only `feedback` responds.
+    are assumed; V is the volume of a chamber, which takes half of a change of dp, and K the bulk modulus of the oil. A
+    speed of the target above `v_max` [m/s] is taken as a jump, to which only `feedback` responds.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
@@ -103,6 +104,7 @@ class Flatness:
             F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),  # with p_A = p_B
             F_v=friction.F_v,
             v_th=friction.v_th,
+            # behind a valve the pump's leakage does not connect the chambers
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,
             C=cylinder.V / (2.0 * rig.fluid.K_oil),
             v_max=max_speed,

@@ -20,7 +20,7 @@ SHUT = 2.0
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
 #: Standard deviations of the model's errors in a block, relative to the compressed and to the swept volume.
 _COMPRESSION_ERROR, _SWEPT_ERROR = 0.02, 2e-4
-#: Noise variance of an averaged pressure, relative to that of a single sample.
+#: Noise variance of an averaged pressure, relative to that of a single sample: that of `_LAG` at 500 Hz.
 _MEAN_NOISE = 0.1
 #: Standard deviation of the conductance's random walk in a block: absolute [m^3/(s Pa)], and relative.
 _WALK, _RELATIVE_WALK = 1e-15, 0.03
@@ -83,7 +83,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     """Update the Kalman filter of a leak observer with the volume balance of the block of samples that ends now.
 
     `m`: record `OBSERVER`, the memory of the filter; `dp_sum`: sum of p_A - p_B [Pa] over the block's samples, of which
-    the first and the last count half. The block is left out if
+    the first (except in the first block of a run) and the last count half. The block is left out if
 
     - the mean of p_A - p_B is within +-`MIN_DP`;
     - p_A - p_B changes its sign, or is at times too small to shut a check valve;
@@ -104,7 +104,7 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
         V, dp_side = m.V_A + side_area * mid_position, end[2] - begin[2]
     else:
         side_area, intake_angle = m.area_B, m.turned_back
-        V, dp_side = m.V_B - side_area * mid_position, begin[3] - end[3]
+        V, dp_side = m.V_B - side_area * mid_position, begin[3] - end[3]  # with dp_integral < 0, turns both signs below
     swept = side_area * travel
     # oil in the chamber is compressed by the pressure change, incoming oil by the mean pressure difference
     compressed = (V * dp_side + m.D * intake_angle * dp_integral * m.rate / m.length) / m.K
@@ -155,8 +155,8 @@ class Balance:
 
     `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of the
     chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
-    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: |p_A - p_B| above which the check valve of the
-    chamber with the higher pressure is shut, 0 without such valves.
+    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: |p_A - p_B| above which the pilot-operated check
+    valve of the chamber with the higher pressure is shut, 0 without such valves.
     """
 
     D: float

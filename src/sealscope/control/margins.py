@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 #: Duration [s] of a controller's impulse response.
 _RESPONSE_DURATION = 60.0
-#: Sizes of the impulses of position [m] (above any dead band), pressure [Pa] and angle [rad].
+#: Sizes of the impulses of position [m] (above the built-in controllers' default dead bands), pressure [Pa] and angle
+#: [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
 #: Time [s] in which a moving piston settles before the rig is linearised.
 _SETTLING = 0.5
@@ -102,7 +103,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
 
     Returns A (14, 14), B (14,) [per V] and the state (14,) at which the rig is linearised by finite differences of the
     solver's steps: at standstill, or with the piston at mid-stroke and moving at `speed` [m/s], under the additional
-    force `load` [N]. Raises InputError for a speed that the drive cannot reach.
+    force `load` [N]. Raises InputError for a speed that the drive cannot reach within 20 %.
     """
     from sealscope.physics.rig import pack_numbers, rig_numbers
     from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, step_nodes
@@ -116,7 +117,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
     h = 1.0 / (rate * steps)
     implicit = IMPLICIT if p.throttled else EXPLICIT  # throttles make the equations stiff
     euler = rig.motor.integrator == "euler"
-    nodes = step_nodes(implicit, h).size
+    nodes = step_nodes(implicit, h).size  # times within a step at which the solver takes its inputs
 
     def advance_state(y: Array, u: float, samples: int = 1) -> Array:
         """Integrate the state y (14,) over a number of samples at a constant voltage u [V]; return the new state."""
@@ -141,13 +142,13 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
-        next_u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)
+        next_u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)  # a first guess
         for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
             u = min(max(next_u, -limit), limit)
             state, mean_speed = find_moving_state(u)
-            speed_gain = mean_speed - drift_speed  # due to the voltage
-            # by at most a factor of 5; by 1.5 if the piston does not follow
-            factor = min(max((speed - drift_speed) / speed_gain, 0.2), 5.0) if speed_gain * speed > 0.0 else 1.5
+            driven_speed = mean_speed - drift_speed  # due to the voltage
+            # a factor from 1/5 to 5, or 1.5 if the voltage does not move the piston in the right direction
+            factor = min(max((speed - drift_speed) / driven_speed, 0.2), 5.0) if driven_speed * speed > 0.0 else 1.5
             next_u = factor * u
         if not abs(mean_speed - speed) < 0.2 * abs(speed):
             raise InputError(f"speed must be one that the drive can reach, got {speed:g} m/s")

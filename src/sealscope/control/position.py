@@ -97,7 +97,7 @@ class PositionPI:
         if isinstance(drive, Drive):
             drive = replace(drive, droop=0.0)  # a pump's speed is computed as if there were no load
         else:
-            # each direction opens two edges, first the one with less overlap; 0.5: mean of both directions
+            # each direction opens two edges, first the one with less overlap; an underlap (mean < 0) needs no volts
             overlap = max(0.0, 0.5 * (min(valve.o_PA, valve.o_BT) + min(valve.o_PB, valve.o_AT)))
             gains.setdefault("dead_volts", valve.u_N * overlap / valve.x_max)
         return cls(rig.cylinder.A_A, rig.cylinder.A_B, drive, rig.daq.u_max, **gains)  # type: ignore[arg-type]

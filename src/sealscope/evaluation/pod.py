@@ -193,8 +193,9 @@ class HitMiss:
         By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
         maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). It is infinite if
         this holds for arbitrarily large sizes, or if the detection does not rise with the size. Raises InputError
-        unless `confidence` is from 0.5 to below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
-        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
+        unless `confidence` is from 0.5 (the estimate itself) to below 1. Source: MIL-HDBK-1823A (2009), appendix G.
+        Cheng and Iles, Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds,
+        which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri

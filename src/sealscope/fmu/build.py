@@ -86,6 +86,7 @@ def find_compiler() -> Compiler:
     from importlib.util import find_spec
 
     if find_spec("ziglang") is not None:
+        # -P: a package ziglang in the working folder must not run
         return Compiler([sys.executable, "-P", "-m", "ziglang", "cc"], cross_compiles=True)
     for name in ("cc", "gcc", "clang"):
         if path := shutil.which(name):
@@ -233,7 +234,7 @@ def write_fmu(
     Raises
     ------
     InputError
-        An argument breaks a rule, or there is no compiler.
+        An argument breaks a rule, the rig is not pump-controlled, or there is no compiler.
 
     Examples
     --------
@@ -309,7 +310,7 @@ def write_sensor_fmu(
     Raises
     ------
     InputError
-        An argument breaks a rule, or there is no compiler.
+        An argument breaks a rule, the rig is not pump-controlled, or there is no compiler.
 
     Examples
     --------

@@ -60,6 +60,6 @@ def format_description(fmi: int, identifier: str, token: str, summary: str, vari
         units=[(unit, base_units(unit)) for unit in units],
         variables=variables,
         outputs=outputs,
-        index={variable.name: k for k, variable in enumerate(variables, 1)},
+        index={variable.name: k for k, variable in enumerate(variables, 1)},  # by which FMI 2 names variables
         dependencies={output.name: [by_name[name] for name in DIRECT.get(output.name, ())] for output in outputs},
     )

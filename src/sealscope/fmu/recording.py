@@ -22,14 +22,15 @@ from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import FILTER_REACH, record
-from sealscope.simulation.integrate import RunInputs, oversampling_of
+from sealscope.simulation.integrate import RunInputs, steps_per_output
 from sealscope.units import from_si, to_si
 
 if TYPE_CHECKING:
     from sealscope.simulation.simulate import Progress
 
-#: Longest communication step [s]; it is shorter if the samples are closer together.
-MAX_COMMUNICATION_STEP = 5e-4
+#: Longest communication step [s], during which the inputs are constant, and as a fraction of the sampling interval: the
+#: anti-alias filter needs several outputs for each sample.
+_MAX_STEP, _MAX_STEP_FRACTION = 5e-4, 0.25
 _INPUT_NAMES = ("u", "G", "C", "F")
 _MEASURED_NAMES = tuple(name for name in CHANNEL_UNITS if name not in ("u", "omega"))  # omega is read off the encoder
 #: Channels without an instrument in a rig: the FMU's outputs are recorded without noise or quantisation.
@@ -47,8 +48,8 @@ def record_fmu(
     """Run a functional mock-up unit under an experiment's command, and record it with the instruments of its rig.
 
     The unit replaces the machine: only the instruments of the experiment's rig are used. Channels without an
-    instrument (``q_comp``, ``q_pump``, ``T_oil``) are recorded as the unit outputs them. A unit is a program, which
-    runs with all rights of the calling program.
+    instrument (``q_comp``, ``q_pump``, ``q_supply``, ``T_oil``) are recorded as the unit outputs them. A unit is a
+    program, which runs with all rights of the calling program.
 
     Parameters
     ----------
@@ -94,7 +95,7 @@ def record_fmu(
             "with --map p_A=NAME"
         )
     rate = experiment.rate
-    factor = oversampling_of(rate, MAX_COMMUNICATION_STEP)  # communication steps per sample
+    factor = steps_per_output(rate, min(_MAX_STEP, _MAX_STEP_FRACTION / rate))  # communication steps per sample
     n = round(experiment.duration * rate)  # samples of the recording
     # communication points, with those that the anti-alias filter needs after the last sample
     t = np.arange((n + FILTER_REACH) * factor + 1) / (rate * factor)
@@ -227,7 +228,7 @@ def _run_unit(
             rows = fmpy.simulate_fmu(
                 str(path), start_time=0.0, stop_time=float(t[-1]), step_size=communication_step,
                 output_interval=communication_step, input=input_table, output=outputs, step_finished=report_step,
-                validate=False,
+                validate=False,  # `_read_description` has checked it
             )  # fmt: skip
     except Exception as error:  # from the unit's code, FMPy, or a library for another system
         logged = [line.removeprefix("[ERROR] ") for line in log.getvalue().splitlines() if line.startswith("[")]

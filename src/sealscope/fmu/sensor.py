@@ -4,7 +4,7 @@ The equations are those of the live volume balance (`diagnosis.live`, `diagnosis
 integrated with a test function over `SPAN` strides (`rows.weak_form`); a row begins every stride of about 0.125 s. Each
 sample adds the increments of the balance's terms to the unfinished rows. The rows of a block of 3 s are weighted and
 summed to a Gram matrix, the products of all terms, from which the block's leakage conductance is estimated. Only the
-samples within `HALF_DIFFERENCE` of the present one are stored.
+last samples are stored, about 2 `HALF_DIFFERENCE` seconds.
 
 The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
 
@@ -19,8 +19,9 @@ middle. Its variance is
 
 with the variance v_0 of the baseline's blocks. The last term is the random walk of a healthy machine: in each block
 its variance grows by w = `WALK` times the variance sigma^2 of a block's noise. The divisor is there because this walk
-adds w (N + 1)/6 times sigma^2 to v_0. The flow is G times the mean of abs(p_A - p_B) as recorded; the live balance also
-subtracts the sensors' noise from this mean, a few per cent.
+adds w (N + 1)/6 times sigma^2 to v_0. The interval of the rise is formed like that of G, with o from the machine's
+sizes alone. The flow is G times the mean of abs(p_A - p_B) as recorded; the live balance also subtracts the sensors'
+noise from this mean, a few per cent.
 """
 
 from __future__ import annotations
@@ -51,7 +52,6 @@ from sealscope.diagnosis.live.balance import (
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
     STANDSTILL,
-    TINY,
     Coefficients,
     add_block,
     coefficient_shapes,
@@ -177,13 +177,13 @@ def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
     workspace = workspace_shapes(max_rows, SUPPORT, len(choice.column_order), n_slow)
     return record_dtype(
         *_SCALARS,
-        ring=(len(INPUTS), 2 * half + 3),  # room for all samples that `_compute_increments` reads
+        ring=(len(INPUTS), 2 * half + 2),  # the samples that `_compute_increments` reads
         increments=(_N_COLUMNS,),
         unfinished=(SPAN, _N_COLUMNS),
         rows=(max_rows, _N_COLUMNS),
         ends=(SUPPORT,),
         gram=(SUPPORT, _N_COLUMNS, _N_COLUMNS),
-        pressure_sums=(SUPPORT + 1, 2),
+        pressure_sums=(SUPPORT + 1, 2),  # + 1: the last rows of a block end when samples of the next have begun
         slow_sums=(n_slow + 1, n_slow + 1),
         waiting_grams=(LEARNED, _N_COLUMNS, _N_COLUMNS),
         waiting_sizes=(LEARNED, 2),
@@ -261,7 +261,7 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
 
     @law
     def add_sample(m: Any, displacement: float, p_A: float, p_B: float, theta: float, x: float) -> None:
-        """Add a sample to the sensor's memory m, and estimate the leakage when a block of rows is complete.
+        """Add a sample to the sensor's memory m; after the last row of a block, call `finish_block`.
 
         `displacement` [m^3/rad] of the pump; `p_A`, `p_B` [Pa]; `theta` [rad]: angle of the pump; `x` [m]: position.
         """
@@ -282,7 +282,8 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
             for j in range(_N_COLUMNS):
                 row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[slot, j]  # a new row begins at 0
                 m.unfinished[slot, j] = row_sum + phi * m.increments[j]
-        row = stride - SPAN + 1  # number of the row that is finished at the end of this stride
+        # number of the row that is finished at the end of this stride; < 0 if it began before the first sample
+        row = stride - SPAN + 1
         if k_in_stride < n_stride - 1 or row < 0:
             return
         is_finite, place = True, int(m.n_rows)
@@ -291,6 +292,7 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
             is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
         m.n_rows += is_finite  # a row with a missing measurement is overwritten by the next
         if row % block_strides == block_strides - 1:
+            # the rows of this block and of the `n_open` earlier ones, and room for the ends of all of them
             finish_block(m, m.rows[: int(m.n_rows)], m.ends[: int(m.n_open) + 1], row // block_strides)
 
     return add_sample  # type: ignore[no-any-return]
@@ -350,18 +352,29 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
 
 
 @law
-def _find_angle_sign(m: Any, n_rows: int) -> None:
+def _find_angle_sign(m: Any) -> None:
     """Find the sign of the pump's recorded angle, and store it in the sensor's memory m: `m.angle_sign`, 1 or -1.
 
-    It is the sign of the covariance between p_A - p_B and the pump's flow in the first `n_rows` rows of the volume
-    balance: with the right sign, the flow rises with p_A - p_B.
+    It is the sign of the covariance between p_A - p_B and the pump's flow in the blocks that wait for the first fit:
+    with the right sign, the flow rises with p_A - p_B. Blocks at standstill do not tell the sign.
     """
-    mean, covariance = 0.0, 0.0
-    for r in range(n_rows):
-        mean += m.rows[r, _LEAK] / n_rows
-    for r in range(n_rows):
-        covariance += (m.rows[r, _LEAK] - mean) * m.rows[r, _RESPONSE]
-    m.angle_sign = -1.0 if covariance < 0.0 else 1.0
+    weight = leak = response = product = 0.0  # sums over the rows; the bias has the same value in each row
+    for k in range(LEARNED):
+        gram = m.waiting_grams[k]
+        weight += gram[_BIAS, _BIAS]
+        leak += gram[_BIAS, _LEAK]
+        response += gram[_BIAS, _RESPONSE]
+        product += gram[_LEAK, _RESPONSE]
+    m.angle_sign = -1.0 if product < leak * response / weight else 1.0
+
+
+@law
+def _load_block(m: Any, gram: Any) -> None:
+    """Copy the Gram matrix of a block to `m.model.block`; correct the sign of the response by `m.angle_sign`."""
+    load_block(m.model, gram, _ALL_COLUMNS)
+    for j in range(_RESPONSE):
+        m.model.block[j, _RESPONSE] *= m.angle_sign
+        m.model.block[_RESPONSE, j] *= m.angle_sign
 
 
 @large_law
@@ -397,20 +410,21 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
     """Fit the volume balance to the first `LEARNED` blocks of samples, and append their leakage to the history.
 
     `m`: the sensor's memory, in which these blocks wait for the fit; afterwards no block waits. The median precision of
-    their estimates is stored as `usual_precision`, to which later ones are compared. `size_error`: relative standard
-    error of the leakage due to the machine's sizes (displacement, piston area).
+    their estimates is stored as `usual_precision`, with which each precision at standstill is compared. `size_error`:
+    relative standard error of the leakage due to the machine's sizes (displacement, piston area).
     """
     model = m.model
+    _find_angle_sign(m)
     for k in range(LEARNED):
-        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        _load_block(m, m.waiting_grams[k])
         add_block(model, m.waiting_sizes[k, _BLOCK_ROWS], weight=1.0, has_stepped=False)
     fit_coefficients(model)
     for k in range(LEARNED):
-        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        _load_block(m, m.waiting_grams[k])
         m.precisions[k], _, _, _ = estimate_leak(model, m.waiting_sizes[k, _BLOCK_ROWS], is_learned=False)
     m.usual_precision = median(m.precisions, LEARNED)
     for k in range(LEARNED):
-        load_block(model, m.waiting_grams[k], _ALL_COLUMNS)
+        _load_block(m, m.waiting_grams[k])
         n_rows, pressure = m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE]
         _append_conductance(m, size_error, n_rows, pressure, is_learned=False)
     m.n_waiting = 0.0
@@ -418,7 +432,12 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 
 @law
 def _forget_standstill(m: Any) -> None:
-    """Discard all coefficients and estimates in the sensor's memory m: those of a standstill do not hold in motion."""
+    """Discard the coefficients and estimates of a standstill in the sensor's memory m: they do not hold in motion.
+
+    The weighting of the rows (`slow_sums`) remains, as after `LiveBalance.relearn`. No block waits. What else remains
+    is not read again: the history counts only up to `n_estimated`, and the next fit overwrites the coefficients' values
+    and the sign of the angle.
+    """
     model = m.model
     model.sums[:, :] = 0.0
     model.leak_products[:] = 0.0
@@ -445,7 +464,7 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
         if m.n_moving >= N_WAKING:
             _forget_standstill(m)
             return
-        load_block(model, m.gram[b], _ALL_COLUMNS)
+        _load_block(m, m.gram[b])
         _append_conductance(m, size_error, n_rows, pressure, is_learned=True)
         return
     k = int(m.n_waiting)
@@ -479,10 +498,6 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
         m.n_open = n_open
         if is_first and n_open < SUPPORT:
             return
-        if is_first:
-            _find_angle_sign(m, n_rows)
-        for r in range(n_rows):
-            rows[r, _RESPONSE] *= m.angle_sign  # -1 if the pump's angle is recorded with the opposite sign, else 1
         m.n_weighted += n_open
         weigh_rows(
             rows,
@@ -498,9 +513,9 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
         for b in range(n_open):
             block_rows = ends[b] - (ends[b - 1] if b else 0.0)
             slot = (block - n_open + 1 + b) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
-            mean_pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
+            pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
             if block_rows > 0.0:
-                _update_with_block(m, size_error, b, block_rows, max(mean_pressure, TINY))
+                _update_with_block(m, size_error, b, block_rows, pressure)
 
     return finish_block  # type: ignore[no-any-return]
 
@@ -518,8 +533,8 @@ def _mean(history: Any, newest: int, n: int, column: int) -> float:
 def _variance_of_mean(history: Any, newest: int, n: int) -> float:
     """Compute the variance of the mean conductance of the n >= 2 blocks up to block `newest`.
 
-    It is the larger of two variances, divided by n: the sample variance of the blocks' estimates, and the mean of the
-    variances that the fit gives these estimates. `history` (WINDOW, 5): ring buffer of the blocks' results.
+    It is the larger of two variances, divided by n: the sample variance of the blocks' comparable estimates g, and the
+    mean of the variances that the fit gives these estimates. `history` (WINDOW, 5): ring buffer of the blocks' results.
     """
     mean, sample_variance = _mean(history, newest, n, _COMPARABLE_G), 0.0
     for k in range(n):
@@ -536,9 +551,10 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
         leakage = (mean of p) (mean of G),
         rise = (mean of p) ((mean of g) - (mean of g in the baseline)),
 
-    where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`). At most the
-    last `WINDOW` blocks count, for the rise without those of the baseline. The leakage needs two blocks, the rise and
-    the flag `settled` need two blocks after the baseline; without them these outputs are 0.
+    where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`), whose scatter
+    gives both intervals. At most the last `WINDOW` blocks count, for the rise without those of the baseline. The
+    leakage needs two blocks, the rise and the flag `settled` need two blocks after the baseline; without them these
+    outputs are 0.
 
     `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes;
     `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`.

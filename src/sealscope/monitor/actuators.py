@@ -64,19 +64,18 @@ _AlarmEvent = tuple[Alarm, str, float]
 class _Actuator:
     """The state of one watched actuator in memory.
 
-    `watch`: the detector of a leak; `judge`: decides on the alarm; `pending`, `bytes`: number and size [bytes] of the
-    blocks of samples since the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with
-    flows averaged over the machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature
-    [deg C], None if unknown; `judged_s` [s]: end of the last judged block; `verdict`: verdict on the last recording,
-    None if there is none or newer results replace it; `alarm_samples`: last samples during an alarm, which may become a
-    healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings, None for files and other
-    actuators.
+    `watch`: the detector of a leak; `judge`: decides on the alarm; `bytes`: size [bytes] of the blocks of samples since
+    the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over the
+    machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if unknown;
+    `judged_s` [s]: end of the last judged block, or of the first block if none is judged yet; `verdict`: verdict on the
+    last recording, None if there is none or newer results replace it; `alarm_samples`: last samples during an alarm,
+    which may become a healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings, None
+    for files and other actuators.
     """
 
     settings: ActuatorSettings
     watch: Watch
     judge: AlarmJudge
-    pending: int = 0
     bytes: int = 0
     n_stored: int = 0
     last: BlockEstimate | None = None
@@ -101,7 +100,6 @@ class _Actuator:
         estimates: list[BlockEstimate] = []
         events: list[_AlarmEvent] = []
         deciding_verdict = verdict if verdict is not None and verdict.decides else None
-        self.pending += 1
         self.bytes += count_bytes(samples)
         if (oil_celsius := measured_oil_temperature(samples)) is not None:
             self.oil_celsius = oil_celsius
@@ -176,7 +174,10 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", *_RESULT_TYPES, "n_stored", "recorder"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore detector, recorder and last results from `state`, plain values of a checkpoint, but not the alarm."""
+        """Restore detector, recorder and last results from `state`, plain values of a checkpoint.
+
+        `_load_checkpoint` restores the alarm, even if the detector starts anew.
+        """
         self.watch = Watch.from_state(state["watch"])
         restore_attributes(self, _RESULT_TYPES, state, _RESULT_TYPES)
         if self.recorder is not None and state["recorder"] is not None:
@@ -198,19 +199,21 @@ class _Actuator:
         if self.last.t - self.judged_s > self.settings.not_comparable_s:
             return state_of("not comparable", self.last.status, since_s=self.judged_s)
         if baseline is None:
-            return state_of("learning", since_s=alarm_end_s)
+            return state_of("learning", since_s=alarm_end_s)  # the last alarm's end, as by a repair, or None
         # watched since the baseline is known or the last alarm ended, whichever is later
         return state_of("watched", since_s=max(baseline.known_s, alarm_end_s or -math.inf))
 
     def summary(self) -> dict[str, Any]:
         """Build the summary of the actuator for the page, the metrics and messages, as plain values by name.
 
-        Status and time are those of the verdict on the last recording, if there is one, else of the last block. The
-        flows are those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are None.
+        The status is that of the verdict on the last recording, if there is one, else of the last block. The flows are
+        those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are None.
 
         - `blocks`: number of blocks of some seconds that the detector has processed; `counters`: its counters; `by`:
-          quantity that it watches, "volumes" or "pressures"; `why_no_litres`: reason why no L/min are stated, else "";
-        - `t`: end of the last block or recording [s since 1970]; `status`: its result; `state`: state by NAMUR NE 107;
+          quantity that it watches, "volumes" or "pressures"; `why_no_litres`: reason why it states no L/min, else "",
+          and "" beside a verdict, whose own texts are shown;
+        - `t`: end of the last block or of the verdict's recording, whichever is later [s]; `status`: result in words;
+          `state`: state by NAMUR NE 107;
         - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
           found; `total_interval_lpm`, `leak_interval_lpm`: 95 % intervals; `recording`: texts of the last verdict;
         - `oil_celsius`: oil temperature [deg C]; `baseline`: version, hours and leakage of the healthy baseline;
@@ -249,12 +252,12 @@ class _AlreadyStored(Exception):  # noqa: N818 (says what happened)
 
 
 class WatchedActuators:
-    """The watched actuators of a monitor, restored from its `store`; `keep_days`: how long estimates are stored [d]."""
+    """The watched actuators of a monitor, restored from its `store`, with estimates of `keep_days` of operation."""
 
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         """Restore the actuator of each of the `settings` from the database, or create it if it is not stored."""
         self.store, self.settings = store, {setting.name: setting for setting in settings}
-        self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())  # arrival of the last block of each [s]
+        self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())  # arrival of each one's last block [s]
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         # change_number: see `_notify_change`; closed: set to True when open web pages must end
@@ -317,7 +320,7 @@ class WatchedActuators:
             # with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
         actuator.watch.false_alarms_per_1000_h = fresh.false_alarms_per_1000_h  # may change without a new baseline
-        if actuator.watch.healthy is not None:  # None after a person has marked a repair
+        if actuator.watch.healthy is not None:  # None once a leak was withdrawn (`Watch.dismiss`)
             actuator.watch.healthy = fresh.healthy
         rig, *learning_settings = fresh.learned_with
         stored_rig, *stored_learning_settings = actuator.watch.learned_with
@@ -432,8 +435,8 @@ class WatchedActuators:
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion.
 
-        Of the pending samples, those of a stream's recording that has not ended are kept (`first_kept`). Their number
-        and size since the last checkpoint become 0.
+        Of the pending samples, those of a stream's recording that has not ended are kept (`first_kept`). The
+        size of the samples since the last checkpoint becomes 0.
         """
         settings = actuator.settings
         state, recorder = actuator.state(), actuator.recorder
@@ -443,7 +446,7 @@ class WatchedActuators:
         n_kept_estimates = self._keep_s / actuator.watch.block_seconds
         rows.old_blocks[settings.name] = actuator.n_stored - MAX_IDENTITIES
         rows.old_estimates[settings.name] = math.floor(actuator.watch.blocks - n_kept_estimates)
-        actuator.pending = actuator.bytes = 0
+        actuator.bytes = 0
 
     @staticmethod
     def _add_summary(actuator: _Actuator, rows: StoredRows) -> None:
@@ -459,7 +462,7 @@ class WatchedActuators:
         `name`: the actuator; `by_whom`: name of the person; `text`: comment, or reason of ``invalid``; `mark`:
 
         - ``acknowledged``, ``comment``, or ``valid``, which confirms the leak;
-        - ``shelved``: the alarm is not announced for `hours` of operation;
+        - ``shelved``: the alarm is not announced for `hours` on the clock of the samples;
         - ``invalid``: the detector withdraws the leak; ``repaired``: it also learns a new healthy baseline.
 
         A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine, and an

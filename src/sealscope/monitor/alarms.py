@@ -45,7 +45,7 @@ class Alarm:
     """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
 
     `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which the alarm was raised and
-    last changed; `onset_s`, `returned_s`: begin and end of the leak, None while it lasts; `leak_lpm`: leak flow
+    last changed; `onset_s`, `returned_s`: begin of the leak, and its end, None while it lasts; `leak_lpm`: leak flow
     [L/min], None if unknown; `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line;
     `next_check`: recommended inspection; `baseline`: version of the healthy baseline, 0 while it is being learned;
     `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
@@ -138,10 +138,11 @@ class AlarmJudge:
 
         `leak`: leak that the detector has found, or None; `baseline`: version of the healthy baseline; `allowed_rate`:
         most false alarms of the detector in 1000 h. An alarm is raised if there is a leak and its flow reaches
-        `warning_lpm` or `error_lpm` of the `settings`. It ends, or an error becomes a warning, when the flow is below
-        `return_share` times the threshold of its level. Each change needs `debounce_blocks` successive blocks. A leak
-        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
-        the same alarm again. After a restart of the detector, when `leak` is None, the alarm stays: the leak may last.
+        `warning_lpm` or `error_lpm` of the `settings`. It ends when the flow is below `return_share` times the
+        threshold of its level; an error whose flow still reaches `warning_lpm` then becomes a warning instead. Each
+        change needs `debounce_blocks` successive blocks. A leak without a flow in L/min is a warning. A leak that comes
+        back before anybody has acknowledged its alarm raises the same alarm again. After a restart of the detector,
+        when `leak` is None, the alarm stays: the leak may last.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.

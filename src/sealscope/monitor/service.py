@@ -100,8 +100,9 @@ class Service:
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
         """Queue a block or a refused message for storage; wait while the queue is full.
 
-        A refused message is also counted and logged; the web page draws the samples of a block before they are stored.
-        If the service stops meanwhile, the block is neither stored nor acknowledged to its sender.
+        A refused message is also counted and, unless there are many (`_is_logged`), logged. The web page draws the
+        samples of a block before they are stored. If the service stops meanwhile, the block is neither stored nor
+        acknowledged to its sender.
         """
         if isinstance(block, RefusedMessage):
             self.count(block.reason)

@@ -93,7 +93,7 @@ class SupervisedPart:
 
         An error begins an outage of the part, or of the database if the error comes from the database. It also begins a
         pause, twice as long as the last one up to a limit. Success ends the outage of the part. `at_once`: True to
-        ignore a pause. The reason of an outage also states the place in the code, except for PartAway.
+        ignore a pause. The reason of an outage also states the place in the code, except for PartAway and the database.
         """
         if self.pause_s and not at_once:
             return False

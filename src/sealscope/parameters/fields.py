@@ -70,7 +70,7 @@ def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))
-    # pydantic states a broken bound under its name, as in {"gt": 0}
+    # pydantic states a broken bound under its name, as in {"gt": 0}; for an unknown name `format_error` drops the unit
     has_bound = symbol in model.model_fields and first.get("ctx", {}).keys() & {"gt", "ge", "lt", "le"}
     unit = unit_of(model.model_fields[symbol]) if has_bound else ""
     return format_error(error, unit="" if unit in ("", "1") else f" {unit}")

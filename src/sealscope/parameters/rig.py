@@ -219,6 +219,7 @@ class Rig(Part):
         return hash(tuple(getattr(self, part) for part in Rig.model_fields))
 
     def __repr__(self) -> str:
+        # sources of values set by a caller, an option or a plan; those that describe a measurement are not counted
         n_overrides = sum(entry.source.startswith("set by") for _, entry in self._entries)
         overridden = f", {n_overrides} overridden" if n_overrides else ""
         return f"<Rig {self._name}: {self._title or 'no title'}, {len(self._entries)} parameters{overridden}>"
@@ -299,6 +300,7 @@ class Rig(Part):
             if full_name in names_by_parameter:
                 raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
             names_by_parameter[full_name] = name
+            # the last argument: errors state the source as the place of the value
             entries[full_name] = _make_entry(full_name, value, source, source)
         return self._with_entries(entries, source)
 
@@ -352,7 +354,10 @@ class Rig(Part):
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the rig to nested values that JSON can contain: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
+        """Convert the rig to nested values that JSON can contain: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`.
+
+        The channel map is left out.
+        """
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
         for name, entry in self._stated_entries().items():
             *groups, symbol = name.split(".")
@@ -479,6 +484,7 @@ def _si_value(full_name: str, field: FieldInfo, entry: ParameterEntry) -> Value:
         number = math.inf
     if not math.isfinite(number):
         raise InputError(f"{short_name} must be finite, got {entry.value} ({place})")
+    # strict models of pydantic refuse floats for an int: a whole number is converted here, any other refused there
     return int(number) if field.annotation is int and number.is_integer() else number
 
 
@@ -494,7 +500,7 @@ def _make_entry(full_name: str, value: Any, source: str, place: str) -> Paramete
         value = value.strip() if isinstance(value, str) else value
     elif isinstance(value, str):
         value = parse_quantity(value, unit, name=_short_name(full_name), place=place)
-    elif isinstance(value, np.generic):
+    elif isinstance(value, np.generic):  # NumPy's integers and single-precision numbers are no int and no float
         value = value.item()
     return ParameterEntry(value, unit, source, place)
 

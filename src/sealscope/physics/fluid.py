@@ -67,7 +67,7 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
     - the air contributes ln((1 + r_0)/(1 + r)) exactly, where r and r_0 are the ratios of the volumes of air and oil at
       p and p_0 (`air_volume_ratio`);
     - the liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)), which is computed by
-      Simpson's rule with an error far below r (p - p_0)/K_oil.
+      Simpson's rule with an error below max(r, r_0) |p - p_0|/(6 K_oil).
 
     `air`: the ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
     """

@@ -38,10 +38,10 @@ def karnopp_friction(
 ) -> float:
     """Compute Karnopp's friction force [N]: the piston sticks at velocities |v| < v_th, and slides otherwise.
 
-    While it sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N]. While it
-    slides at the velocity `v` [m/s], friction is F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21). `F_C`
-    [N]: Coulomb force; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v`
-    [N s/m]: viscous coefficient.
+    While it sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N], which is
+    K_brk F_C of the direction in which they push. While it slides at the velocity `v` [m/s], friction is F_C (1 +
+    (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21). `F_C` [N], `F_v` [N s/m]: Coulomb force and viscous
+    coefficient of the direction of `v`; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition coefficient.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -62,8 +62,8 @@ def stuck_velocity(v: float, v_th: float) -> float:
 def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
     """Compute the rate dz/dt [m/s] of the mean deflection z [m] of the contact's elastic bristles in LuGre's law.
 
-    dz/dt = v - sigma_0 |v|/g z, with the velocity v [m/s], the friction `g` > 0 [N] of steady sliding at v, and the
-    bristles' stiffness `sigma_0` [N/m]. At a constant v, z settles at g/sigma_0 sign(v), its largest magnitude.
+    dz/dt = v - sigma_0 |v|/g z, with the velocity v [m/s], the friction `g` > 0 [N] of steady sliding at v without its
+    viscous part, and the bristles' stiffness `sigma_0` [N/m]. At a constant v, z settles at g/sigma_0 sign(v).
 
     Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with
     friction, IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2). The paper's g is a Gaussian of v, here
@@ -92,14 +92,15 @@ def stribeck_friction(
 ) -> float:
     """Compute the thesis's friction force [N] at the velocity v [m/s], eqs. (4.21)-(4.22).
 
-    F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v for |v| > v_th, F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th))
-    + F_v v_th] / v_th for |v| <= v_th, which is continuous at v_th.
+    - |v| > v_th: F = F_C (1 + (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21).
+    - |v| <= v_th: F = v [F_C (1 + (K_brk - 1) exp(-C_c v_th)) + F_v v_th] / v_th, linear, and continuous at v_th.
 
     `F_C` [N]: Coulomb force; `K_brk`: breakaway force over Coulomb force; `C_c` [s/m]: transition coefficient; `F_v` [N
     s/m]: viscous coefficient; `v_th` [m/s]: velocity below which friction is linear.
 
-    Eq. (4.22) is printed with an unbalanced bracket. `literal_bracket` closes it after F_v v_th instead, F = v F_C [1 +
-    (K_brk - 1) exp(-C_c |v|) + F_v v_th] / v_th, so that F jumps at v_th (73.2 N to 145 N with Table 4.1, no pressure).
+    Eq. (4.22), for |v| <= v_th, is printed with an unbalanced bracket. `literal_bracket` takes F = v F_C [1 + (K_brk -
+    1) exp(-C_c |v|) + F_v v_th] / v_th, as if F_C multiplied F_v v_th, too. F then drops where the speed rises beyond
+    v_th, with Table 4.1 and no pressure from 145.2 N to 73.2 N.
     """
     speed = abs(v)
     if literal_bracket:

@@ -328,7 +328,7 @@ def load(array: Any, row: int) -> Any:
 
 def _loaded_type(arg_types: Any) -> Any:
     """Find the type of the vector (lanes) that `load` reads; None unless it gets a suitable array and an integer."""
-    array, row = arg_types[:2]
+    array, row = arg_types[:2]  # `_stored_type` passes the vector's type, too
     is_loadable = isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
     return _LANES_OF_DTYPE[array.dtype] if is_loadable and isinstance(row, types.Integer) else None
 

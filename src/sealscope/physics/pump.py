@@ -63,7 +63,7 @@ def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float,
     - `k_h` [N m s^2]: coefficient of the hydrodynamic torque.
 
     sat limits its argument to +-1, so that T is continuous at standstill: below the speed `omega_f` [rad/s] the
-    friction is linear in the speed.
+    friction is linear in the speed. The viscous drag is B_M omega in `motor.shaft_acceleration`.
     """
     smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
     return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)

@@ -27,6 +27,7 @@ def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
     square = opening * opening
+    # no division by `opening`, so that a shut valve gives 0
     return c * c_line * opening * (c_line * c_line * square + c * c * (1.0 - square)) ** -0.5
 
 

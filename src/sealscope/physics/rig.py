@@ -130,7 +130,7 @@ if TYPE_CHECKING:
         def _asdict(self) -> dict[str, Any]: ...
 
     RigValues = RigNumbers
-else:  # plain named tuples, which numba takes apart into their fields
+else:  # plain named tuples, which numba takes apart into their fields; `RigValues` has the parameters of `VALUES` only
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
     RigValues = namedtuple("RigValues", VALUES)
 
@@ -225,7 +225,8 @@ def pack_numbers(p: RigNumbers) -> Any:
 def limit_state(y: State, p: RigNumbers) -> State:
     """Limit the states of motor and spool in `y` after a step of the solver, and set those that no law changes.
 
-    - The motor current is limited to +-i_max, a servo valve's spool to its stroke, and the spool's speed to +-v_max.
+    - The motor current is limited to +-i_max, a servo valve's spool to its stroke, and the spool's speed to +-v_max,
+      which a step may overshoot although the rates become 0 at the limits.
     - Without lines p_1 = p_A and p_2 = p_B are set; with a servo valve p_2 is the return's pressure.
     - Other states of parts that the rig does not have are set to 0, so that the compiler removes them.
     """
@@ -455,7 +456,8 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
         makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
         makeup_2 = external.pilot_valve_flow(p_up - p_2, p_1 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
     else:
-        G_check = p.G_check if p.made_up else 0.0 * p.G_check  # a zero of G_check's type: a number or a vector
+        # a rig without a make-up may state a G_check, too; 0.0 * G_check: a zero of its type, a number or a vector
+        G_check = p.G_check if p.made_up else 0.0 * p.G_check
         makeup_1 = external.check_valve_flow(p_up - p_1, p.p_crack, G_check)
         makeup_2 = external.check_valve_flow(p_up - p_2, p.p_crack, G_check)
     if len(p.relieved) > 0:
@@ -640,7 +642,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
         Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
-    Q_A, Q_B = throttle_flows(y, p) if len(p.throttled) > 0 else (Q_1, Q_1)
+    Q_A, Q_B = throttle_flows(y, p) if len(p.throttled) > 0 else (Q_1, Q_1)  # else the pump is at the chambers
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)
         Q_A, Q_B = Q_PA - Q_AT, Q_BT - Q_PB

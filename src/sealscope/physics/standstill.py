@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Codes of `stand_still` if there is no standstill: a pressure is below vacuum, or the drive cannot hold the load.
+#: Codes of `stand_still` if there is no standstill: a pressure is below vacuum, or the drive cannot hold the load. They
+#: are also codes of an FMU, whose code 1 is a state that is not finite (`fmu/machine.py`).
 BELOW_VACUUM, BEYOND_DRIVE = 2, 3
 
 
@@ -39,7 +40,7 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
 
     `force` [N]: load against +x. If the rig has a make-up (`made_up`), the lower pressure is the charge pressure. If
     not, the circuit contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted
-    by the oil volumes of the two sides, is therefore the charge pressure.
+    by the oil volumes of the two sides at mid-stroke, is therefore the charge pressure.
     """
     if p.made_up:
         # each pressure balances the force with the charge pressure on the other side, or is the charge pressure if that
@@ -62,8 +63,9 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     """Set the state `y` (14,), all 0, to standstill of a pump-controlled rig; return 0, or a code if impossible.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3), or 0 if K_i = 0. The code is
-    `BELOW_VACUUM` for a pressure below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the drive's limit.
+    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3); it is 0 if K_i = 0, where it has no
+    effect. The code is `BELOW_VACUUM` for a pressure below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the
+    drive's limit.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -100,7 +102,7 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
     low = p.p_return
     high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve takes more than the pump delivers
     p_A, p_B = low, low  # overwritten in the loop
-    for _ in range(200):  # more halvings than doubles resolve
+    for _ in range(200):  # more halvings than doubles resolve: `low` and `middle` then agree
         middle = 0.5 * (low + high)
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle

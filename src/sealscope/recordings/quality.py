@@ -115,14 +115,17 @@ def _time_findings(recording: Recording) -> list[Finding]:
     add("duplicated_time", timed[equal_steps + 1], text)
     if positive_steps.size:
         median_step = float(np.median(positive_steps))
-        # stamps of a coarse clock repeat, and their positive steps are about two sampling steps long
-        is_coarse = equal_steps.size and median_step < 2.5 * step
-        if abs(median_step / step - 1.0) > _CLOCK.rate and not is_coarse:
-            text = f"time stamps show {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
-            add("rate_mismatch", timed[:1], text, "fatal")
+        sampling_step = step
+        if abs(median_step / step - 1.0) > _CLOCK.rate:
+            # stamps of a coarse clock repeat, and their positive steps are about two sampling steps long
+            n_repeats = steps.size * (1.0 - step / median_step)  # if no sample is lost
+            if not (step < median_step < 2.5 * step and equal_steps.size > 0.5 * n_repeats):
+                text = f"time stamps show {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
+                add("rate_mismatch", timed[:1], text, "fatal")
+                sampling_step = median_step
             step = median_step  # gaps and scatter are those of the real clock
         gaps = np.flatnonzero(steps > _MAX_STEP * step)
-        n_lost = np.round(steps[gaps] / step - 1.0).sum()  # infinite if a time is absurd
+        n_lost = np.round((steps[gaps] - step) / sampling_step).sum()  # infinite if a time is absurd
         samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
         longest = float(steps[gaps].max(initial=0.0))
         add("gap", timed[gaps], f"{format_count(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")

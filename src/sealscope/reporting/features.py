@@ -81,6 +81,7 @@ def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails 
             unaffected_samples = transform.inside(level)
             values[name][part][unaffected_samples] = row[unaffected_samples]
         if ends.size:
+            # `ends`: number of the sample just after each window, in the part
             centres = t[part.start] + (ends - WINDOW_SIZE / 2) / recording.rate
             if windows:  # NaN breaks the drawn line between two parts
                 windows.append((centres[:1], np.full((len(QUANTITIES), 1), np.nan)))

@@ -39,7 +39,8 @@ def say(name: str, /, **values: Any) -> str:
 def number(value: float | None, digits: int = 3) -> str:
     """Format a number with `digits` significant digits; a dash stands for None or NaN, "∞" for infinity.
 
-    Magnitudes from 1e-6 to 1e9 are written without an exponent, and without zeros at the end of the decimals.
+    Magnitudes from 1e-6 to 1e9 are written without an exponent and without zeros at the end of the decimals; digits
+    before the decimal point are all written, such as 12345 with `digits` 3.
     """
     if value is None or isnan(value):
         return ABSENT
@@ -153,6 +154,7 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
 def _why_no_flow(diagnosis: Diagnosis) -> str:
     """Format the reason why the leak is not stated in L/min, with the remedy if there is one."""
     if "leak_lpm" not in diagnosis.refuses:  # not withheld, but cannot be computed
+        # the channels allow L/min if the total leakage has them
         is_too_small = diagnosis.total_leakage is not None and diagnosis.total_leakage.lpm is not None
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
     if raw_counts(diagnosis):
@@ -190,7 +192,8 @@ def how_bad(diagnosis: Diagnosis) -> str | None:
     """Format the severity of the leak as a percentage of the repair limit, or as a multiple from 10 times the limit on.
 
     If this ratio is not known although a limit was stated, the text asks for the piston area. If no limit was stated,
-    the text is the leak as a fraction of the pump's flow. Returns None if there is no leak or its size is not known.
+    the text is the leak as a fraction of the pump's flow, unless `how_much` states this already. Returns None if there
+    is no leak or its size is not known.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -222,7 +225,7 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
     # [0]: each quantity is (value, low, high), of which only the value is stated
     parts = [
         None if severity.mL_per_min is None else f"{number(severity.mL_per_min[0], 2)} mL/min",
-        None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),
+        None if diagnosis.leak_lpm is None else _pump_fraction(diagnosis),  # without L/min `how_much` states it
         None if creep is None else f"as much as a piston that creeps by {number(creep[0], 2)} mm/min",
     ]
     return "; ".join(part for part in parts if part) or None
@@ -232,7 +235,8 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     """Format the total leakage past pump and piston, with its smallest change that could have been detected.
 
     It is stated in L/min or, if this is not known, as a fraction of the pump's flow. Returns None if no detector
-    measured it. `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak".
+    measured it. `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak",
+    for which they stand beside the leak (`_figure_rows`).
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -339,6 +343,7 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     """
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
+    # an unknown level is treated as the middle one, `plan`
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":

@@ -228,7 +228,7 @@ def _change_rows(
         label = charts.detail_label(change.name)
         rows.append((change.channel, label, unit, before, after, change.percent))
     max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])  # at least 10 %
-    bar_limit = min(100.0, 10.0 * ceil(max_change / 10.0))  # rounded up to tens of percent
+    bar_limit = min(100.0, 10.0 * ceil(max_change / 10.0))  # rounded up to tens of percent, at most 100 %
     return {"changes": rows, "bar_limit": bar_limit, "parts": parts}
 
 

@@ -21,7 +21,7 @@ _VALUES = {
     "closed_A": ("line.closed_A", "%", 1e-2),
     "closed_B": ("line.closed_B", "%", 1e-2),
 }
-#: A cylinder counts as double-rod if the smaller area is at least this fraction of the larger one.
+#: A cylinder is drawn as double-rod if the smaller area is more than this fraction of the larger one.
 _MIN_DOUBLE_ROD_RATIO = 0.95
 #: Height of the cylinder's bore in the drawing, and of a rod of unknown diameter.
 _BORE, _ROD = 78.0, 18.0
@@ -74,8 +74,8 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: areas of the sides A and B. A single rod is drawn sqrt(1 - smaller/larger area) times as high as the bore,
-    but at most 0.8 times.
+    `areas`: areas of the sides A and B. The height of a single rod over that of the bore is the ratio of the diameters,
+    sqrt(1 - smaller/larger area), but at most 0.8. That of a double-rod cylinder is unknown: it is drawn as `_ROD`.
     """
     ratio = min(areas) / max(areas)
     if ratio > _MIN_DOUBLE_ROD_RATIO:

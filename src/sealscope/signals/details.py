@@ -137,8 +137,8 @@ def details(
     depend on padding.
 
     The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
-    (5 in every decimated level, 0 in every reconstructed one). A causal system knows d_j of sample n only at sample ``n
-    + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
+    (5 to 6 in each decimated level, 0 in each reconstructed one). A causal system knows d_j of sample n only at sample
+    ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
     Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, for an
     unknown wavelet, transform or edge, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
@@ -169,7 +169,7 @@ def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
     """Compute the means (r, k) of `values` (r, n) in k segments.
 
-    `bounds` (k + 1,): segment i has the columns bounds[i] to bounds[i + 1] - 1.
+    `bounds` (k + 1,), increasing: segment i has the columns bounds[i] to bounds[i + 1] - 1.
     """
     limits = np.asarray(bounds)
     sums = np.add.reduceat(values, limits[:-1], axis=1)
@@ -235,7 +235,7 @@ def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[A
     coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
 
     def reconstruct_level(index: int) -> Array:
-        """Compute the part of the signal (n,) from the `coefficients` at `index`, 0 for the approximation."""
+        """Compute the signal part (n,) from the `coefficients` at `index`: 0 (approximation) to `levels` (d_1)."""
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
         return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
 

@@ -74,7 +74,7 @@ def split_levels(
     for level in range(levels):
         dilation = 1 << level
         row = start + level * capacity + first
-        delay = n_taps // 2 * ((1 << levels) - 2 * dilation)
+        delay = n_taps // 2 * ((1 << levels) - 2 * dilation)  # (L/2)(2^levels - 2^j) for level j, as 2^j = 2 dilation
         filter_rows(buffers, row - delay, 1, dilation, high, 0, n_taps, details, level * CHUNK, n)
         if level + 1 < levels:
             filter_rows(buffers, row, 1, dilation, low, 0, n_taps, buffers, row + capacity, n)

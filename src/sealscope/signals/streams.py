@@ -1,7 +1,8 @@
 """Stationary wavelet details of live signals, block by block and in bounded memory.
 
-One call filters a block of all signals and allocates nothing but views. Eight signals share a vector register
-(`kernels`), so that small blocks cost little more than large ones. Results do not depend on the division into blocks.
+One call filters a block of all signals and, given an array for the result, allocates nothing but views. Eight signals
+share a vector register (`kernels`), so that small blocks cost little more than large ones. Results do not depend on the
+division into blocks.
 """
 
 from __future__ import annotations
@@ -133,7 +134,7 @@ class DetailStream:
             raise InputError(f"block must have shape ({expected}), got {np.shape(block)}")
         n = np.shape(block)[-1]
         x = np.ascontiguousarray(block, dtype=np.float64).reshape(*self._shape_2d, n).view()
-        x.setflags(write=False)  # so that the kernel is compiled for one type, read-only arrays
+        x.setflags(write=False)  # so that the kernel is compiled for one type; a view, as the block may stay writeable
         out_shape = (*np.shape(block)[:-1], self.levels, n)
         if out is None:
             out = np.empty(out_shape)

@@ -154,7 +154,7 @@ class RmsStream:
             "step": self.step,
             "skip": self._skip,
             "next_end": self._next_end,
-            "ahead": self._n_unused,
+            "ahead": self._n_unused,  # the name in states saved so far
             "rest": None if self._rest is None else self._rest.copy(),
             "sums": None if self._sums is None else self._sums.copy(),
         }
@@ -179,6 +179,7 @@ class RmsStream:
 def _piece_sums(x: Array, piece: int) -> Array:
     """Compute the sums of squares (..., n // piece) of consecutive pieces of `x` (..., n), of `piece` samples each."""
     n_pieces = x.shape[-1] // piece
+    # contiguous: the order of the additions, and so the rounding, must not depend on the layout of `x`
     in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
     return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
 

@@ -127,11 +127,11 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
 
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the sets of model parameters in a run that limit the length of the solver's step.
+    """Collect the sets of model parameters in a run for which the length of the solver's step is checked.
 
-    A step that is short enough for each of them is short enough for the whole run. The first is `base`, without
-    effects. The others are those just before and just after each breakpoint of a fast effect, such as a valve that
-    switches (`min_block` below `SHORTEST_BLOCK`). Slow effects change the parameters too little to matter.
+    The first is `base`, without effects. The others are those just before and just after each breakpoint of a fast
+    effect, such as a valve that switches (`min_block` below `SHORTEST_BLOCK`). All other effects, drifts and most
+    faults, are left out.
     """
     fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
     times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
@@ -146,7 +146,7 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tup
 def add_needed_laws(base: RigNumbers, effects: Sequence[Effect]) -> RigNumbers:
     """Add to the parameters `base` the optional laws that effects need: leaks to the outside, and free air.
 
-    They are compiled in, so that every block of a run has them. A factor needs no law: it leaves a parameter at 0.
+    They are compiled in, so that every block of a run has them. A factor needs no law: it leaves a parameter of 0 at 0.
     """
     options: dict[str, Any] = {}
     for effect in effects:

@@ -37,10 +37,10 @@ def outputs_per_sample(rate: float, controller_rate: float, min_outputs: int) ->
 class Feedback:
     """A controller in feedback with the rig over a run of `duration` [s], which the solver calls through its `loop`.
 
-    The controller measures position and angle in whole counts of the rig's encoders, and pressures with the
-    transducers' noise. Other errors of the sensors, also those by faults and drifts, change the recording but not the
-    control. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate`
-    [Hz]: rate of the solver's outputs; `seed`: seed of the noise.
+    The controller measures position and angle in whole counts of the rig's encoders, and pressures with each
+    transducer's own noise. Other errors of the sensors, also those by faults and drifts, change the recording but not
+    the control. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate` [Hz]:
+    rate of the solver's outputs; `seed`: seed of the noise.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Feedback:
         self._controller = controller
         self._spacing = round(rate / controller.rate)  # solver outputs per sample of the controller
         samples = round(duration * rate) // self._spacing + 1
-        t = np.arange(samples + 1) / controller.rate
+        t = np.arange(samples + 1) / controller.rate  # one more, which only ends the last sample's interval
         inputs = np.zeros((samples + 1, 5))  # time, target, its speed, noise of p_A and p_B (`Loop.inputs`)
         inputs[:, 0], inputs[:, 1] = t, target.value_at(t)
         # a sample's voltage acts from `delay` to `delay + 1` samples later: the target's mean speed in this interval

@@ -125,7 +125,7 @@ class Alternating:
         durations = np.array([2.0 * np.pi * periods / sine.omega for periods, sine in self.parts])  # of each part [s]
         ends = np.cumsum(durations)
         time_in_cycle = np.mod(t, ends[-1])
-        part = np.minimum(np.searchsorted(ends, time_in_cycle, side="right"), ends.size - 1)
+        part = np.minimum(np.searchsorted(ends, time_in_cycle, side="right"), ends.size - 1)  # mod may round to the end
         amplitude = np.array([sine.amplitude for _, sine in self.parts])
         omega = np.array([sine.omega for _, sine in self.parts])
         u = amplitude[part] * np.sin(omega[part] * (time_in_cycle - (ends - durations)[part]))
@@ -156,7 +156,7 @@ class Polyline:
         return self.value_at(t)
 
     def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which slope or value jump; () for 1000 points or more, too many to divide a run."""
+        """Return the times [s] of the points, where slope or value jump; () for 1000 or more (`_MAX_BREAKPOINTS`)."""
         return tuple(map(float, np.unique(self.t))) if self.t.size < _MAX_BREAKPOINTS else ()
 
     def onset(self) -> float:
@@ -257,7 +257,7 @@ GOLDEN, MIX, LAST_SHIFT = 0x9E3779B97F4A7C15, ((30, 0xBF58476D1CE4E5B9), (27, 0x
 class PseudoRandom:
     """A pseudo-random binary command: +amplitude or -amplitude [V], drawn anew every `hold` [s] from `seed`.
 
-    The sign in interval k is a bit of the k-th state of SplitMix64 (Steele, Lea, Flood, OOPSLA 2014).
+    The sign in interval k is the highest bit of SplitMix64's k-th random number (Steele, Lea, Flood, OOPSLA 2014).
     """
 
     amplitude: float
@@ -376,7 +376,10 @@ _SINES = re.compile(rf"\s*([-+])?\s*({_N})?\s*\*?\s*sin\(\s*({_N})?\s*\*?\s*t\s*
 
 
 def _parse_sines(text: str) -> Sine | MultiSine | None:
-    """Parse a sine such as "3 sin(4t)", or a sum of sines, with or without an offset; return None for other texts."""
+    """Parse a sine such as "3 sin(4t)", or a sum of sines, with or without an offset; return None for other texts.
+
+    An amplitude or frequency that is not stated is 1.
+    """
     parts: list[Sine] = []
     end = 0
     # each sine but the first must have a sign, match[1]

@@ -195,7 +195,8 @@ class Fault:
                 size = float(rig[row.adds])
             elif row.over:
                 size /= float(rig[row.over])
-            max_change = FAULT_MAX_CHANGE * size or math.inf  # infinite for size 0, which changes nothing
+            # infinite for size 0, which changes nothing; size < 0 occurs for sensors only, where it is not used
+            max_change = FAULT_MAX_CHANGE * size or math.inf
         return tuple(
             Effect(
                 name.format(at=self.at, gain=GAIN_PARAMETERS.get(self.at)),

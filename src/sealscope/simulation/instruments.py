@@ -141,7 +141,7 @@ def read_pressure(
     drift = np.cumsum(random.standard_normal(n)) * sensor.drift / np.sqrt(rate)
     hum = parameter("hum", sensor.hum) * np.sin(2.0 * np.pi * (sensor.hum_frequency * t + random.random()))
     noise = parameter("noise", sensor.noise) * random.standard_normal(n)
-    if sensor.hum_harmonics > 0:
+    if sensor.hum_harmonics > 0:  # drawn after the noise, which is thus the same without harmonics
         hum = hum + parameter("hum", sensor.hum) * _hum_harmonics(sensor, t, random)
     gain = 1.0 + parameter("gain_error", sensor.gain_error)
     offset = parameter("offset", sensor.offset)
@@ -206,7 +206,7 @@ def record(
     theta = quantize(read_instantly(trajectory["theta"]), angle_resolution)
     x_parameter = parameters_of("x")
     scale = 1.0 + x_parameter("scale_error", sensors.x.scale_error)
-    x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)
+    x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)  # the rig has no such offset, a fault may
     x = x + x_parameter("noise", sensors.x.noise) * random["x"].standard_normal(n)
     common_noise_sd = readings.value("sensors.common_noise", sensors.common_noise, t)
     common_noise = common_noise_sd * random["common"].standard_normal(n)
@@ -221,7 +221,7 @@ def record(
         lagged_pressure = filter_first_order(trajectory[name], sensor.lag, rate * factor)
         pressure = read_filtered(lagged_pressure, sensor.delay * rate * factor)
         channels[name] = read_pressure(pressure, common_noise, sensor, rig.daq, rate, random[name], parameters_of(name))
-    meter, q_parameter = sensors.q_leak, parameters_of("q_leak")
+    meter, q_parameter = sensors.q_leak, parameters_of("q_leak")  # only faults give it a gain error or an offset
     q = (1.0 + q_parameter("gain_error", 0.0)) * read_filtered(trajectory["q_leak"]) + q_parameter("offset", 0.0)
     q = q + q_parameter("noise", meter.noise) * random["q_leak"].standard_normal(n)
     q = np.clip(q, -meter.range_hi, meter.range_hi)

@@ -218,7 +218,7 @@ def run_with_sized_leaks(
 
     The search for the coefficients (`size_leaks`) calls `progress` with the name of a task and its completed fraction.
     Without a stated mean flow, the only run calls `report_time` with the simulated time [s]. Raises InputError for a
-    leak larger than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
+    leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     initial_leaks = _start_of_search(leaks)
@@ -247,6 +247,7 @@ def run_with_sized_leaks(
                 )
             (unit_leak,) = experiment.scale_with_viscosity((replace(sized_leaks[k], coefficient=1.0),))
             unit_flow = leak_flow(unit_leak, run.t, run["p_A"] - run["p_B"], dp_0)
+            # weighted by the opening 0..1 of `leak`; that of `unit_leak` is divided by the oil's viscosity
             unit_flows[k] = mean_while_open(leak, run.t, unit_flow)
             if not unit_flows[k] > 0:
                 raise InputError(f"a leak with a mean flow must be open within the run, got {leak}")
@@ -358,7 +359,7 @@ class _Integration:
 
     `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: True to advance the
     integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`); `reached` [s]: time last
-    reported to `progress`.
+    reported to `progress`, which parts of the run that are integrated again do not report.
     """
 
     inputs: RunInputs
@@ -467,8 +468,8 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if steps of h [s] by `method` are too long for a rig `p` without its leaks.
 
-    The limit is `longest_step` for all parts but leaks, throttles and end stops, and 2.785/lambda for throttles with
-    rk4: lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
+    The limit is `longest_step` without leaks, which excludes throttles and end stops, and 2.785/lambda for throttles
+    with rk4: lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -522,7 +523,8 @@ class StepErrorCheck:
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
         the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
         the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long
-        enough for the wavelet, at the recording's sampling rate and with the sensors' noise added.
+        enough for the wavelet, at the recording's sampling rate (without its anti-alias filter) and with the variance
+        of the sensors' noise added, which white noise has in each detail.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)

@@ -111,6 +111,7 @@ class Leak:
             raise InputError("a leak needs either a coefficient or a mean flow, and not both")
         if not (math.isfinite(sizes[0]) and sizes[0] >= 0):
             raise InputError(f"a leak must be >= 0 and finite, got {sizes[0]}")
+        # thin oil may open a `Thinned` leak beyond 1
         if isinstance(self.opening, Polyline) and not np.all((self.opening.y >= 0) & (self.opening.y <= 1)):
             raise InputError(f"openings of a leak must be in 0..1, got {self.opening}")
 

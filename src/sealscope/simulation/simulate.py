@@ -104,7 +104,7 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the quantity with the largest difference relative to its tolerance, among those with a tolerance."""
+        """Find the quantity with the largest difference relative to its tolerance, among those with a tolerance > 0."""
         limited = [row for row in self.differences if row.tolerance]
         return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))  # `or`: for the type checker
 
@@ -223,6 +223,7 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
     flows = (leak_flow(leak, run.t, dp, dp_0) for leak in experiment.scale_with_viscosity(leaks))
+    # the mean is weighted by the opening 0..1 of `leak`, without the viscosity
     mean_leak = sum(mean_while_open(leak, run.t, flow) for leak, flow in zip(leaks, flows, strict=True))
     mean_leak_lpm = mean_leak / LITRE_PER_MINUTE
     return Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
@@ -249,7 +250,7 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Compare two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
 
-    Returns the differences of
+    Returns the differences, within the duration of the recording, of
 
     - speed, angle, position and velocity, by their rms difference, without a tolerance;
     - the four pressures, by their rms difference, which is to be at most the experiment's `error_allowed`;

@@ -55,8 +55,8 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     for no run. If the `latest` coefficient is 0, its flow is the one that a coefficient of 1 would give in that run.
 
     The next coefficient is on the straight line through both runs on logarithmic scales. The line's slope is limited to
-    0.1 .. 1, as is usual for leaks. The slope is 1 if the previous run was without a leak, or if both coefficients are
-    nearly equal.
+    0.1 .. 1, because a leak's flow grows with its coefficient, at most in proportion. The slope is 1 if the previous
+    run was without a leak, or if both coefficients are nearly equal.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest
@@ -87,13 +87,13 @@ def size_leaks(
 
     A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
     leak's flow grows less (`next_coefficient`). The search ends at a relative error of `TOLERANCE`, or after `MAX_RUNS`
-    with the best run. Raises SimulationFailed if that has not at least `SCATTER_TOLERANCE`.
+    with the best run. Raises SimulationFailed if its error is not below `SCATTER_TOLERANCE`.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)
     previous_coefficients = previous_flows = np.zeros(coefficients.size)
     best: tuple[Array, T] | None = None
-    best_error = SCATTER_TOLERANCE
+    best_error = SCATTER_TOLERANCE  # a run with a larger error is never the best
     for attempt in range(MAX_RUNS):
         if progress is not None:
             progress("sizing the leak", 1.0 - 0.5**attempt)  # the number of attempts is not known beforehand

@@ -229,7 +229,8 @@ def parse_force(text: str) -> Force:
     over_x, signal = _extract_terms(normalized, "x")
     over_v, signal = _extract_terms(signal, "v")
     if over_x or over_v:
-        signal = re.sub(r"^\s*\+|[+]\s*$", "", signal).strip()  # a sign that joined the signal to a term
+        # the plus that joined the signal to a term before it, and a plus at the end of the text, which joins nothing
+        signal = re.sub(r"^\s*\+|[+]\s*$", "", signal).strip()
         if not signal:
             return Force(_NO_FORCE, normalized, over_x, over_v)
     return Force(_parse_signal(signal, _FORCES, "load"), normalized, over_x, over_v)

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from sealscope.errors import InputError
 
-#: Length to which the file's name is cut in the name of its temporary file.
+#: Length to which the file's name is cut in the name of its temporary file, as file systems limit names to 255 bytes.
 _MAX_NAME = 60
 #: Name of a temporary file: .TARGET.COMPUTER-PROCESS.RANDOM.part.
 _TEMPORARY = re.compile(
     r"\.(?P<target>.{1,60})\.(?P<computer>[0-9a-f]{6})-(?P<process>\d{1,9})\.[a-z0-9_]{8}\.part", re.DOTALL
 )
-#: Age [s] from which a temporary file of another computer is removed.
+#: Age [s] from which a temporary file is removed even if the process that fills it may still run.
 _MAX_AGE = 86_400.0
 
 
@@ -57,7 +57,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = Path(name)
     try:
         yield temporary
-        _sync(temporary, os.O_RDWR)
+        _sync(temporary, os.O_RDWR)  # Windows syncs only what is open for writing
         temporary.chmod(_file_mode(target))
         temporary.replace(target)
         with suppress(OSError):  # Windows cannot open folders, and some file systems cannot sync them
@@ -112,6 +112,6 @@ def _is_alive(process: int) -> bool:
         os.kill(process, 0)  # sends nothing, but fails if there is no such process
     except ProcessLookupError:
         return False
-    except OSError:
+    except OSError:  # for example a process of another user
         return True
     return True

@@ -48,7 +48,7 @@ def iter_inner_files(folder: Path, paths: Iterable[Path]) -> Iterator[Path]:
 
 
 def numeric_sort_key(name: str) -> list[str | int]:
-    """Build a sorting key that puts "day_2" before "day_10": the list of the texts and whole numbers in `name`."""
+    """Build a sorting key that puts "day_2" before "day_10": the texts and whole numbers in `name`, which alternate."""
     return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", name)]
 
 

@@ -46,7 +46,8 @@ def open_inner(path: str | os.PathLike[str], what: str, mode: Literal["rb", "ab+
     """Open a file, in binary mode, in a folder of results that other people may have prepared.
 
     `mode`: `rb` to read, `ab+` to append or create; `what`: name in messages. Raises InputError for a link and any
-    other file that is not regular, and in mode `ab+` for a file with several hard links; OSError if opening fails.
+    other file that is not regular, and in mode `ab+` for a file with several hard links, as one of them may be a file
+    elsewhere; OSError if opening fails.
     """
     if Path(path).is_symlink():
         raise InputError(f"{what} must be a file, got a link ({path})")

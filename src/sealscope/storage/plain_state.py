@@ -78,7 +78,7 @@ def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np
     """Return the entry `name` of a saved state as an array of numbers with this shape; raise InputError otherwise."""
     try:
         values = np.asarray(require_part(state, name, object))
-        if values.size and values.dtype.kind not in "fi":
+        if values.dtype.kind not in "fi":
             raise TypeError(f"got {values.dtype}")
     except (TypeError, ValueError) as error:
         raise InputError(f"saved state's {name} must hold numbers: {error}") from None

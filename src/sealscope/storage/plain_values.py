@@ -100,7 +100,7 @@ def to_plain(value: Any) -> Any:
     values are not changed.
     """
     if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
+        return float(value) if math.isfinite(value) else None  # np.float64 is a float, too
     if isinstance(value, Mapping):
         return {name: to_plain(item) for name, item in value.items()}
     if hasattr(value, "_asdict"):

@@ -15,6 +15,7 @@ from sealscope.storage.atomic import remove_temporaries
 from sealscope.storage.opening import open_inner
 from sealscope.storage.plain_values import parse_json
 
+#: Names of the file of rows and of the lock, in the folder of the results.
 ROWS, LOCK = "rows.jsonl", ".lock"
 #: Longest line of a row [bytes].
 _MAX_LINE = 10_000_000
@@ -49,7 +50,8 @@ def read_rows(
     try:
         with open_inner(path, f"{what}'s file of rows") as file:
             for number, line in enumerate(iter(lambda: file.readline(_MAX_LINE), b""), start=1):
-                if not line.endswith(b"\n") and len(line) < _MAX_LINE:  # cut by a power loss
+                # cut by a power loss; the beginning of a line longer than `_MAX_LINE` is refused below
+                if not line.endswith(b"\n") and len(line) < _MAX_LINE:
                     break
                 try:
                     row = row_of(parse(line))
@@ -76,7 +78,7 @@ def store_rows(folder: Path, rows: Generator[Row, None, None], what: str, allow_
     """
     with closing(rows), open_inner(folder / ROWS, f"{what}'s file of rows", "ab+") as file:
         size = file.seek(0, os.SEEK_END)
-        file.seek(max(0, size - _MAX_LINE))
+        file.seek(max(0, size - _MAX_LINE))  # only the last line is of interest
         _, _, incomplete_line = file.read().rpartition(b"\n")  # empty unless a power loss cut a line off
         file.truncate(size - len(incomplete_line))
         for row in rows:

@@ -39,7 +39,7 @@ def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> di
     try:
         with open_regular(path, what) as file:
             data = file.read(max_size + 1)
-    except InputError:
+    except InputError:  # is a ValueError, with a complete message
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error

@@ -93,7 +93,7 @@ def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
     """
     group_squares = {}
     for command, closed_pct in GROUPS:
-        # number and level have no effect on the simulation
+        # number, leak and level have no effect on a simulation without the leak
         condition = Condition(number=0, command=command, closed_pct=closed_pct, mean_leak_lpm=0.0, level="")
         group_squares[condition.group] = noise_free_mean_squares(rig, condition)
     squares = np.array([group_squares[condition.group] for condition in APPENDIX_C])

@@ -41,10 +41,10 @@ _CLOSED_COLUMN, _LEVEL_COLUMN = "orifice_closed_pct", "leakage_level"
 class Condition:
     """The inputs of one leakage test of Appendix C; `number` counts the tests from 1, in the printed order.
 
-    `command`: voltage as text, such as "3 sin(4t)"; `closed_pct`: closing of both throttles [%], where open throttles
-    (0 %) cause no pressure drop in the thesis's model (section 4.2.1); `mean_leak_lpm`: mean leak [L/min] after the
-    bypass valve was opened; `level`: position of the bypass's needle valve, such as "large". The level does not
-    determine the leak, which is 10 to 16 mL/min for "large" and 4 to 14 for "extra-small".
+    `command`: voltage as text, such as "3 sin(4t)"; `closed_pct`: closing of both throttles [%], 0 if they are open;
+    `mean_leak_lpm`: mean leak [L/min] after the bypass valve was opened; `level`: position of the bypass's needle
+    valve, such as "large". The level does not determine the leak, which is 10 to 16 mL/min for "large" and 4 to 14 for
+    "extra-small".
     """
 
     number: int

@@ -78,7 +78,8 @@ def _judge_file(plan: RecordedPlan, recording_set: RecordingSet, path: Path, nam
 
     `name`: path of the recording within the folder, from which the id of the row is computed.
     """
-    levels = {"set": recording_set.label or recording_set.files, STROKE: "unknown"}  # the stroke is not yet known
+    # the stroke is not yet known; it is set below, in this dictionary, which `make_row` keeps
+    levels = {"set": recording_set.label or recording_set.files, STROKE: "unknown"}
     make_row = partial(
         CaseRow,
         id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],

@@ -34,8 +34,9 @@ def iter_results(
     """Run `task` on each item in several processes, and yield pairs of item and result in the order of completion.
 
     `jobs`: largest number of processes, 1 for this process only; `cluster`: address of a Dask scheduler whose workers
-    are used instead. The next of `items` is taken only when a worker is free. Items and `task` are pickled. Processes
-    on this machine ignore the keyboard interrupt; they end with the generator or with the parent process.
+    are used instead. The next of `items` is taken only when a worker, or a place in a cluster's queue, is free. Items
+    and `task` are pickled. Processes on this machine ignore the keyboard interrupt; they end with the generator or with
+    the parent process.
 
     If a process dies, for example because memory is short, its item is run once more, alone, after all others. If it
     dies again, the result is None. Exceptions of `task` are raised here. Raises MissingExtra if a cluster is wanted and

@@ -55,10 +55,11 @@ def compute_thresholds(
 ) -> Thresholds:
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free records.
 
-    The duty of a record is its command and stroke direction (`duty_label`). A record without a score counts as the
-    lowest score of its duty. `false_alarm`: wanted false-alarm probability; `promise`: "average" if it is kept on
-    average over sets of leak-free records, "bound" if it is kept with the probability `confidence`. Returns thresholds
-    by (detector, duty). Raises InputError if a scorer needs a threshold and no duty has enough records.
+    The duty of a record is its command and stroke direction (`duty_label`). A record without a score, which raises no
+    alarm, counts as the lowest score of its duty. `false_alarm`: wanted false-alarm probability; `promise`: "average"
+    if it is kept on average over sets of leak-free records, "bound" if it is kept with the probability `confidence`.
+    Returns thresholds by (detector, duty). Raises InputError if a scorer needs a threshold and no duty has enough
+    records.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}

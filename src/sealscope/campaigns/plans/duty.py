@@ -38,7 +38,7 @@ def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None
         check_controller_name(level)
     elif name == LOAD:
         parse_force(level)
-    elif isinstance(command := command_or_target(level), Position):
+    elif isinstance(command := command_or_target(level), Position):  # raises for an invalid text
         times = np.arange(0.0, duration, 1.0 / _TARGET_CHECK_RATE)
         check_target(command, times, rig.cylinder.L / 2)  # the position is 0 at mid-stroke
 

@@ -73,7 +73,10 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the name of a view (a set of channels); raise ValueError if it is empty, or has "@" or outer blanks."""
+    """Return the name of a view (a set of channels); raise ValueError if it is empty, or has "@" or outer blanks.
+
+    In a detector's name, such as "diagnose @ pressures", "@" precedes the name of a view.
+    """
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name

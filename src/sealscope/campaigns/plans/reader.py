@@ -82,7 +82,7 @@ def read_plan(tree: Mapping[str, Any], place: str = "plan") -> AnyPlan:
     _check_entry("campaign.assume", place, lambda: plan.assumed)
     for name in plan.detectors:
         _check_entry("campaign.detectors", place, partial(check_detector, name, plan.views))
-    if {DIAGNOSE, WATCH} & {parse_detector_name(name).base for name in plan.detectors}:
+    if {DIAGNOSE, WATCH} & {parse_detector_name(name).base for name in plan.detectors}:  # these accept a smaller range
         _check_entry("campaign.false_alarm", place, partial(check_probability, plan.false_alarm))
     if len(set(plan.detectors)) < len(plan.detectors):
         raise InputError(f"campaign.detectors must be named once each ({place})")
@@ -110,7 +110,7 @@ def _parse_tables(tree: Mapping[str, Any], place: str) -> AnyPlan:
         if not isinstance(values, Mapping):
             raise InputError(f"{table} must be a table, got {values!r} ({place})")
         for entry in values:
-            is_misplaced = (entry in source_entries) != (table == source)  # it is an entry of the other table
+            is_misplaced = (entry in source_entries) != (table == source)  # of the other table, or of none
             if is_misplaced or entry in ("place", *tables):  # these would replace other fields of the plan
                 raise InputError(f"{table}.{entry} is not known ({place})")
             full_names[entry] = f"{table}.{entry}"
@@ -200,8 +200,9 @@ def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 def _check_records(plan: SimulatedPlan) -> None:
     """Check the groups of records of a plan; raise InputError if a group is invalid.
 
-    The groups must differ in use, leak, law or fault, and at least one must be judged. If a detector needs a threshold,
-    there must be enough leak-free records (`records_needed`) for each command.
+    The groups must differ in use, leak, law or fault, since the ids of records follow from these (`list_cases`), and at
+    least one must be judged. If a detector needs a threshold, there must be enough leak-free records (`records_needed`)
+    for each command, as each gets its own threshold.
     """
     contents = [(group.use, group.leak_lpm, group.law, group.fault) for group in plan.records]
     for number, (content, group) in enumerate(zip(contents, plan.records, strict=True), 1):

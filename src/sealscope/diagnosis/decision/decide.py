@@ -87,7 +87,7 @@ def _decide_without_leak(case: Case) -> Evidence:
 
     The verdict is `no leak` if an undetected leak can only be small (`_bound_and_limit`). If another event explains a
     rare change, the evidence states the event's cause. If leakage is measured, it also states the total leakage and the
-    upper bound of an undetected leak. Score and threshold are those of the first test, even if another raised an alarm.
+    upper bound of an undetected leak. Score and threshold are those of the test with an alarm, else of the first one.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
@@ -95,7 +95,7 @@ def _decide_without_leak(case: Case) -> Evidence:
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
     evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
-    evidence = _add_tests(case, evidence, case.tests[0] if case.tests else None)
+    evidence = _add_tests(case, evidence, alarm or next(iter(case.tests), None))
     if leak is not None:
         evidence = replace(
             evidence,

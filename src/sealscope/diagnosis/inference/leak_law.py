@@ -165,19 +165,17 @@ def estimate_older_flow(
     rise over healthy recordings (`rise_flows`) and, for e < 1, also from its curvature over pressure (`bend_flows` of
     `estimate_bend_flows`); the two are averaged with their precisions as weights.
 
-    The weight of an exponent in the result is its prior probability. For e < 1 it is multiplied by exp(-d^2 / (2 v)),
-    where d is the difference between the two flows and v its variance, and by the largest likelihood ratio in
-    `log_ratios` (those of `older_log_ratios`).
+    The weight of an exponent in the result is its prior probability times its likelihood ratio, that of e = 1 or the
+    largest of all e < 1 in `log_ratios` (those of `older_log_ratios`): the data hardly tell these from each other. For
+    e < 1 it is multiplied by exp(-d^2 / (2 v)), where d is the difference between the two flows and v its variance.
     """
-    # one ratio for every e < 1: the data tell these from e = 1, whose ratio is 0 without a prior on the level of the
-    # leak (`onset.constant_log_ratio`), but hardly from each other
-    log_ratio = float(log_ratios.max())
+    laminar_ratio, bent_ratio = float(log_ratios[0]), float(log_ratios[1:].max())
     weights, flows = list[float](), list[Estimate]()
     for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
-        flow, weight = by_rise, float(log_prior)
+        flow, weight = by_rise, float(log_prior) + laminar_ratio
         if by_bend is not None:
             variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)
-            weight += log_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
+            weight += bent_ratio - laminar_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
             value = float(np.average([by_rise.value, by_bend.value], weights=1.0 / variances))
             flow = Estimate(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
         weights.append(weight)

@@ -1,8 +1,8 @@
 """The volume balance of a running machine: the leakage conductance in each block of a few seconds.
 
-The blocks are cut as in a recording (`balance.BlockStream`). All coefficients of the balance but the leak's are
-estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which lie in
-parallel; `sequential` tests it for a step.
+The blocks are cut as in a recording (`inference.balance.BlockStream`). All coefficients of the balance but the leak's
+are estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which
+lie in parallel; `sequential` tests it for a step.
 """
 
 from __future__ import annotations
@@ -223,13 +223,14 @@ class LiveBalance(SavedAttributes):
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        Blocks without missing values are kept, the last `WINDOW` of them, to fit the coefficients of the balance.
-        Learning begins with the first block that moves: the first `LEARNED` - 1 blocks give a `NotJudged`, and the next
-        one the conductances of all `LEARNED`. Blocks with missing values, or before the first motion, give a
-        `NotJudged`, too. After `N_WAKING` successive blocks that move far more than usual, learning begins again.
+        Blocks with at least one complete equation are kept, the last `WINDOW` of them, to fit the coefficients of the
+        balance. Learning begins with the first block that moves: the first `LEARNED` - 1 blocks give a `NotJudged`, and
+        the next one the conductances of all `LEARNED`. Blocks without a complete equation, or before the first motion,
+        give a `NotJudged`, too. After `N_WAKING` successive blocks that move far more than usual, learning begins
+        again.
         """
         _, end = self._sample_times(block)
-        if not block.rows[0]:
+        if not block.rows[0]:  # number of complete equations
             return NotJudged.with_count(end, "missing values")
         packed = block.pack()
         self._stored = packed if self._stored is None else Blocks.join([self._stored, packed])[-WINDOW:]
@@ -339,7 +340,7 @@ class LiveBalance(SavedAttributes):
         if len(blocks) < MIN_BLOCKS:
             return ()
         centred = remove_pressure_offset(blocks, self._roles)
-        volumes = volume_observables(  # oil: not tested
+        volumes = volume_observables(  # few blocks, so without an orifice; a loss of oil is not estimated
             centred, blocks, self._balances, self._roles, oil_loss={}, with_orifice=False
         )
         # the samples of a block begin less than a block before the time range of its equations
@@ -371,6 +372,7 @@ class LiveBalance(SavedAttributes):
             self._stream.load_state(stream)
 
 
+#: Saved attributes of a `Coefficients`, without its work arrays, and of stored `Blocks`.
 _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__dataclass_fields__)
 
 
@@ -392,9 +394,9 @@ def size_error(rig: Rig) -> float:
 def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = False) -> list[Equation]:
     """Build the volume balances of a running machine that the channels `names` allow.
 
-    Balances whose flow is computed from the command are left out. The term of the pump's leakage is left out, too, as
-    it cannot be distinguished from the piston's. `with_tested_terms` includes terms that are only tested for a change,
-    not fitted.
+    Balances whose flow is computed from the command are left out, as a stream does not simulate the drive for it. The
+    term of the pump's leakage is left out, too, as it cannot be distinguished from the piston's. `with_tested_terms`
+    includes terms that are only tested for a change, not fitted.
     """
     balances = []
     for balance in equations(rig, frozenset(names)):

@@ -98,8 +98,9 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
         S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
 
-    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out. The other sums in `model`
-    are updated with the same memory.
+    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out of the denominator. The
+    other sums in `model` have the same memory; `leak_products` and `ENERGY`, of which `estimate_leak` uses the ratio,
+    have no weight.
     """
     sums, block, size = model.sums, model.block, len(model.block)
     leak = size - 2  # index of the leak's column, before the left side

@@ -105,7 +105,7 @@ class WatchedLeak:
 
     @property
     def allowed(self) -> float:
-        """Probability of a false alarm for which the `threshold` of the test was set."""
+        """The test's p-value at its `threshold`: the allowed false-alarm probability, or less by `null.StepNull`."""
         return LiveRise(self.test, self.threshold).chance
 
     @property
@@ -144,7 +144,7 @@ class WatchBaseline(HealthyLevel):
     Attributes
     ----------
     version, hours : int, float
-        1 for the first baseline, increased by one after each repair; operating time of learning [h].
+        1 for the first baseline, increased by one whenever it is learned anew; operating time of learning [h].
     lpm : float or None
         The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
     duty_low, duty_high : tuple of float
@@ -196,8 +196,9 @@ def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
 
     With the conductance G before the leak, the result's `low` is G/r and its `high` is r max(G, 0), where r =
     warmest^(tau/shift) and tau is the time since the onset, at most `shift`. By the table `oil` of `priors.toml`,
-    warming of the oil raises a conductance at most by the factor `warmest`, within the time `shift` [h]. A negative
-    estimate is an error, as no conductance is below 0; `high` is then 0.
+    warming of the oil raises a conductance at most by the factor `warmest`, within the time `shift` [h]; cooling lowers
+    it as much. A negative G is an error, as no conductance is below 0; `high` is then 0. The `deviation` is that of the
+    leak's rise.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0

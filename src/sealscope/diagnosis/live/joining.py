@@ -92,6 +92,7 @@ class SampleJoiner(SavedAttributes):
         """Yield the runs of samples without a gap; count dropped samples, gaps, and changes of rate or channels."""
         names = self._choose_names(samples)
         if reason := _find_lack(samples, names):
+            # without `names` the channels are the reason, not the rate that `_find_lack` states
             self.count(reason if names else f"samples without {format_ways(self.ways)}", len(samples))
             return
         if names != self.names:

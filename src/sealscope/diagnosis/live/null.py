@@ -68,5 +68,6 @@ def _find_threshold(count: int, surprisal: float, probability: float) -> float:
     if count < _MIN_WINDOWS:
         return -math.log(probability)
     null = HealthyNull({STEP: [surprisal / count] * count})  # of the surprisals, only sum and number matter
+    # probability of a window, kept below 1 by the limit
     chance = null.uncalibrated_chance(STEP, min(WINDOW * probability, 0.5))
     return max(_LOG_WINDOW - math.log(chance), -math.log(probability))

@@ -19,7 +19,7 @@ _UNDATED = Interval(math.nan, math.nan, math.nan)
 
 
 class LiveRise(NamedTuple):
-    """An increase of a running machine's leakage conductance, with its test; a `observable.DatedTest`."""
+    """An increase of a running machine's leakage conductance, with its test; an `observable.DatedTest`."""
 
     test: str  # "step" for a step within the stream, "level" for a conductance above that of the healthy machine
     score: float  # score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level
@@ -45,7 +45,7 @@ class LiveRise(NamedTuple):
         return math.exp(self.log_chance)
 
     def threshold(self, chance: float) -> float:
-        """Return the score that a healthy machine exceeds with the probability `chance`."""
+        """Return the score that a healthy machine exceeds with the probability `chance`, for a step at most."""
         from scipy.special import ndtri
 
         return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))

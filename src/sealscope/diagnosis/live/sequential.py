@@ -130,7 +130,7 @@ class StepDetector(SavedAttributes):
         if may_begin:
             self._add_onsets(begin, end)
         response = 1.0 - self._sums[_FOLLOWED]  # f
-        if may_begin:  # a step that begins in this block acts in a part of the block
+        if may_begin:  # a step that begins in this block (the last onsets) acts in a part of the block
             response[:, -len(PARTS) :] = PARTS
         square = innovation**2 / innovation_variance
         self._sums[_FOLLOWED] += gain * response

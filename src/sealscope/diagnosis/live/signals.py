@@ -73,7 +73,8 @@ class SignalWindow(SavedAttributes):
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
-            self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])  # subtracted from all blocks
+            # subtracted from all blocks, against rounding
+            self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
         motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
         speed = 0.0 if motion is None else top_speed(motion)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
@@ -131,6 +132,9 @@ class SignalWindow(SavedAttributes):
 
 
 def append_row(rows: Array, row: Array) -> Array:
-    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`; drop all `rows` if their length differs."""
+    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`.
+
+    All `rows` are dropped if their length differs, as at the first block or, in `pressures`, at another sampling rate.
+    """
     stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
     return np.vstack([stored, row])

@@ -181,7 +181,7 @@ class Watch:
         """
         leak = self.leak
         if leak is not None:
-            estimator = self._estimator or self._make_estimator()
+            estimator = self._estimator or self._make_estimator()  # a restored watch may have none yet
             return decide_on_stream(self._measure(estimator, leak), leak.allowed)
         probability = self._false_alarm_probability(STEP, self.block_seconds)
         measure = None if self._estimator is None or not len(self._compared) else self._measure(self._estimator, None)
@@ -430,7 +430,7 @@ class Watch:
             self._samples.count("changes that are no leak: a start")
             self._forget()
             return UNKNOWN
-        with threadpool_limits(limits=1):
+        with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
             observables = estimator.observables(self._since, block.end, rise.interval.value)
         if observables is None:
             return RiseExplanation(is_leak=True)
@@ -453,7 +453,7 @@ class Watch:
         if healthy is None:
             return
         blocks = self._compared[-GROUP:]
-        first_s = float(self._compared["end"][0])
+        first_end_s = float(self._compared["end"][0])
         max_ratio = INFERENCE.oil.warmest
         weights = blocks["sd"] ** -2.0 / np.sum(blocks["sd"] ** -2.0)  # by the precision of each block
         g, total, offset = (float(weights @ blocks[name]) for name in ("g", "total", "offset"))
@@ -463,11 +463,11 @@ class Watch:
             # the mean is compared with `max_ratio` times the baseline, and both contain the same error `offset`
             deviation = math.hypot(sd, offset * (max_ratio - 1.0))
         else:
-            name, mean, onset_s = "healthy recordings", total, first_s
+            name, mean, onset_s = "healthy recordings", total, first_end_s
             deviation = math.hypot(sd, offset)
         # the leak began after the machine was known to be healthy, if that time is on the clock of the blocks
         has_same_clock = has_baseline or counts_from_1970(block.end)
-        earliest_s = min(healthy.known_s, first_s) if has_same_clock else first_s
+        earliest_s = min(healthy.known_s, first_end_s) if has_same_clock else first_end_s
         onset = Interval(onset_s, earliest_s, block.end)
         probability = self._false_alarm_probability(LEVEL, GROUP * self.block_seconds)
         rise = find_level_rise(healthy, onset, mean, deviation, probability)

@@ -15,11 +15,11 @@ class FalseAlarmPriors(PriorTable):
 class NullPriors(PriorTable):
     """Prior on the error of the p-values that a detector states for healthy recordings (`decision.null`).
 
-    Wrong p-values are too small: their mean surprisal, -log(p-value), is 1 times an inflation factor > 1.
+    For right p-values the mean of -log(p-value) is 1. Wrong p-values are too small, and this mean is a factor > 1.
     """
 
     fails: float  # fraction of machines on which the p-values of a test are wrong
-    inflation: float  # scale of the exponential prior on the logarithm of the factor
+    inflation: float  # scale of the exponential prior on the logarithm of this factor
     largest: float  # largest factor
 
 

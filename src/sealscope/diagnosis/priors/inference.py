@@ -59,7 +59,8 @@ class ScatterPriors(PriorTable):
     relative: float  # largest scatter of the leakage's logarithm
     unlike: float  # fraction of days whose unrecorded oil temperature is unlike that of all others
     session: float  # standard deviation of the leakage between sessions with oil of one viscosity
-    tail: float  # probability that a healthy recording lies farther above than predicted, and the same below
+    # a leakage outside the quantiles `tail` and 1 - `tail` of the prediction is evidence neither for a leak nor against
+    tail: float
 
 
 class ConditionPriors(PriorTable):

@@ -52,7 +52,7 @@ class WatchPriors(PriorTable):
     pause: float  # [s] longest pause across which blocks are compared
     margin: float  # pressure and flow may exceed the range of the baseline by this logarithm
     damped: float  # the pressure may fall below the range by this logarithm, as a leak lowers it
-    inside: float  # smallest part of a leak that flows past the piston, over its flow as estimated from the pressures
+    inside: float  # smallest part of a leak inside the actuator, over its flow as estimated from the pressures
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
     step: float  # fraction of the false alarms for the test for a step

@@ -38,8 +38,9 @@ class LevelScatter(PriorTable):
 class RmsBlockPriors(PriorTable):
     """Division of a recording into blocks."""
 
-    seconds: float  # [s] shortest block
-    samples: int  # fewest samples of a block
+    # a block is as long as the longer of these, before it is adapted to the cycle of the duty and to `most`
+    seconds: float  # [s]
+    samples: int  # number of samples
     most: int  # largest number of blocks
     fewest: int  # smallest number of blocks in which a change is looked for
     settling: float  # [s] time in which pressures and speed settle after a start

@@ -2,8 +2,8 @@
 
 The details are those of each chamber pressure, d1 to d4 with the wavelet db8 (`signals.details`). The duty is how the
 machine is moved and loaded, measured by the command and p_A - p_B. A block is a whole fraction or multiple of the
-command's cycle, so that blocks of the same phase differ only by noise and by changes of the machine. Without a cycle, a
-block is a window of fixed length.
+duty's cycle (`find_cycle`), so that blocks of the same phase differ only by noise and by changes of the machine.
+Without a cycle, a block is a window of fixed length.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ DUTY = tuple(vars(RMS_PRIORS.duty))
 class RmsBlocks:
     """Log RMS of every wavelet quantity (`QUANTITIES`) and features of the duty, in n blocks of a recording.
 
-    If the command repeats, the mean differences between the phases, the blocks of a cycle, are removed from both.
+    If the duty repeats, the mean differences between the phases, the blocks of a cycle, are removed from both.
     """
 
     edges: Array  # (n + 1,): start of each block and end of the last one [s]
@@ -43,8 +43,8 @@ class RmsBlocks:
     # (n, 4), see `DUTY`: log RMS of the command, of its rate and of the pressure difference dp, and mean(dp)/RMS(dp)
     duty: Array
     chambers: tuple[str, ...]  # names of the chamber pressures
-    phases: int  # number of blocks per cycle of the command; 1 if a block is a whole cycle or longer, or without one
-    cycle: float | None  # period of the command [s], None if nothing repeats
+    phases: int  # number of blocks per cycle of the duty; 1 if a block is a whole cycle or longer, or without one
+    cycle: float | None  # period of the duty [s], None if nothing repeats
     frozen: str | None = None  # description of the first block with a stuck pressure reading, if any
     n_left_out: int = 0  # number of blocks that were left out because samples are missing
 
@@ -82,7 +82,7 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 
 
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
-    """Name the recorded chamber pressures that are not mostly clipped, or all of them if all are mostly clipped."""
+    """Name the recorded chamber pressures that are not mostly clipped; all of them if none would be left."""
     chambers = chambers_of(recording)
     return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
 
@@ -103,14 +103,15 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
 
     `RmsBlocks` describes both. `transformed` are the wavelet details of each judged chamber, and `bounds` (n + 1,) the
-    sample indices of the blocks' ends. The load is p_A - p_B or, for a single chamber, its pressure minus the mean.
+    sample indices of the blocks' ends. The load is p_A - p_B, even if one of them is clipped, or the pressure of the
+    only recorded chamber minus its mean. The log RMS is -inf for a detail that is 0, such as that of a stuck reading.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
         load = recording["p_A"] - recording["p_B"]
     else:
         load = recording[chambers[0]] - recording[chambers[0]].mean()
-    command = recording.channels.get("u", np.zeros(len(recording)))
+    command = recording.channels.get("u", np.zeros(len(recording)))  # without u: equal in all blocks
     squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
     # lower limit, so that the logarithm is finite in blocks at standstill
     floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
@@ -128,7 +129,7 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     The recording must be uniformly sampled and its gaps filled in. Blocks in which too many samples were missing are
     left out, and so are the ends, where the wavelet transform depends on padding. If the duty repeats, the mean
     differences between the phases of its cycle (blocks at the same place in the cycle) are removed, unless a reading is
-    stuck. For a recording that is too short for a block, the result has no blocks.
+    stuck, whose log RMS has no mean. For a recording that is too short for a block, the result has no blocks.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -159,17 +160,18 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
     """Choose the sample indices at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
     `inside` are the samples at which the wavelet details do not depend on padding, `rate` is the sampling rate [Hz],
-    and `cycle` the period of the command [s], or None. A block is the fraction 1, 1/2, 1/3, ... of the cycle that is
-    closest to the shortest allowed length, or several cycles if a cycle is shorter than that. Without a cycle, it has
-    the shortest allowed length. If there would be too many blocks, they become longer and span whole cycles.
+    and `cycle` the period of the duty [s], or None. Without a cycle, a block has the length L of `priors.toml`, the
+    longer of `blocks.seconds` and `blocks.samples`. With one, it is cycle / n with n = cycle / L, rounded, or n cycles
+    with n = L / cycle, rounded, if a cycle is shorter than L. If there would be too many blocks, they become longer and
+    span whole cycles.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
-    block_s = min_block_s = max(prior.seconds, prior.samples / rate)
+    block_s = prior_s = max(prior.seconds, prior.samples / rate)
     phases = 1
     if cycle is not None:
-        phases = max(1, round(cycle / min_block_s))
+        phases = max(1, round(cycle / prior_s))
         phase_s = cycle / phases
-        block_s = phase_s * max(1, round(min_block_s / phase_s))
+        block_s = phase_s * max(1, round(prior_s / phase_s))
     if n_samples > prior.most * block_s * rate:
         block_s *= phases * math.ceil(n_samples / (prior.most * phases * block_s * rate))
         phases = 1

@@ -74,7 +74,8 @@ class RmsChange:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test the RMS of the wavelet details against `baseline` or, without one, for a change within the recording.
 
-        If the sampling rate is too low, a reading is stuck, or the recording is too short, the report only says so.
+        The report only gives a reason if the sampling rate is too low, or if nothing can be compared: no recording of
+        `baseline` is comparable (`observe_against`) or, without one, a reading is stuck or there are too few blocks.
         """
         min_rate: float = RMS_PRIORS.rate.slowest
         if recording.rate < min_rate:
@@ -95,9 +96,10 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
     """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
     The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
-    the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. `rate` is the
-    sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels. If most blocks
-    give no information about a detail, the report only says so.
+    the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. The bound of an
+    undetected change of the ringing is the smallest by a judged detail, as the ringing changes in all of them. `rate`
+    is the sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels. If most
+    blocks give no information about a detail, the report only says so.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
@@ -127,18 +129,18 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
         tuple(observables),
         share=blocks.share,
         judged_until=blocks.share,
-        ringing=Ringing(min(bounds), rate, healthy=0, is_dated=True, unused=unused),
+        ringing=Ringing(min(bounds), rate, healthy=0, is_dated=True, unused=unused),  # one recording needs no date
     )
 
 
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    Only recordings in `baseline` with the same chamber pressures and sampling rate are used. If there are none, the
-    report only says so.
+    Only recordings in `baseline` with the same chamber pressures and sampling rate are used, in which the pressures
+    that are judged here are not clipped. If there are none, the report only says so.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
-    # the duty is computed from all recorded chambers, which must therefore be the same
+    # the duty is computed from all recorded chambers, which must therefore be the same; older summaries lack `recorded`
     summaries = [
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
@@ -163,7 +165,8 @@ def compare_summaries(
 
     `judged` and `summaries` are summaries (`RmsChange.learn`) of the judged and the leak-free recordings, and
     `chambers` the pressures to compare. Returns an observable for each detail and chamber, and the 95 % upper bound of
-    an undetected change g of the ringing (log RMS without noise): the smallest of those by the judged details d2 to d4.
+    an undetected change g of the ringing (log RMS without noise): the smallest of those by the judged details d2 to d4,
+    which all contain the ringing.
     """
     starts = [*(summary.get("start_s") for summary in summaries), judged.get("start_s")]
     times = None if None in starts else np.array(starts, dtype=float)
@@ -194,7 +197,8 @@ def _make_observable(
 
     `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `onset` its time [s], None for a
     comparison with other recordings. The p-value `chance` is multiplied by the number of tests, which is two (rise and
-    fall) for each judged detail of each chamber in `chambers`.
+    fall) for each judged detail of each chamber in `chambers`. d1 and d3d4, which are not judged, have a kind of data
+    of their own, "noise of details": a leak may change it, but is not detected by it (`decision/events.toml`).
     """
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",

@@ -55,25 +55,26 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
-    g = log(RMS / mean RMS) of the pressures' wavelet details, after noise (`subtract_noise`) and the effect of the duty
-    were subtracted. Returns for each column of `blocks.log_rms` a normal likelihood of g over the blocks
+    g is the log RMS of the pressures' wavelet details, up to a constant, after noise (`subtract_noise`) and the effect
+    of the duty were subtracted. Returns for each column of `blocks.log_rms` a normal likelihood of g over the blocks
     (`Information`), and the mean fraction w (columns,) of energy that is not noise: the log RMS itself changes by w g.
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
-    features = DUTY[:-1]  # no direction: the mean differences between the phases of a cycle are removed already
+    features = DUTY[:-1]  # no direction: it belongs to the phase of a cycle, whose mean difference is removed already
     duty = (blocks.duty - blocks.duty.mean(axis=0))[:, : len(features)]
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in features])
     time = blocks.edges[:-1] + 0.5 * blocks.seconds
     walks = RMS_PRIORS.walk
-    # convert scales for `walk.time` to the length of all blocks: a random walk grows with the root of the time
+    # convert scales for `walk.time` to the length of all blocks: a random walk grows with the root of the time; the
+    # linear change is given the same scale
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()
     for name, y, w, variance in zip(blocks.names, changes.T, weight.T, variances, strict=True):
         drift_scale = (walks.noise if name.startswith("d1 ") else machine_walk) * walk_scale
         precision, vector = w**2 / variance, w * y / variance
-        # eliminate the exponents of the duty, which have normal priors
+        # eliminate the exponents of the duty D, which have normal priors: P - P D (D'P D + 1/sd^2)^-1 D'P
         weighted = precision[:, None] * duty
         gain = weighted @ np.linalg.inv(duty.T @ weighted + np.diag(exponent_sd**-2))
         precision, vector = np.diag(precision) - gain @ weighted.T, vector - gain @ (duty.T @ vector)

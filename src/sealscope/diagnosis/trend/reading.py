@@ -62,7 +62,7 @@ class LeakReading:
     states_flow : bool
         True if the level can be stated in L/min.
     area : float or None
-        Piston area [m^2] that converts a creep speed to the level's unit, None if it cannot be converted.
+        Piston area [m^2] that converts a creep speed to a flow on the level's scale, None if there is no such area.
     pressure : float
         Mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing.
     temperature : float or None
@@ -132,7 +132,7 @@ def estimate_reading(
     )
     if reading.problem:
         return reading
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):  # numbers of impossible readings may overflow
         return replace(reading, **_estimate_level(part, used_rig, machine))
 
 
@@ -262,7 +262,7 @@ def build_timeline(
         points.append(TrendPoint(**fields, group=-1 if note else next(used_groups), note=note))
     scales: list[float | None] = []  # of the first reading of each group
     for point in points:
-        if point.group == len(scales):
+        if point.group == len(scales):  # a new group, as they are numbered in the order of their first reading
             scales.append(point.scale)
         elif point.group >= 0 and scales[point.group] is None:
             scales[point.group] = point.scale  # the first that is known
@@ -275,10 +275,11 @@ def build_timeline(
 
 
 def _group_scales(scales: Sequence[float | None]) -> list[int]:
-    """Find the group of each reading, of readings with nearly the same ratio of displacement to area.
+    """Group readings with nearly the same ratio of displacement to area, and return the group number of each reading.
 
-    `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; None has the group
-    0. Sorted by size, neighbouring ratios are of one group if their logarithms differ by at most
+    `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; a reading whose
+    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group if their
+    logarithms differ by at most
 
         log(1 + `reading.scale`) + `reading.scatter` * median difference of neighbours    (`priors.toml`).
 
@@ -321,7 +322,7 @@ def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[
 def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
     """List the reason why each reading is left out: no level, a copy, or a method other than that of most readings.
 
-    The text is "" for a reading that is used.
+    The text is "" for a reading that is used. Of methods with equally many readings, the most specific one counts.
     """
     file_of_digest: dict[str, str] = {}
     notes = []
@@ -332,7 +333,7 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
         copy_note = "" if original == reading.file else f"the same samples as {original}"
         notes.append(reading.problem or copy_note)
     bases = [reading.basis for reading, note in zip(readings, notes, strict=True) if not note]
-    basis: Basis | None = max(BASES, key=bases.count) if bases else None
+    basis: Basis | None = max(BASES, key=bases.count) if bases else None  # the first of equally frequent ones
     return [
         note or ("" if reading.basis == basis else f"its channels allow the {reading.basis}, not the {basis}")
         for reading, note in zip(readings, notes, strict=True)

@@ -54,7 +54,8 @@ class Trend:
     basis : str or None
         Method by which the levels were estimated: "volume balance", "pressure response" or "ringing".
     unit, pressure : str, float or None
-        ``L/min`` at this pressure difference [Pa], or ``%`` of the healthy recordings' mean if the sizes are not known.
+        ``L/min`` at this pressure difference [Pa], or ``%`` of the healthy recordings' mean if the sizes are not known;
+        for "ringing" ``%`` above this mean. The pressure is None for ``%``.
     points : tuple of TrendPoint
         The recordings in the order of their times.
     groups : tuple of str
@@ -62,7 +63,8 @@ class Trend:
     episodes : tuple of Episode
         The periods between repairs, the present one last; days in their `wear` count from the first recording.
     rows : tuple of int
-        Indices of the points that are compared; the rows of an `Episode` are indices into `rows`.
+        Indices of the points that are compared, or nearest to the compared averages (`Levels.average_neighbours`); the
+        rows of an `Episode` are indices into `rows`.
     repair : RepairLimit
         Leak above the healthy level at which a repair is due.
     machine : AssumedMachine or None
@@ -388,7 +390,7 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
         np.array([getattr(point, name) for point in compared]) for name in ("day", "group", "level", "error")
     )
     usual = float(np.mean(value[: _count_healthy(trend)]))  # mean level of the healthy recordings
-    prior = scatter_prior(trend.basis or "ringing", usual)
+    prior = scatter_prior(trend.basis or "ringing", usual)  # compared recordings have a basis: never None here
     warming, slope_sd = np.zeros(t.size), 0.0  # warming of the oil [K], standard deviation of the level's change per K
     temperatures = [point.temperature for point in compared if point.temperature is not None]
     if trend.basis != "ringing" and len(temperatures) == t.size:

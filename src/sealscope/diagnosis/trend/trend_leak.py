@@ -93,8 +93,8 @@ def _measure_leak(
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
-        pump_flow=(pump_flow, pump_flow),
-        lpm_per_flow=None if pressure is None else 1.0,
+        pump_flow=(pump_flow, pump_flow),  # also stands for the mean while the pump delivers
+        lpm_per_flow=None if pressure is None else 1.0,  # flows are in L/min already
         size_deviation=size_deviation,
         total_leakage=None if pressure is None else _total_leakage(wear.total, size_deviation, pressure),
     )

@@ -50,7 +50,7 @@ _JITTER, _ROUNDING = 1e-10, 1e-13
 _N_DRAWS = 4000
 #: Standard deviation of a normal number over its median size.
 _SD_PER_MEDIAN = 1.4826
-#: Recordings of an episode that count for the next one's prior, which may then scatter otherwise.
+#: Most recordings of an episode that count for the next one's prior, as the machine may scatter otherwise then.
 _MAX_FREEDOM = 20
 
 
@@ -134,7 +134,7 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     Two successive levels beyond the limit on the same side are a change of the machine: the excess is 0 if the level
     before is also beyond the limit, and for the first level of a group. Returns two variants, each (n,). The first
     treats each level as the latest level. The second is for the whole series: the excess is also 0 if the next level is
-    beyond the limit on the same side, and for the last level of a group.
+    beyond the limit on the same side, and for the last level of a group, whose next is not known.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -147,8 +147,8 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
             if sign * distances[position - 1] > max_distance:  # a change
                 continue
             excess_as_last[row] = sign * max(abs(distances[position]) - max_distance, 0.0)
-            is_confirmed = position + 1 < rows.size and sign * distances[position + 1] <= max_distance
-            excess[row] = excess_as_last[row] if is_confirmed else 0.0
+            is_single = position + 1 < rows.size and sign * distances[position + 1] <= max_distance
+            excess[row] = excess_as_last[row] if is_single else 0.0
     return excess_as_last, excess
 
 
@@ -516,7 +516,7 @@ def find_episodes(
         alarm, end = rise.find_alarm(days), _find_repair(remaining, rise, n_healthy, days)
         if alarm is not None and alarm >= end:  # an alarm after the repair belongs to the next episode
             alarm = None
-        change_begin = None if alarm is None else int(rise.begin[end - 1])  # as all of the period show
+        change_begin = None if alarm is None else int(rise.begin[end - 1])  # by all recordings of the period
         wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
         alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
         # `log_R`: logarithm of the mean time [days] until a healthy machine scores as high; each period but the first

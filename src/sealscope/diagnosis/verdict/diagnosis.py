@@ -43,8 +43,8 @@ _MACHINE_NAMES = ("machine", "actuator", "asset", "serial number", "serial", "ri
 class Diagnosis(Evidence):
     """Verdict on one recording: the combined evidence of all detectors.
 
-    The fields of `Evidence` are those of the combined evidence, with that of every detector in `parts`, the deciding
-    detector's first. The other fields are:
+    The fields of `Evidence` are those of the combined evidence. `parts` has the evidence of every detector, first that
+    of the deciding detector, if one has decided. The other fields are:
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class Diagnosis(Evidence):
 
     @property
     def severity(self) -> Severity | None:
-        """Severity of the leak relative to the repair limit; None if there is no leak or its flow is unknown."""
+        """Severity of the leak relative to the repair limit; None if there is no leak or its size is unknown."""
         return severity(self, self.limit)
 
     @property
@@ -132,23 +132,24 @@ class Diagnosis(Evidence):
     def repair_lpm(self) -> float | None:
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`); None without a plot.
 
-        If the plot shows the leak alone, this is `limit_lpm`. If it shows the total leakage, the leakage of the healthy
-        machine is added: the median of the plotted flow before the onset or, for a leak that was open from the start,
-        the median over the recording minus the leak. The result is also None if the limit or this leakage is unknown.
+        If the plot shows the leak alone, this is `limit_lpm`. If it shows the total leakage, that of the healthy
+        machine is added: the median of the plotted flow before the onset or, without an onset, over the recording. From
+        the latter a detected leak is subtracted, as it was open from the start. Also None if one of these is unknown.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
             return None
         if not course.whole:  # the plot shows the leak alone
             return limit
-        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s  # inf: none
+        # without an onset: infinity, as all of the plotted flow counts
+        onset = math.inf if self.onset_s is None or not math.isfinite(self.onset_s) else self.onset_s
         lpm_before = course.lpm[(course.t < onset) & np.isfinite(course.lpm)]
         if not lpm_before.size:
             return None
-        usual_lpm = float(np.median(lpm_before))
+        median_lpm = float(np.median(lpm_before))
         if self.verdict == LEAK and self.onset_s is None:  # the leak was open from the first sample on
-            return None if self.leak_lpm is None else limit + max(0.0, usual_lpm - self.leak_lpm)
-        return limit + usual_lpm
+            return None if self.leak_lpm is None else limit + max(0.0, median_lpm - self.leak_lpm)
+        return limit + median_lpm
 
     @property
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
@@ -240,7 +241,10 @@ class Diagnosis(Evidence):
         return self.onset_s is None and step_test is not None and not _is_usual(step_test)
 
     def _find_test(self, name: str) -> Evidence | None:
-        """Find the evidence of a test of the deciding detector, such as `WITHIN`, by its `name`; None if absent."""
+        """Find the evidence of a test of the deciding detector, such as `WITHIN`, by its `name`.
+
+        None if there is no such test, or no other one: a detector lists its tests only if it has several.
+        """
         tests = self.parts[0].parts if self.parts else ()  # the deciding detector is the first
         return next((test for test in tests if test.detector == name), None)
 

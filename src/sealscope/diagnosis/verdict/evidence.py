@@ -71,15 +71,16 @@ class TotalLeakage:
     Attributes
     ----------
     lpm, interval_lpm : float and pair of floats, or None
-        The flow and its 95 % interval [L/min], None if the machine's sizes are not known.
+        The flow and its 95 % interval [L/min], None if unknown, for example without the machine's sizes.
     pressure : float
         Mean absolute pressure difference that drives the flow [Pa].
     findable_lpm : float or None
-        Smallest step of the flow that would have been detected [L/min], None if a step was detected.
+        Smallest step of the flow that would have been detected [L/min], None if a leak was detected or if unknown.
     healthy_lpm : float or None
-        Largest flow of a healthy machine at this pressure [L/min], None if the rig does not state it.
+        Largest flow of a healthy machine at this pressure [L/min] by the rig; None if the rig does not state it, or if
+        healthy recordings are compared instead.
     pump_share, findable_share : float or None
-        `lpm` and `findable_lpm` as fractions of the pump's mean flow.
+        Flow and smallest step as fractions of the pump's mean flow, also if L/min are unknown; None if unknown.
     """
 
     lpm: float | None
@@ -145,7 +146,7 @@ class Evidence:
     share : float
         Fraction of the recording, 0 to 1, that was used for the verdict.
     judged_until : float
-        Time of the last judged sample, as a fraction of the duration; only a leak that begins later is overlooked.
+        Time of the last judged sample, as a fraction of the duration; any leak that begins later is overlooked.
     detector : str
         Name of the detector or of its test; for a combined verdict, of the deciding detector, "" if none did.
     usable : bool

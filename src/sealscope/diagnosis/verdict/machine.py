@@ -102,7 +102,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 
 
 def states_rig(rig: Rig) -> bool:
-    """Return True if a whole rig was stated; False for the default rig, even with stated areas or displacement."""
+    """Return True if a whole rig was stated; False if one is assumed, even with stated areas or displacement."""
     # a user may state areas or displacement alone, but never the mass: if it is not assumed, a whole rig was stated
     return rig.entry("cylinder.M_eq").source != f"{ASSUMED} {_REASON}"
 

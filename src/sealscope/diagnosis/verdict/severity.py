@@ -50,7 +50,8 @@ class RepairLimit:
         """
         if text is None:
             return cls(VERDICT.repair.creep * MM_PER_MINUTE, "creep", stated=False)
-        without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""  # the e of 5e-6 is not a unit
+        # `parse_quantity` takes a number without a unit as SI, which is refused here; the e of 5e-6 is not a unit
+        without_exponent = _EXPONENT.sub("", text) if isinstance(text, str) else ""
         has_unit = any(character.isalpha() for character in without_exponent)
         for kind, unit in (("flow", "m^3/s"), ("creep", "m/s")):
             try:

@@ -96,7 +96,7 @@ int unit_get(Instance *unit, uint32_t reference, double *value) {
         *value = b->values[reference - VALUE_BASE];
     } else if (reference - RESULT_BASE < N_RESULTS) {
         if (!b->fresh) {
-            if (b->phase < STEPPING) at_standstill(unit); /* what is not held is said when the start is left */
+            if (b->phase < STEPPING) at_standstill(unit); /* a failure is returned by unit_started */
             sealscope_report(&code, NULL, b->values, b->inputs, b->y, b->results);
             b->fresh = 1;
         }

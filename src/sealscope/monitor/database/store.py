@@ -185,7 +185,7 @@ class MonitorStore:
         with self._writing_lock, self.engine.connect() as connection:
             if is_file:
                 connection.exec_driver_sql("PRAGMA synchronous=NORMAL")
-                connection.commit()
+                connection.commit()  # ends the transaction that SQLAlchemy begins with each statement
             try:
                 with connection.begin():
                     if self.engine.dialect.name == "postgresql":

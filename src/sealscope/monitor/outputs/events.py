@@ -56,6 +56,7 @@ class EventLines:
                 file = self._stream.fileno()
             except (OSError, ValueError):  # a stream in memory
                 self._stream.write(self._unwritten.decode())
+                self._unwritten = b""
                 return True
             self._stream.flush()
             while self._unwritten:  # `os.write` returns how many bytes it has written

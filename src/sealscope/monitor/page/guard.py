@@ -79,7 +79,10 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if the system permits few open files."""
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if the system permits few open files.
+
+    It is at least 8, as one browser alone opens up to 6.
+    """
     with suppress(ImportError, OSError, ValueError):
         import resource
 

@@ -210,8 +210,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
     t = t[-samples.size :]
     try:
         transform: Details = details(samples)
-        windows = windowed_rms(transform, step=_RMS_STEP)
-    except InputError:  # numbers overflow
+        windows = windowed_rms(transform, step=_RMS_STEP)  # refuses details that overflow, in either form
+    except InputError:
         return {**header, "t": [], "has": 0}
     if detail_form == "details":
         inside = transform.inside()  # without the samples that depend on padding

@@ -107,6 +107,7 @@ class _Pages:
         self._machines = {name: describe_rig(settings.rig) for name, settings in actuators.settings.items()}
         # times of files are shown in their logger's zone, not the browser's
         self._by_files = {name for name, settings in actuators.settings.items() if settings.folder is not None}
+        # half of the connections remain for other requests
         self._n_listeners, self._max_listeners = 0, min(_MAX_LISTENERS, connection_limit() // 2)
         self._admission = None if token is None else Admission(token)
 

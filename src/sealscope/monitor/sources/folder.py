@@ -78,7 +78,8 @@ class WatchedFolder:
         self.settle_s, self._is_stored = settle_s, is_stored
         self._rig, self._rate, self._limit_lpm = settings.rig, settings.rate, settings.error_lpm
         self._channel_map = settings.map or load_watched(settings.rig).channel_map
-        self._newest_s = self._end_s = newest_s  # start and end of the newest recording [s since 1970]
+        # start and end of the newest recording [s since 1970]; after a restart both are the last stored sample's time
+        self._newest_s = self._end_s = newest_s
         # by identity of the file: time at which it was first found [s], and time of its first sample [s since 1970]
         self._first_found: dict[str, float] = {}
         self._starts: dict[str, float] = {}
@@ -98,7 +99,7 @@ class WatchedFolder:
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
         self._submitted &= self._first_found.keys()  # forget the files that are gone
         self._unreadable &= self._first_found.keys()
-        self._read_ahead.clear()
+        self._read_ahead.clear()  # of an earlier call that did not come to its end
         self._starts = {identity: start for identity, start in self._starts.items() if identity in self._first_found}
         due_files = [file for file in files if file.identity not in self._submitted and self._is_due(file)]
         if len(due_files) > 1:  # files may be copied in another order than recorded
@@ -120,7 +121,10 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Compute the time [s] since a file changed or since it was first found, whichever is longer."""
+        """Compute the time [s] since a file changed or since it was first found, whichever is longer.
+
+        The time of the change may lie in the future.
+        """
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
@@ -143,7 +147,7 @@ class WatchedFolder:
     def _start_time(self, file: _FoundFile) -> float:
         """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
 
-        The file is read for this; `blocks` need not read it again if all such recordings fit in `_READ_AHEAD_BYTES`.
+        The file is read for this; `blocks` need not read it again while such recordings fit in `_READ_AHEAD_BYTES`.
         """
         modified_s, path, identity = file
         if identity not in self._starts:
@@ -151,9 +155,9 @@ class WatchedFolder:
             n_bytes = sum(count_bytes(recording) for recording, _ in self._read_ahead.values() if recording is not None)
             if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:
                 self._read_ahead[identity] = samples, reason
-            if reason:
+            if samples is None:
                 return modified_s
-            self._starts[identity] = modified_s if samples is None else file_seconds(samples, path)
+            self._starts[identity] = file_seconds(samples, path)
         return self._starts[identity]
 
     def _read(self, path: Path) -> tuple[Recording | None, str]:

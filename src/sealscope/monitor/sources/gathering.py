@@ -20,6 +20,7 @@ from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 SILENT_S = 3.0
 #: Largest step from the newest value [s]; a larger one is a pause, or a clock set back, and starts a new block.
 _AHEAD_S = 60.0
+#: Counter of dropped values.
 LATE = "values that came after their block"
 
 
@@ -57,7 +58,7 @@ class _Channel:
 class ValueGatherer:
     """Gathers the values of one actuator's channels into blocks of `block_s` seconds at `rate` [Hz].
 
-    `count`: function called with the reason for each dropped value; `now`: returns a monotonic time [s].
+    `count`: function called with the reason when values are dropped; `now`: returns a monotonic time [s].
     """
 
     def __init__(

@@ -148,8 +148,8 @@ def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int)
     """Skip a CBOR text or byte string of unknown length, which consists of pieces with the same major type `major`.
 
     `data` (n,): bytes of the message; `start`, `position`: index of the item's first byte, and of its first piece;
-    `n_texts`: number of texts, byte strings and their pieces in the message so far. Returns the code of the broken rule
-    (0 for none), the position of the fault or, without a fault, after the item, and the new `n_texts`.
+    `n_texts`: number of texts, byte strings, and their pieces and ends in the message so far. Returns the code of the
+    broken rule (0 for none), the position of the fault or, without a fault, after the item, and the new `n_texts`.
     """
     while True:
         n_texts += 1

@@ -262,6 +262,7 @@ class SparkplugHost:
                 raise RefusedMessage(blocks.NO_CLOCK, f"the metric {name[:40]!r} must have a time, got none")
             else:
                 groups[timestamp][channel_of[name]] = metric
+                birth.metrics[name] = replace(birth.metrics[name], unit=metric.unit)  # the message may state another
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []

@@ -29,8 +29,9 @@ class StreamRecorder(SavedAttributes):
 
     A recording also ends at `_MAX_BYTES`, and before a gap, a clock set back, or a change of channels, units or rate.
     Recordings shorter than the first of `recording.lengths` (`priors.toml`) are dropped. The first recording of all,
-    and the first after a gap, such a clock or such a change, is shorter than `duration_s` by up to a half. This
-    fraction depends on the `actuator`'s name, so that the recordings of many actuators do not end at the same moment.
+    and the first after a gap, such a clock, such a change or `clear`, is shorter than `duration_s` by up to a half.
+    This fraction depends on the `actuator`'s name, so that the recordings of many actuators do not end at the same
+    moment.
 
     Attributes
     ----------
@@ -61,7 +62,7 @@ class StreamRecorder(SavedAttributes):
             ended = self._end(follows=False)
         self.first = self.first or number
         self.blocks.append(samples)
-        if ended is not None:
+        if ended is not None:  # one recording a call: the next block tells if the new one is full, too
             return ended
         is_full = sum(map(count_bytes, self.blocks)) >= _MAX_BYTES
         return self._end(follows=True) if is_full or self._duration() >= self._full_duration() else None

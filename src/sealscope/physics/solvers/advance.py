@@ -49,7 +49,7 @@ def advance(
     - `u`, `G`, `C`, `F` (n, nodes): inputs at the times within each step that the method needs (`step_nodes`). They are
       the command [V], the leakage coefficients [m^3/(s Pa)] and [m^3/(s Pa^0.5)] of the piston (`piston_leakage`), and
       a load [N] in addition to the rig's own. Without such a load `F` is an empty array of shape (0, 0).
-    - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs.
+    - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs; n is a multiple of `every`.
     """
     z = state_of(y)
     for step in range(u.shape[0]):

@@ -75,8 +75,8 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     flow Q and its pressure drop d [Pa] at the end of the stage satisfy d + g Q = total (`implicit_flows`): total is the
     drop if nothing flowed in the stage, and g = GAMMA h (r_chamber + r_line) [Pa s/m^3], where r [Pa/m^3] is the
     pressure rate of an oil volume per unit flow. Boiling oil keeps its pressure, so its r is 0. If bulk moduli and
-    densities depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`). In `p`, an optional law
-    such as `boiling` is an empty tuple if the rig does not have it.
+    densities depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`), each time with those at
+    the pressures `solved` last. In `p`, an optional law such as `boiling` is an empty tuple if the rig lacks it.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
@@ -90,7 +90,7 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
         K_1, K_2 = rig.bulk_modulus(solved[P_1], p), rig.bulk_modulus(solved[P_2], p)
         r_A, r_B = pressure_rate(1.0, V_A, K_A), pressure_rate(1.0, V_B, K_B)
         r_1, r_2 = pressure_rate(1.0, p.V_1, K_1), pressure_rate(1.0, p.V_2, K_2)
-        if len(p.boiling) > 0:
+        if len(p.boiling) > 0:  # volumes that boil at `solved` are at p_boil, others at their state, even below p_boil
             p_boil = p.p_vap - P_ATM
             boils_A, boils_B = solved[P_A] < p_boil, solved[P_B] < p_boil
             boils_1, boils_2 = solved[P_1] < p_boil, solved[P_2] < p_boil
@@ -116,8 +116,9 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
     """Integrate the state `y` over one step of h [s] by the implicit-explicit method; return the new state.
 
     The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G` [m^3/(s
-    Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage k solves for its state z and its implicit rates s_k, then
-    evaluates its explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
+    Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage 1 is explicit: its state is `y`, at which both rates are
+    evaluated. Stage k >= 2 solves for its state z and its implicit rates s_k, then evaluates its explicit rates f_k.
+    E_k and I_k are the rows of the tableaus, W the weights.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)

@@ -56,7 +56,7 @@ def stiffest_rate(p: RigNumbers) -> float:
 
 
 def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
-    """Compute the longest step [s] that resolves all of a rig except its throttles and end stops.
+    """Compute the longest step [s] that resolves a rig without its throttles, end stops and opposing cylinder.
 
     `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston. The result is the shortest of the steps
     that resolve these parts (`_longest_mode_step`):
@@ -68,7 +68,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 
     The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
     Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
-    only makes the oil softer. In `p`, an optional law, such as `lossy`, is an empty tuple if the rig does not have it.
+    only softens the oil. In `p`, an optional law, such as `lossy`, is an empty tuple if the rig does not have it.
     """
     ends = _end_volumes(p)
     # stiffness of the oil in both chambers, and in the volumes at the pump's ports [Pa/m^3]
@@ -91,6 +91,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
         column_stiffness += _steepest_rise(p.pushed[0]) / p.M_eq
         damper += _steepest_rise(p.pushed[1])
     sliding_step = _longest_mode_step((p.F_v + damper) / p.M_eq, column_stiffness)
+    # near standstill, in the direction of the larger friction
     sticking_step = _longest_mode_step((max(1.0, p.backward) * friction_slope + damper) / p.M_eq, column_stiffness)
     if len(p.bristled) > 0:
         bristle_stiffness = column_stiffness + p.sigma_0 / p.M_eq

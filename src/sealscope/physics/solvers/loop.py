@@ -15,8 +15,8 @@ from sealscope.physics.state import P_A, P_B, POSITION, THETA
 #: - DELAY: samples from a measurement to the time at which its voltage acts.
 #: - SAMPLED: samples taken so far. REPORTED: 1 once the controller has reported a compensated flow, until then 0.
 SPACING, DELAY, SAMPLED, REPORTED = range(4)
-#: Indices of `Loop.numbers`: one count of the encoders of position [m] and angle [rad], lowest pressure [Pa], largest
-#: voltage [V], and the controller's last voltage before it was limited [V].
+#: Indices of `Loop.numbers`: one count of the encoders of position [m] and angle [rad], lowest pressure [Pa] (that of
+#: vapour if the oil boils), largest voltage [V], and the controller's last voltage before it was limited [V].
 COUNT_X, COUNT_THETA, MIN_PRESSURE, MAX_VOLTAGE, LAST_VOLTAGE = range(5)
 
 

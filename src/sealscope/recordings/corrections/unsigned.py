@@ -119,12 +119,17 @@ def _piston_speed(x: Array, rate: float) -> Array:
 
     `rate`: sampling rate [Hz]. Missing positions are interpolated; the speed is 0 if all are missing.
     """
-    n_half = max(1, round(_PRIORS.half * rate))
+    n_half = _half_span(rate)
     known = np.isfinite(x)
     x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
     # the position is constant before the beginning and after the end
     padded = np.concatenate([x[:1].repeat(n_half), x, x[-1:].repeat(n_half)])
     return np.asarray((padded[2 * n_half :] - padded[: -2 * n_half]) * (0.5 * rate / n_half))
+
+
+def _half_span(rate: float) -> int:
+    """Round `unsigned.half` of `priors.toml` to samples at `rate` [Hz], at least one."""
+    return max(1, round(_PRIORS.half * rate))
 
 
 def _moves_both_ways(values: Array) -> bool:
@@ -190,11 +195,11 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 def _noise_variance(speed: Array, rate: float) -> float:
     """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
 
-    It is half the median of the locally averaged squared differences of samples that are twice `unsigned.half`
-    (`priors.toml`) apart. Motion changes only some of these averages, and hardly their median. The result is 0 for a
-    recording that is shorter than this distance.
+    It is half the median of the locally averaged squared differences of samples that are just over twice
+    `unsigned.half` (`priors.toml`) apart, whose speeds share no position. Motion changes only some of these averages,
+    and hardly their median. The result is 0 for a recording that is shorter than this distance.
     """
-    n_lag = max(1, round(2.0 * _PRIORS.half * rate))
+    n_lag = 2 * _half_span(rate) + 1
     steps = speed[n_lag:] - speed[:-n_lag]
     return 0.5 * float(np.median(_average_nearby(steps**2, rate))) if steps.size else 0.0
 

@@ -82,7 +82,7 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
 
 def _format_cell(value: Any) -> str:
     """Format a cell: numbers with all digits, times in ISO form, durations in seconds; truth values stay empty."""
-    if isinstance(value, bool | None):
+    if isinstance(value, bool | None):  # `=IF(test, value)` is FALSE where there is no sample
         return ""
     if isinstance(value, float | int):
         return repr(value)

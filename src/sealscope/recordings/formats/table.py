@@ -317,18 +317,20 @@ def _assign_clocks(series: Sequence[Series]) -> list[Series]:
 def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array, np.datetime64 | None]:
     """Read the series `time`, a column of times; return the times (n,) [s] and the time stamp of 0 s.
 
-    Date stamps are converted to seconds from the first one, which is then the time stamp of 0 s (None for a column in a
-    group). For numbers and timedelta64 it is `start`, None if unknown. Raises InputError if no row has a time.
+    Date stamps are converted to seconds from the first one, which is then the time stamp of 0 s. For numbers and
+    timedelta64 it is `start`, None if unknown. Raises InputError if no row has a time.
     """
     values = time.values()
     if values.dtype.kind == "m":
         return timedelta_seconds(values), start
+    if values.dtype.kind in "OSU":
+        values = _read_samples(time, as_time=True)
     known = values[~np.isnat(values) if values.dtype.kind == "M" else np.isfinite(values)]
     if not known.size:
         expected = "a stamp" if values.dtype.kind == "M" else "a number"
         raise InputError(f"time must have {expected} in some row, got none in column {time.label.whole}")
     if values.dtype.kind == "M":
-        return timedelta_seconds(values - known[0]), known[0] if time.group == "" else None
+        return timedelta_seconds(values - known[0]), known[0]
     unit = time.label.unit or unit_of_time(time.label) or "s"
     return to_si(np.asarray(values, dtype=np.float64), unit, "s", name="time"), start
 

@@ -191,6 +191,7 @@ def _parse_heading(
         cells = _split_heading(line, delimiter, width)
         if cells and not cells[-1]:  # drop empty cells at the end, beyond the width
             cells = cells[: max(_used_width(cells), min(width, len(cells)))]
+        # rows may end in a separator, or leave out the last columns; above a single column, more cells are a title's
         fits_width = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
         names = [cell for cell in cells if cell]
         return cells if fits_width and names and not all(is_value(name, decimal) for name in names) else None

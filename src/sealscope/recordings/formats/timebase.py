@@ -244,7 +244,10 @@ def _format_clock(text: str) -> str:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
     if text.count(":") == 3:
         return ".".join(text.rsplit(":", 1))
-    return f"00:{text:0>2}" if text.count(":") == 1 and "." in text else text
+    if text.count(":") == 1 and "." in text:  # minutes and seconds
+        minute, _, second = text.partition(":")
+        return f"00:{minute:0>2}:{second}"
+    return text
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:

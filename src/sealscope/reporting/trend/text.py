@@ -19,7 +19,7 @@ from sealscope.units import BAR, DAY, DAYS_PER_YEAR
 
 
 def level_name(trend: Trend) -> str:
-    """Return the label of the present leakage: "now" if the trend is based on the pressures' ringing, else "total"."""
+    """Return the label of the present level: "now" for the basis "ringing", which is no leakage, else "total"."""
     return "now" if trend.basis == "ringing" else "total"
 
 
@@ -87,15 +87,18 @@ def verdict_sentence(trend: Trend) -> str:
 def figures(trend: Trend) -> dict[str, str]:
     """Format the numbers of a trend as text, by name; the text is "" or a remark if a number is not known.
 
-    They are `total`, the present leakage of pump and piston together; `leak`, its rise above the healthy level, if the
-    verdict is `leak`; `healthy`, the range of 95 % of the healthy recordings; `since`, the onset of the rise; `growth`,
-    the rise in a month, or in a sudden step; `limit`, the repair limit, and the date at which the leakage reaches it.
+    They are `total`, the present level: the leakage of pump and piston together or, for the basis "ringing", the
+    damping of the pressures' ringing; `leak`, its rise above the healthy level, if the verdict is `leak`; `healthy`,
+    the range of 95 % of the healthy recordings, cut off at the repair limit (`healthy_end`); `since`, the onset of the
+    rise; `growth`, the rise in a month, or in a sudden step; `limit`, the repair limit, and the date at which the level
+    reaches it. Levels are in `Trend.unit`.
     """
     wear = trend.wear
     if wear is None:
         return dict.fromkeys(("total", "leak", "healthy", "since", "growth", "limit"), "")
     at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
-    # without a rig, levels are in percent of the first recording's level
+    # without a rig, leakage is in % of the healthy recordings' mean, by default that of the first recording alone;
+    # ringing is always in % above this mean, with or without a rig
     reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high
@@ -158,7 +161,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
 
 def assumptions_text(trend: Trend) -> str:
     """Format the assumptions of a trend as sentences: method, machine data, oil temperature, healthy recordings."""
-    machine = ""
+    machine = ""  # for "ringing" the text of the basis says that there are no L/min
     if trend.machine is not None and trend.basis not in (None, "ringing"):
         machine = "No L/min: area and displacement of this machine are not stated (--rig, --area, --displacement). "
         if trend.unit == "L/min":

@@ -223,8 +223,9 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments that are integrated together.
 
-    `integrate` finds the step for a pressure error of `error` [Pa rms] in the first 4 s of up to four runs. The result
-    is the shortest of these steps and `longest_allowed_step`. `coefficients` (runs,): leakage coefficients of the runs.
+    `integrate` finds the step for a pressure error of `error` [Pa rms] in the first 4 s of up to four runs, evenly
+    spread over the set. The result is the shortest of these steps and `longest_allowed_step`. `coefficients` (runs,):
+    leakage coefficients of the runs.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):

@@ -86,6 +86,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
         violated_rules.append("motor.integrator = state, got euler")
     if any(fault.row.is_sensor_fault for fault in experiment.faults):
         violated_rules.append(f"no fault of a sensor, got {', '.join(map(str, experiment.faults))}")
+    # with the oil's viscosity a leak's flow changes, and not by a single linear rise (`leaks.Thinned`)
     if leaks and any(fault.viscosity_ratio(rig) is not None for fault in experiment.faults):
         violated_rules.append("no leak while the oil's temperature changes")
     not_modelled = ["daq.jitter"]  # parameters that the instruments of a batch do not model (`batch.signals`)
@@ -159,7 +160,7 @@ def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coeffic
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
         leak = member.leak
-        start, stop = leak.opening.rise or (0.0, 0.0)
+        start, stop = leak.opening.rise or (0.0, 0.0)  # a batch has no leak without a rise (`refuse_unbatchable`)
         slope = 1.0 / (stop - start) if stop > start else ABRUPT
         if leak.law == "laminar":
             rows.append([coefficient, 0.0, start, slope, flow_coefficient, 0.0])
@@ -189,7 +190,7 @@ class Cells:
         runs = slice(groups[0] * width, groups[1] * width)
         table = np.repeat(self.base[runs, None, :], last - first, axis=1)
         for rows, (bounds, values) in zip(table, self.blocks[runs], strict=True):
-            block = np.searchsorted(bounds, self.bounds[first:last], side="right") - 1
+            block = np.searchsorted(bounds, self.bounds[first:last], side="right") - 1  # in which each cell begins
             for parameter, series in values.items():
                 rows[:, parameter] = series[block]
         return pack_lanes(table, width)
@@ -241,7 +242,7 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
 
 
 def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments for `build_instrument_rows`.
+    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments, but for the phase of the hum, which is 0.
 
     `readings`: changes of the instruments within the run; `ends` (2,): start and end [s] of the `samples` samples.
     """
@@ -427,7 +428,7 @@ class SetRun:
         # (groups, outputs of history and chunk, channels, width)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))
         offset_drifts = np.zeros((b - a, self.channels, self.width))
-        wavelet = DetailStream((self.channels, (b - a) * self.width))
+        wavelet = DetailStream((self.channels, (b - a) * self.width))  # its taps and buffers only
         n_read = 0  # samples read so far
         output_steps = self.steps_per_output
         for first, last, start, stop in chunks:  # cells first <= cell < last, outputs start <= output < stop
@@ -500,6 +501,7 @@ class SetRun:
 
         totals = self.totals[groups[0] : groups[1]]
         time = stop / (self.experiment_set.experiment.rate * self.oversampling)
+        # a quick test of all runs together; only if it fails, each run is tested
         min_half_stroke = 0.5 * float(min(member.numbers.L for member in self.experiment_set.members))
         is_valid = np.all(totals[:, DIVERGED] == 0.0) and totals[:, MIN_PRESSURE].min() >= VACUUM
         if is_valid and totals[:, MAX_TRAVEL].max() <= min_half_stroke:

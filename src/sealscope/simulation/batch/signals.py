@@ -124,7 +124,9 @@ def add_reading_squares(
 ) -> None:
     """Compute the readings of p_A and p_B for some groups of runs, and add their squared wavelet details to `sums`.
 
-    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. The arrays are:
+    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. `load` and `store` count the rows of an
+    array over all axes but the last, the lanes. For each CHUNK of samples, the filtered pressures are written behind
+    the history in the buffer of the first level, and there replaced by the readings. The arrays are:
 
     `pressures` (groups, outputs, CHANNELS, WIDTH): simulated pressures, `factor` outputs per sample. The anti-alias
     filter of sample `first` begins at output `first_output`.
@@ -146,15 +148,15 @@ def add_reading_squares(
     details = np.empty((LEVELS, CHUNK, WIDTH))
     for g in range(groups[0], groups[1]):
         key = load(keys, g)
-        A, B = CHANNELS * g, CHANNELS * g + 1  # numbers of both channels; rows are counted over all axes but the lanes
+        A, B = CHANNELS * g, CHANNELS * g + 1  # numbers of both channels
         drift_A, drift_B = load(drifts, A), load(drifts, B)
         sensor_A, sensor_B = A * INSTRUMENT_ROWS, B * INSTRUMENT_ROWS
         start_A, start_B = A * LEVELS * capacity, B * LEVELS * capacity
         for start in range(first, last, CHUNK):
             n = min(CHUNK, last - start)
             source = (g * pressures.shape[1] + first_output) * CHANNELS + (start - first) * stride
-            a, b = start_A + history, start_B + history
-            # -CHANNELS: each further tap multiplies the next output
+            a, b = start_A + history, start_B + history  # rows of the first new sample of p_A and p_B
+            # `filter_rows` takes tap k times row source - dilation k: with the dilation -CHANNELS, the k-th next output
             filter_rows(pressures, source, stride, -CHANNELS, taps, A * n_taps, n_taps, buffers, a, n)
             filter_rows(pressures, source + 1, stride, -CHANNELS, taps, B * n_taps, n_taps, buffers, b, n)
             for i in range(n):

@@ -74,9 +74,9 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     `duration` [s]: length of the command. With a position target, the result is the target's first value. Every result
     is limited to the stroke.
 
-    The piston moves with the pump's flow, A v = q_b omega/(2 pi). The motor is taken as unloaded and without inertia,
-    with its PI controller of the speed: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt = omega_d - omega (thesis, eqs.
-    4.2-4.5). Behind a servo valve the piston moves with the valve's flow without load.
+    The piston moves with the pump's flow, A v = q_b omega/(2 pi), A the mean of both piston areas. The motor is taken
+    as unloaded and without inertia, with its PI controller of the speed: (k_p + C_e) omega = k_p omega_d + K_i I, dI/dt
+    = omega_d - omega (thesis, eqs. 4.2-4.5). Behind a servo valve the piston moves with the valve's flow without load.
     """
     command = parse_command(command) if isinstance(command, str) else command
     motor, cylinder = rig.motor, rig.cylinder
@@ -206,7 +206,7 @@ def draw(
     command, closed_fraction = command_or_target(draw_one(duty.commands)), draw_one(duty.closed)
     overrides |= throttle_values(closed_fraction)
     amplitude = float(random.uniform(*duty.amplitude))
-    if amplitude != 1.0:
+    if amplitude != 1.0:  # then all commands have an amplitude (`Duty`)
         command = replace(command, amplitude=command.amplitude * amplitude)  # type: ignore[type-var, union-attr]
     load = parse_force(draw_one(duty.loads)) if duty.loads else None
     controller = draw_one(duty.controllers) if duty.controllers else "pi"

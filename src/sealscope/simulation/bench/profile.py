@@ -138,7 +138,8 @@ class Duty:
             parse_force(text)
 
     def __repr__(self) -> str:
-        # seeds of cases are derived from this text, which has `loads` and `controllers` only where they are stated
+        # seeds of cases derive from this text: `loads` and `controllers`, the fields with a plain default, are left out
+        # unless stated, so that profiles without them draw the same cases as before these fields existed
         stated_fields = [
             part for part in fields(self) if part.default is MISSING or getattr(self, part.name) != part.default
         ]
@@ -215,12 +216,13 @@ def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) 
     """
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
-        ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift
+        ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift like this
     low, high = (to_si(value, entry.unit, si_unit if absolute else "1", name="drift") for value in entry.size)
     if low < 0:
         raise InputError(f"size of the drift must be >= 0, got {low:g} to {high:g}")
     if entry.shapes is not None and entry.oil is not None:
         raise InputError("the drift must have shapes or oil, got both")
+    # the part of a drift that does not follow the oil wanders
     shapes = entry.shapes or (("linear", "wander") if entry.oil is None else ("wander",))
     return DriftRange((low, high), absolute, shapes, float(entry.oil or 0.0))
 
@@ -243,7 +245,7 @@ def _check_distinct_names(entries: _Entries) -> _Entries:
 
 
 def _check_falls(nuisances: tuple[AnyNuisance, ...], *, warms: bool = False) -> tuple[AnyNuisance, ...]:
-    """Return the nuisances (differences between machines); raise InputError if a drift may leave a parameter below 0.
+    """Return the nuisances (differences between machines); raise InputError if a drift may make a parameter <= 0.
 
     `warms`: True if the oil only warms, so that a drift that follows nothing else (`oil` = 1) only rises.
     """

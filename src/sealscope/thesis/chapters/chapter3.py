@@ -26,7 +26,7 @@ WAVELET = "db8"
 _COMMAND, _LEAK = "3 sin(4t)", "0.0163 L/min"
 #: Onset of the leak, end of the start-up, and length of the blocks in which an rms is computed [s].
 _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
-#: Number of factors of the wavelet's spectrum after which the infinite product has converged.
+#: Octave before which the infinite product of the wavelet's spectrum is cut; it has converged there.
 _N_FACTORS = 24
 
 
@@ -170,7 +170,8 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectr
     starts = np.arange(0, x.size - window + 1, step)
     hann = np.hanning(window + 1)[:-1]  # periodic: the last value is the first of the next period
     segments = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * hann
-    amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()  # 2: half is at the negative frequency
+    # 2: half is at the negative frequency; at 0 and the Nyquist frequency, which is not so, the result is double
+    amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()
     frequency = np.asarray(np.fft.rfftfreq(window, 1.0 / rate), dtype=np.float64)
     middles = np.asarray((starts + window / 2.0) / rate, dtype=np.float64)
     return Spectrogram(middles, frequency, np.asarray(amplitudes))

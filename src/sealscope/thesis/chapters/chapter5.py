@@ -296,6 +296,7 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
     `leak`: False to simulate the test without the leak.
     """
     experiment = make_test_experiment(test)
+    # no figure shows the run without the leak, so it is not proved by a smaller step
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
     recording = run.recorded
     t, period = recording.t, 2.0 * np.pi / test.omega

@@ -257,7 +257,7 @@ def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
         return 60e3 * (means[1] - means[0]) / CYCLE  # 60e3 mm/min are 1 m/s
 
     for lpm in _leak_flows(context):
-        # a cosine of the speed makes the position swing about its start
+        # a cosine of the speed makes the position swing about its start; drifts are between a run's last two cycles
         open_loop = ControlledRig("", lpm).run(f"{OPEN_LOOP_U} sin({OMEGA!r}t + {0.5 * math.pi!r})", 3.0 * CYCLE)
         open_drift = drift(open_loop, first=1)
         if lpm == 0.0:  # the first of the leaks
@@ -334,9 +334,10 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Return the values in the column `head` of a table by the leak [L/min]; empty cells are read as 0.
+    """Return the values in the column `head` of a table by the leak [L/min], from rows that begin with `names`.
 
-    Only rows whose first cells are `names`, such as a controller's name, are read; the leak is in the next column.
+    `names`: the first cells, such as a controller's name; the leak is in the next column. The tables have no empty
+    cells: `or 0.0` is for the type checker.
     """
     leak_column, value_column = len(names), table.columns.index(head)
     rows = [row for row in table.rows if row[:leak_column] == names]
@@ -366,7 +367,7 @@ def _tolerance_claim(context: Context) -> Claim:
     """Judge claim 6.2.2: a fault-tolerant controller restores tracking and stiffness with a leak.
 
     With each leak, the tracking error may be at most 10 % larger, and the stiffness at most 10 % smaller, than with the
-    PI controller and no leak. Without a leak it must track like the PI controller, and compensate no leakage.
+    PI controller and no leak. Without a leak its error must equal that of the PI controller, with no flow compensated.
     """
     table = first_table(context, "sec-6.2-controllers")
     error, tolerant_error = (_column_by_leak(table, (name,), _ERROR) for name in ("pi", "fault-tolerant"))

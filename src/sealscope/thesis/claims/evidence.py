@@ -93,7 +93,7 @@ class SheetClaim:
         measured = evidence.measured_sheet
         sheet_text, parts = (NO_SHEET, []) if measured is None else state_findings(measured)
         simulation_text, _ = state_findings(evidence.leak_sheet)
-        values = self.values(evidence, measured or evidence.leak_sheet)
+        values = self.values(evidence, measured or evidence.leak_sheet)  # the texts need numbers in either case
         return judge_claim(id, parts, kind, sheet=sheet_text, simulation=simulation_text, **values)
 
 

@@ -42,7 +42,7 @@ class ItemStatus:
     """The state of an item, that is of a figure, table or claim, in the folder of a reproduction.
 
     - `state`: "made" by this call, "kept" from an earlier call, "left out" or "failed" (for the stated `reason`), or
-      "not made" (not selected, or stored from other inputs)
+      "not made" (not selected, and no complete result of the same inputs is stored)
     - `products`: tables, claims, and figures without their panels
     - `files`: paths relative to the folder
     """

@@ -18,6 +18,7 @@ Role = Literal[
 ]  # fmt: skip
 #: A value of a table; None: no value.
 Cell = float | int | str | None
+#: An array that pydantic converts from a list.
 Values = Annotated[Array, PlainValidator(np.asarray)]
 
 

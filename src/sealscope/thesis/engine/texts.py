@@ -37,6 +37,7 @@ def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **valu
     A test is True, False, or None if the data cannot decide. The texts are in `claims.toml` under `id`, or under `kind`
     for claims that share texts. The values `sheet` (what the thesis's data show), `simulation` (what a simulation
     shows) and `why` (reason for the verdict) replace a whole text; the others fill the placeholders of the same names.
+    These may be named like the first three arguments, which are therefore positional only.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

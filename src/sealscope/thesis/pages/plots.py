@@ -229,7 +229,7 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
     """Draw a curve into `ax` in the line style of its role.
 
     `n_before`: number of earlier curves with this role in the panel, which determines the dashes; `is_only`: True for
-    the only curve of a panel, which is drawn in the style "other" if its role is "reference".
+    the only curve of a panel, which is drawn as a solid line (role "other") if its role is "reference" (dashed).
     """
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve, x_range)
@@ -240,7 +240,7 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
     if dashes and not is_dense:
         line["dashes"] = dashes
     marker: dict[str, Any] = {"marker": style.marker, "markersize": 4.2, "color": style.colour}
-    if style.marker != "x":
+    if style.marker != "x":  # a cross has no face
         marker["markerfacecolor"] = style.colour if style.filled else "white"
     if curve.kind == "points":
         ax.plot(x, y, linestyle="none", label=line["label"], **marker)

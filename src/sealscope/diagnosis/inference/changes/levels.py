@@ -234,11 +234,13 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels. The
     results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
     """
-    whitening = _whitening_matrix(values)
     mean = values.mean(axis=0)
     sum_of_levels = values[:, :2].sum(axis=1)
     # a step of a sensor's scale changes level and half difference of that pressure in proportion to their means
     scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
+    if not np.ptp(values, axis=0).any():  # constant pressures have no errors by which steps are tested
+        return [None] * (len(PATTERNS) + len(scales))
+    whitening = _whitening_matrix(values)
     changes = list[LevelChange | None]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
@@ -334,6 +336,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     # sum over the pattern's directions of F = variance without a step / variance with it - 1
     gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
     score = n_blocks * float(gains.max())
-    chance = 2.0 * n_directions * min(test.law.chance(score) for test in tests[:n_directions])  # up or down in each
+    # up or down in each direction, by the law under which the score is the most probable
+    chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
     return LevelChange(name, rank, score, min(1.0, chance), onset, block)

@@ -59,13 +59,14 @@ _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must change: the smaller step
-    must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score, onset and size,
-    here without its sign, are those of the test with the lower score. The p-value is twice the higher one, since a step
-    may be up or down.
+    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must rise, or both fall: the
+    smaller step must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score,
+    onset and size are those of the test with the lower score. The p-value is twice the higher one, since a step may be
+    up or down.
     """
     steps = np.abs([test.fitted.value for test in tests])
-    if tests and steps.min() > _MIN_STEP_RATIO * steps.max():
+    has_one_sign = len({test.sign for test in tests}) == 1
+    if has_one_sign and steps.min() > _MIN_STEP_RATIO * steps.max():
         weakest = min(tests, key=lambda test: test.score)
         least_certain = max(tests, key=lambda test: test.chance)
         yield Observable(
@@ -74,7 +75,7 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
             score=weakest.score,
             chance=min(1.0, 2.0 * least_certain.chance),
             onset=weakest.onset(),
-            size=weakest.fitted.value,
+            size=weakest.sign * weakest.fitted.value,
         )
 
 

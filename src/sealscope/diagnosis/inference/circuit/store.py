@@ -74,7 +74,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
         return {}
     unit_s = 1.0 / signals.rate if cycle is None else cycle  # a block is a multiple of this time
     duration = len(signals.time_step) / signals.rate
-    block_s = unit_s * max(1, round(duration / (INFERENCE.blocks.coarse * unit_s)))
+    block_s = unit_s * max(1, round(duration / (INFERENCE.blocks.coarse * unit_s)))  # about `blocks.coarse` blocks
     edges = np.round(np.arange(int(duration / block_s) + 1) * block_s * signals.rate).astype(int)
     if len(edges) <= MIN_BLOCKS:
         return {}

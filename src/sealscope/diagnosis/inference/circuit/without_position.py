@@ -44,6 +44,7 @@ if TYPE_CHECKING:
 _PRIORS = INFERENCE.held
 #: Half-width of the test functions over holds [s].
 HOLD_HALF_WIDTH: float = _PRIORS.half
+#: Channels that these balances read: none of their terms needs the pressures at the ports.
 _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
 
@@ -102,6 +103,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
             continue
         blocks = _build_blocks(signals, equation, half_width, is_used, begin, one_sided=single_rod)
         if blocks is not None:
+            # shut valves part the chambers from the accumulator
             oil_loss = {} if is_locked else oil_loss_tests(signals, rig, cycle, begin)
             balances.append(CycleBalance(blocks, equation, ColumnRoles(equation), oil_loss))
     return balances

@@ -82,7 +82,7 @@ class BalanceLeak(LeakMeasure):
 
         - "piston or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
           too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
-          `held_oil.rare` (`priors.toml`), as it does beside a chamber that is open to the tank.
+          `held_oil.rare` (`priors.toml`): with one chamber open to the tank, the other loses oil alike by either leak.
         - "piston leak" in other cases in which holds measure the leakage, if a servo valve drives the cylinder, or if a
           flow meter measures the flow behind the pump.
         - "piston or pump leak" otherwise.
@@ -166,7 +166,8 @@ class BalanceLeak(LeakMeasure):
     def _hold_rise(self) -> Rise | None:
         """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None if it cannot be estimated, or if it shows no leak and is less precise than the rise in the whole recording.
+        None if it cannot be estimated, or if it shows no leak and says nothing about the rise in the whole recording,
+        because its error exceeds both the error and the value of that rise.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -174,7 +175,6 @@ class BalanceLeak(LeakMeasure):
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
             return None
-        # the error of `hold_rise` is smaller than the error or the value of the rise from the whole recording
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
         return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
 
@@ -361,7 +361,8 @@ class BalanceLeak(LeakMeasure):
         unit = pressure * max(float(laws.weights @ relative_deviations), 1.0)
         # the holds show the leak if they are right about it and it did not begin after them
         hold_probability = INFERENCE.held_oil.right * (1.0 - chambers.probability_after_holds)
-        # `hold_rise.value` contains the piston's leak times its probability; here the leak is either whole or absent
+        # `hold_rise.value` contains the piston's leak times its probability; here the leak is either whole or absent.
+        # The error of `hold_rise` excludes the oil's uncertain properties, so a whole leak adds them
         by_motion = _flow_mixture(motion_rise, motion_rise.value, unit=pressure, weight=1.0 - hold_probability)
         past_piston = _flow_mixture(
             hold_rise,
@@ -396,16 +397,17 @@ class BalanceLeak(LeakMeasure):
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
         if total_rise is None:
             return None
-        if step is None or motion_rise is None:
+        if step is None or motion_rise is None:  # with a `total_rise`, `motion_rise` is never None
             return LeakRise(total_rise)
         balance, chambers = self.balance, self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
         older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
-        # the likelihood of an older leak is averaged over the laws; that of the step has the prior of its law
+        # the likelihood of an older leak is averaged over the laws; that of the step has `law.share`, its law's prior
         mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
         onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
+        # noise[False]: as fitted without a step
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
         if rise_after is None:
             is_after = balance.running_blocks.time >= step.onset().value
@@ -477,11 +479,11 @@ class BalanceLeak(LeakMeasure):
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        The limit is that of the rig's file, None if healthy recordings are compared instead. The flow is not stated
-        behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of the pump.
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the recording,
-        computed with the assumed piston area and displacement; None if that was not tested. The result states it as
-        `findable_lpm` and `findable_share`.
+        The limit is that of the rig's file, None if that states none, or if healthy recordings are compared instead.
+        The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
+        the pump. `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the
+        recording, computed with the assumed piston area and displacement; None if that was not tested. The result
+        states it as `findable_lpm` and `findable_share`.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -499,6 +501,7 @@ class BalanceLeak(LeakMeasure):
             interval_lpm=(low, high) if is_stated else None,
             pressure=pressure,
             findable_lpm=None if detectable_flow is None or not size.stated else detectable_flow * lpm_per_flow,
+            # the limit is a true conductance, and so is not multiplied by `size.scale`
             healthy_lpm=limit * pressure / LITRE_PER_MINUTE if limit > 0.0 and self.rise is None else None,
             pump_share=max(value, 0.0) * pressure / pump_flow if pump_flow > 0.0 and is_single else None,
             findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,

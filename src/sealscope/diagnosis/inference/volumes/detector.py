@@ -50,7 +50,8 @@ _NO_BALANCE = {
 }
 #: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
-_MAX_AGE_S = 1e11  # longer than any machine is recorded [s]
+#: Time that is longer than any machine is recorded [s].
+_MAX_AGE_S = 1e11
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
 
@@ -128,10 +129,10 @@ class VolumeBalance:
         return self._build_balance(recording, recorded.regime(odds))
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
-        """Choose the volume balance with the smallest upper bound of a leak, among those that need no position.
+        """Choose the volume balance with the smallest upper bound of a leak, without a position or without a flow.
 
         Only balances of a load behind shut valves, or of a pump that replaces the leakage (`compensates_leakage`), are
-        considered. Return None if there is no such balance.
+        considered (`cycle_balances`). Return None if there is no such balance.
         """
         balances = compute_once(
             recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
@@ -248,7 +249,8 @@ class VolumeBalance:
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
         """Return the column roles of each volume balance of the recorded channels, for open or `shut` valves.
 
-        If the channels allow no other balance, it is that of a load held by valves (`locked`).
+        If the channels allow no balance with a position and a flow, it is that of a load held by valves (`locked`), if
+        they allow this; a balance over cycles (`circulation`) is not among them.
         """
         balances = equations(self.rig, channels)
         if not balances and (hold_balance := locked(self.rig, channels)) is not None:
@@ -293,7 +295,8 @@ class VolumeBalance:
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
         """Report on a recording without a baseline, for each assumption on the valves while the pump rests.
 
-        The key True stands for valves that cut the pump off (missing if it never rests), False for open valves.
+        The key True stands for valves that cut the pump off (missing if it never rests), False for open valves. Empty
+        without a balance.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
@@ -308,8 +311,9 @@ class VolumeBalance:
 
         `Observed.share` is the fraction of the samples that were used, `Observed.judged_until` the end of the last
         block with used samples, as a fraction of the recording. The leakage is tested for a step within the recording
-        and compared with that of the `healthy` recordings, if there are any. If neither is possible, the report states
-        only the reason.
+        and compared with that of the `healthy` recordings, if there are any; in a single balance with a position, the
+        motion (`compare_motion`) and the rivals of a leak (`rival_rises`) are, too. If neither is possible, the report
+        states only the reason.
         """
         leak, rows = BalanceLeak(balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:

@@ -26,7 +26,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over
 
-#: Time over which flow, speed and pressures are averaged [s], and maximum number of samples of the fit per second.
+#: Averaging time of flow, speed and pressures [s]. Rate [Hz] to which samples are thinned, or up to twice as much.
 AVERAGING_TIME, MAX_RATE = 0.1, 50.0
 #: Minimum number of samples of the fit.
 MIN_SAMPLES = 30
@@ -54,7 +54,7 @@ def estimate_pump_leakage(
         windows.append(samples[:: max(1, int(rate / MAX_RATE))])
         last_end = hold.t[-1]
     rows = np.concatenate(windows)
-    if len(holds) < 2 or len(rows) < MIN_SAMPLES:
+    if len(holds) < 2 or len(rows) < MIN_SAMPLES:  # the errors below are those of fits without one hold each
         return None
     mean_pressure, mean_flow = (float(np.abs(values[rows]).mean()) for values in (pressure, flow))
     if not (mean_pressure > 0.0 and mean_flow > 0.0):

@@ -177,7 +177,8 @@ class RiseFits(NamedTuple):
         chance, tail = float(weights.sum()), 1.0 - BOUND_PROBABILITY  # of a leak, and of one above the bound
         if chance <= tail:
             return 0.0
-        truncated = weights / np.maximum(ndtr(flows / deviations), _TINY)  # of normal densities without negative flows
+        # weights of whole normal densities, of which only the parts with a flow > 0 have the weights above
+        truncated = weights / np.maximum(ndtr(flows / deviations), _TINY)
         return bound_steps(truncated, flows, deviations, 1.0 - tail / chance)
 
 
@@ -213,15 +214,17 @@ def fit_rise(
 
     N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
     and p = `size.present` the prior probability of a leak. The weights of the hypotheses, up to a common factor, are as
-    follows; those of leaks are also multiplied by the probability that the flow is positive.
+    follows; those of leaks are also multiplied by the probability that the flow is positive, and by the priors of law,
+    growth and onset.
 
         leak within the recording: exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
         older leak:                N(r; d^2 + R^2),
         no leak:                   N(r; d^2) (1 - p) / p.
 
     The flow of an older leak follows from the rise alone. All onsets together are as probable beforehand as an older
-    leak. With the small probability 2 `scatter.tail` the rise is no evidence, as the recording is like none that the
-    healthy ones predict. Its density is then 1 / R, and only s'' and e'' give the flow.
+    leak: each has p / 2, and this half cancels the factor 2 of the half-normal density. With the small probability 2
+    `scatter.tail` the rise is no evidence, as the recording is like none that the healthy ones predict. Its density is
+    then 1 / R, and only s'' and e'' give the flow.
     """
     from scipy.special import log_ndtr
 
@@ -231,11 +234,13 @@ def fit_rise(
     usual_rises = usual_flow / unit_flows
     log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
     present: float = INFERENCE.size.present
+    # the hypothesis of no leak gets the sum of the laws' weights, which are not normalised
     log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
     log_none += float(normal_log_density(rise.value, rise.deviation**2))
     if test is None:
-        log_none -= math.log(2.0)  # an older leak has the whole probability, of which it has half beside one within
+        log_none -= math.log(2.0)  # an older leak then has the whole probability p, instead of p / 2
     flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
+    # onsets: before the recording; parts: all of it; by_rise: true
     older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
     fits = [older]
     if test is not None:
@@ -251,7 +256,7 @@ def fit_rise(
     fit = older.join(fits)
     log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
     is_excluded = np.abs(fit.flows) > max_flow
-    is_excluded[0] = False  # the older leak under the first law always counts
+    is_excluded[0] = False  # the older leak under the first law always counts, so that a hypothesis remains
     return fit._replace(log_weights=np.where(is_excluded, -np.inf, log_weights))
 
 

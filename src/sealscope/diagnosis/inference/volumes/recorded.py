@@ -130,11 +130,12 @@ class RecordedBalance:
 
     @cached_property
     def _first_motion(self) -> int:
-        """Index of the first moving block that begins after the machine's start; 0 if too few blocks would remain.
+        """Index of the first block tested for steps: the first moving one, or the first after the machine's start.
 
-        The machine starts with the flow of its pump or, behind a servo valve (two balances), with the motion of the
-        piston. In a balance without a position or a flow (`balances.circulation`, `balances.locked`) the first moving
-        block counts. A step test needs `MIN_BLOCKS` blocks.
+        The later of the two counts; the index is 0 if too few blocks would remain. The machine starts with the flow of
+        its pump or, behind a servo valve (two balances), with the motion of the piston. In a balance without a position
+        or a flow (`balances.circulation`, `balances.locked`) the first moving block counts. A step test needs
+        `MIN_BLOCKS` blocks.
         """
         first = int(np.argmax(self.blocks.is_moving))
         if self.equations[0].name == CYLINDER or len(self.equations) > 1:
@@ -190,6 +191,7 @@ class RecordedBalance:
     def observables(self) -> tuple[Observable, ...]:
         """Tests of the balance's coefficients for a step within the recording, the highest score first."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
+        # the fall of the charge pressure is compared with losses of oil as true flows
         charge = estimate_charge_trend(self.recording) if self.size.stated else None
         return volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss,
@@ -262,7 +264,7 @@ class RecordedBalance:
 
         It is NaN while a valve lowers the load past the pump (`flag_lowering`).
         """
-        signals = Signals(dict(self.recording.channels), self.recording.rate, {})
+        signals = Signals(dict(self.recording.channels), self.recording.rate)
         pumped = self.equations[0].left(signals)
         return np.where(flag_lowering(pumped, signals.step("x"), self.recording.rate), np.nan, pumped)
 
@@ -377,7 +379,8 @@ class RecordedBalance:
         Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
         the position x is reversed, and zero if nothing moves.
 
-        - Areas in the rig's file are used if they are stated, scaled to the flows of the balance.
+        - Areas in the rig's file are used if they are stated, scaled to the flows of the balance, whose ratio to true
+          flows must be known (`Size.stated`).
         - Otherwise the area of a side is the mean coefficient of the motion under its load in the volume balance,
           weighted by the sums of squares of the columns. The main side is the one with more motion in which it surely
           carries the load. The area of the other side is corrected for motion that may belong to the main side
@@ -430,7 +433,7 @@ class RecordedBalance:
 
     @cached_property
     def pressure_offset(self) -> float:
-        """Estimated sensor offset of p_A - p_B [Pa]; near 0 unless a change of the leak reveals the offset."""
+        """Estimated sensor offset of p_A - p_B [Pa]; near `Blocks.zero` unless a change of the leak reveals another."""
         return estimate_offset(self.blocks, self.columns)
 
     @cached_property
@@ -457,6 +460,7 @@ class RecordedBalance:
 
         The leak is driven by the root mean square of its pressure (`Blocks.driving_pressure`).
         """
+        # with the pressures as recorded, as external leaks are tested (`volume_observables`)
         names, blocks = self.columns[0].names, self.blocks if self.plain is None else self.plain
         return {
             name: blocks.driving_pressure(names, name) * self.size.scale
@@ -467,7 +471,7 @@ class RecordedBalance:
     @cached_property
     def mean_flow(self) -> float:
         """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of the flow that the piston displaces."""
-        if not self.is_creep:
+        if not self.is_creep:  # weights: positive, so that a mean exists
             return float(np.average(self.blocks.flow, weights=np.maximum(self.blocks.rows, 1e-9)))
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
@@ -482,12 +486,13 @@ class RecordedBalance:
           the difference is the uncertainty.
         - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
           stated, it is 1, with the uncertainty of both.
+        - Without a measured area the factor is 1, with the uncertainty of meter or displacement.
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)
         has_flow_unit = source in METERS or (source, COUNTS) not in self.units  # the area scales a meter without unit
         has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & self.units
-        states_displacement = rig.states("pump.q_b") and has_flow_unit
+        states_displacement = rig.states("pump.q_b") and has_flow_unit and source not in METERS
         states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
         if len(self.columns) > 1 or self.is_creep:  # behind a servo valve, or for a load that shut valves hold
             deviation = float(np.hypot(prior.area, prior.creep)) if self.is_creep else prior.area

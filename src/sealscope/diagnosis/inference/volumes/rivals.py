@@ -19,11 +19,11 @@ from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, eliminate, subtract_fit
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
-from sealscope.diagnosis.inference.comparison.levels import MIN_WITH_HOLDS, held_pump_rise, rise
+from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import predict_thinning
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import RISE
-from sealscope.diagnosis.inference.differences import compare_with_healthy, excess_error, size_penalty
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY, compare_with_healthy, excess_error, size_penalty
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -42,16 +42,16 @@ def rival_rises(
     volume_ratio: float = 1.0,
     unit_flows: Mapping[str, float] | None = None,
 ) -> tuple[Observable, ...]:
-    """Test for faults other than a leak past the piston that explain a change since the healthy recordings.
+    """Test for faults other than a leak past the piston that may explain a change since the healthy recordings.
 
     These rivals of the leak are external leaks, leakage of the turning pump, and free air. The result has one test for
-    each rival that can be compared. If external leaks can be measured while shut valves hold the load (`held_rivals`),
-    they are compared only there.
+    each rival that can be compared. Leakages that are measured while shut valves hold the load (`held_rivals`), or just
+    before (`held_pump_rise`), are compared only by these measurements.
 
-    `volume_ratio`: measured over assumed ratio of the piston's area to the pump's displacement, by which prior volumes
-    of air are multiplied. `unit_flows`: flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the
-    name of its term. A leak without an entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged
-    recording.
+    `columns`: roles of the columns of each balance, the same for all recordings. `volume_ratio`: measured over assumed
+    ratio of the piston's area to the pump's displacement, by which prior volumes of air are multiplied. `unit_flows`:
+    flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A leak without an
+    entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
     """
     names = columns[0].names
     hold_rivals = held_rivals(judged, healthy, unit_flows)
@@ -83,11 +83,12 @@ def rival_rises(
         changes = list(compress(changes, is_known))  # in the others no pressure drives the flow of this term
         is_air = names[k] == AIR
         values = np.array([*(healthy_change for healthy_change, _ in changes), change])
+        # the scatter of the healthy changes contains their own errors already
         error = excess_error(error, [healthy_error for _, healthy_error in changes])
         if names[k] == TURNING:
             turning_columns = [roles.replace_leak(TURNING) for roles in columns]
             level, _ = coefficient_level(healthy_gram, turning_columns)
-            # levels instead of changes, since the oil scales the whole leakage
+            # levels instead of changes, since the oil's viscosity scales the whole leakage
             values = _without_oil(level + values, predict_thinning([*compress(healthy, is_known), judged]))
         *healthy_values, value = values.tolist()
         observable = compare_with_healthy(
@@ -101,7 +102,7 @@ def rival_rises(
         )
         if observable is None:
             continue
-        if names[k] == TURNING:
+        if names[k] == TURNING:  # it describes data of its own, and so does not compete with the leak for the rise
             turning_rise = rise(judged, healthy, turning_columns)
             # a rise that warmer oil explains does not count
             observable = replace(observable, chance=max(observable.chance, turning_rise.chance))
@@ -119,10 +120,10 @@ def rival_rises(
 
 
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
-    """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if they then scatter less.
+    """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if healthy ones then scatter less.
 
     `thinning` (n + 1,): logarithm of the factor by which thinner oil raises each coefficient. The last coefficient is
-    that of the judged recording, the others are those of healthy ones.
+    that of the judged recording, the others are those of healthy ones, whose scatter is taken relative to their mean.
     """
     corrected = coefficients * np.exp(-thinning)
     scatters = [
@@ -136,14 +137,15 @@ def held_rivals(
 ) -> tuple[Observable, ...] | None:
     """Test chambers A and B for larger external leaks than in healthy recordings, while shut valves hold the load.
 
-    Return one test for each chamber that can be compared. Return None if the judged recording has no such holds, or if
-    fewer than `MIN_WITH_HOLDS` healthy recordings have them. `unit_flows`: as in `rival_rises`.
+    Return one test for each chamber that can be compared (`compare_with_healthy`). Return None if the judged recording
+    has no such holds, or if fewer than `MIN_HEALTHY` healthy recordings have them. `unit_flows`: as in
+    `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
-    if judged.held is None or len(healthy_leaks) < MIN_WITH_HOLDS:
+    if judged.held is None or len(healthy_leaks) < MIN_HEALTHY:
         return None
     judged_leaks = HeldLeaks(*judged.held)
-    min_error = INFERENCE.scatter.finest * judged.conductance_of_flow
+    min_error = INFERENCE.scatter.finest * judged.conductance_of_flow  # no machine repeats its leakage any better
     observables = list[Observable]()
     for side in "AB":
         value, *healthy_values = (float(getattr(leaks, f"outside_{side}")) for leaks in (judged_leaks, *healthy_leaks))
@@ -172,14 +174,15 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
     equations; `columns`: roles of their columns; `tested`: column of the coefficient, which counts as 0 in the healthy
     recordings. The differences of the other coefficients have normal priors and are eliminated. Except for the leak,
-    columns without a finite prior deviation are left out. Without information the change is 0 and the error infinite.
+    columns without a finite prior deviation are left out: `RecordingSums.sums` no longer contain them. Without
+    information the change is 0 and the error infinite.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
         leak = roles.names.index(LEAK)
-        free = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
-        coefficients = solve(reference[e][np.ix_(free, free)], reference[e][free, roles.left])
-        prior = roles.difference_precisions(free, coefficients, coefficients[free.index(leak)])
-        reduced = eliminate(subtract_fit(gram[e], free, coefficients, roles.left), free, prior)
+        fitted = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
+        coefficients = solve(reference[e][np.ix_(fitted, fitted)], reference[e][fitted, roles.left])
+        prior = roles.difference_precisions(fitted, coefficients, coefficients[fitted.index(leak)])
+        reduced = eliminate(subtract_fit(gram[e], fitted, coefficients, roles.left), fitted, prior)
         precision, moment = precision + reduced[tested, tested], moment + reduced[tested, roles.left]
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

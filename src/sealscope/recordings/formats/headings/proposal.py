@@ -202,6 +202,7 @@ def is_measured(label: Label) -> bool:
         measured_units = ("Pa", "m", "rad/s", "m/s", "m^3/s")
         return unit in WORDS["rotation_units"] or any(map(same_dimension, repeat(unit), measured_units))
     kinds = (*(_MEASURED[kind] for kind in ("pressure", "position", "speed")), _KIND["supply"], _KIND["velocity"])
+    # a letter alone, such as n, may count the rows
     return len(name) > 1 and any(words & known for known in kinds)
 
 

@@ -151,8 +151,8 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
         values, times_of_packets = [], []
         for packet, offset in zip(matching, offsets, strict=True):
             samples = packet.column(column)
-            if is_multi:  # shorter channels end in blanks
-                samples = samples[: np.flatnonzero(np.isfinite(samples)).max(initial=-1) + 1]
+            if x_columns != "one":  # shorter channels end in blanks; one without samples stays
+                samples = samples[: np.flatnonzero(np.isfinite(samples)).max(initial=-1) + 1 or None]
             computed_times = _compute_times(packet, index, samples.size) if x_columns == "no" else None
             values.append(samples)
             times_of_packets.append(
@@ -160,7 +160,8 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
             )
         t = np.concatenate(times_of_packets)
         label = Label.parse(names[column], first.entry("y_unit_label", index) or None)
-        clock = Clock.of_times(time_column, t, first.moment(index, day_first))
+        # with times of its own, even channels that follow one column may differ in step or length
+        clock = Clock.of_times(time_column if x_columns == "one" else column, t, first.moment(index, day_first))
         series.append(Series("", label, t.size, partial(np.asarray, np.concatenate(values)), clock))
     return series
 

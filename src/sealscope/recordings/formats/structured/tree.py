@@ -75,12 +75,13 @@ def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock 
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
     samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)
+    # each struct's times have a key of their own, as names may repeat
     if (times := _read_struct_times(by_name)) is not None:
-        yield from _iter_time_series(group, name, by_name, Clock.of_times((group, name, depth), times), depth)
+        yield from _iter_time_series(group, name, by_name, Clock.of_times(object(), times), depth)
     elif samples is not None and unit is not None:
         times = by_name.get("time", by_name.get("t"))
         if isinstance(times, np.ndarray) and times.dtype.kind in "fiu" and times.size == samples.size:
-            clock = Clock.of_times((group, name, depth), times.reshape(-1).astype(np.float64))
+            clock = Clock.of_times(object(), times.reshape(-1).astype(np.float64))
         yield from _iter_columns(group, _first_text(by_name, _NAME_FIELDS) or name, samples, unit or None, clock)
     elif "values" in by_name and _single_text(by_name.get("name")):  # a signal of a Simulink log
         yield from _iter_value(group, _single_text(by_name["name"]), by_name["values"], clock, depth + 1)
@@ -99,7 +100,8 @@ def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: 
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
             label = _single_text(signal.get("label")) or f"{name}({number})"
-            yield from _iter_columns("", label, np.asarray(signal.get("values")), unit=None, clock=clock)
+            path = f"{group}/{name}" if group else name
+            yield from _iter_columns(path, label, np.asarray(signal.get("values")), unit=None, clock=clock)
     elif isinstance(data, np.ndarray):
         info = _struct_fields(by_name.get("datainfo")) or {}
         unit = _single_text(info.get("Units")) or _first_text(by_name, _UNIT_FIELDS)

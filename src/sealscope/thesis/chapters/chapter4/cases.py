@@ -85,7 +85,7 @@ class Reading:
         sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
         if closed_pct is None:
             return sampling
-        # open throttles are the same under all readings: with the same parameters, their runs are shared
+        # these two do not matter to open throttles: readings that differ in them only share a run by equal parameters
         reading = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
         return (
             *sampling,

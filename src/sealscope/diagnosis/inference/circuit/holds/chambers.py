@@ -188,8 +188,8 @@ class HeldChambers:
     def _possible_supplies(self) -> list[SideSupplies]:
         """Supplies of A and B that are tried for a leak.
 
-        Check valves are tried if some reading does not count with them, and an open side if it is at the charge
-        pressure nearly all the time.
+        Check valves are tried if one of their sides is at the charge pressure in some samples, and an open side if it
+        is at this pressure nearly all the time.
         """
         possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
         if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
@@ -565,7 +565,10 @@ class HeldChambers:
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
-        """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order."""
+        """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order.
+
+        Leaks to the outside are fitted with check valves on both sides and, if possible, with an open unloaded side.
+        """
         # if BOTH is not possible, no reading is at the charge pressure, and it flags the same samples as NEITHER
         possible = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies] or [
             BOTH
@@ -605,7 +608,7 @@ class HeldChambers:
         A leak may be past the piston, to the outside, or through open valves and the pump; each of these is weighted by
         its probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
-        # without a charge pressure check valves stay closed
+        # without a charge pressure check valves stay closed; if they do so anyway, the cached fits serve
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
         sides = (True, False)
         leaks = [[chambers._unit_outside_leak(is_A)] for is_A in sides]

@@ -17,7 +17,7 @@ from sealscope.signals.smoothing import average_over
 
 #: Length of a hold's first reading [s], ratio of the lengths of successive readings, minimum number of readings.
 FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
-#: Maximum sampling rate [Hz]; enough for pressures in shut chambers.
+#: Rate [Hz] to which samples are averaged, or up to twice as much; enough for pressures in shut chambers.
 MAX_RATE = 100.0
 #: Quantile of the lower chamber pressure that counts as charge pressure.
 LOWEST = 0.02

@@ -200,7 +200,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
         residual = leaked - design @ solution
         distances = np.append(np.zeros(n_leaks), changes) + solution  # distances from the means of the priors
         squares = float(residual @ residual) + float(prior_weights[n_leaks:] @ distances[n_leaks:] ** 2)
-        mean_square = squares / len(leaked)
+        mean_square = squares / len(leaked)  # per degree of freedom below, since the leaks are fitted
         previous, variance = variance, mean_square * n_readings / degrees_of_freedom + misfit_variance
         steps = np.clip(solution[n_leaks:], -MAX_STEP, MAX_STEP)
         was_lowest, is_lowest = is_lowest, is_lowest | (changes + steps < lowest)
@@ -250,7 +250,8 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     # (c, 4), (c, 4, o): changes of the free properties without a leak, and decrease of these changes for a leak with a
     # coefficient of 1
     without_leak, per_leak = solutions[:, :, 0], solutions[:, :, 1:]
-    # sum of squares without a leak; a leak with the coefficient g changes it by -2 g moment + g^2 energy
+    # Sum of squares without a leak. With b = `leaked`, w = `with_leaked`, P = `products`, limits l and free changes f
+    # it is b'b - 2 l'w + l'P l - f'(w - P l); a leak with the coefficient g changes it by -2 g moment + g^2 energy.
     total = leaked @ leaked - (limits * (with_leaked + remainder)).sum(axis=1) - (remainder * without_leak).sum(axis=1)
     energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, per_leak)
     moment = columns.T @ leaked - limits @ with_columns - np.einsum("ck,cko->co", remainder, per_leak)
