@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import flag_lowering, max_rest_rate
+from sealscope.diagnosis.inference.balance import derive_drive_signals, flag_lowering, max_rest_rate
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -264,9 +264,12 @@ class RecordedBalance:
 
         It is NaN while a valve lowers the load past the pump (`flag_lowering`).
         """
-        signals = Signals(dict(self.recording.channels), self.recording.rate)
+        channels, rate = dict(self.recording.channels), self.recording.rate
+        if self.equations[0].by_command:
+            channels = derive_drive_signals(channels, self.rig, rate)
+        signals = Signals(channels, rate)
         pumped = self.equations[0].left(signals)
-        return np.where(flag_lowering(pumped, signals.step("x"), self.recording.rate), np.nan, pumped)
+        return np.where(flag_lowering(pumped, signals.step("x"), rate), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the averaged magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
