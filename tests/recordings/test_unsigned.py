@@ -57,6 +57,18 @@ def test_noise_at_rest_has_no_mean_and_a_slow_flow_keeps_its_own() -> None:
     assert np.abs(restored["omega"]) == pytest.approx(np.abs(resting["omega"]))
 
 
+def test_samples_beside_a_gap_keep_the_sign_of_their_stroke() -> None:
+    """A gate whose poll missed a sample had a jump of twice its speed there: a leak of half the flow."""
+    fast, speed = held_lift(2.0, noise=0.5)
+    polled = slice(None, None, 20)  # at 5 Hz
+    t, speed = fast.t[polled], speed[polled]
+    missing = np.arange(t.size) % 10 == 0  # in strokes up and down, and in holds
+    channels = {name: np.where(missing, np.nan, values[polled]) for name, values in fast.channels.items()}
+    restored, _ = restore_signs(replace(fast, t=t, channels=channels, rate=5.0))
+    in_stroke = ~missing & (np.abs(speed) > 900.0 * RPM)
+    assert np.all(restored["omega"][in_stroke] * speed[in_stroke] > 0.0)
+
+
 def test_a_pump_that_turns_one_way_keeps_the_signed_noise_of_its_sensor() -> None:
     recording, speed = held_lift(0.0, noise=2.0)
     signed_noise = np.random.default_rng(5).standard_normal(len(recording)) * 2.0 * RPM

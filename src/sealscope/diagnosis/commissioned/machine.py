@@ -25,7 +25,7 @@ from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
-from sealscope.diagnosis.verdict.machine import assumed_rig
+from sealscope.diagnosis.verdict.machine import assumed_rig, infer_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 from sealscope.paragraphs import format_count
@@ -400,6 +400,8 @@ def commission(
     for label, path in zip(_distinct_names(files), files, strict=True):
         try:
             recording = machine.read(path)
+            if not machine.healthy:
+                machine = replace(machine, rig=infer_rig(stated_rig, recording))
             machine = machine._with_recording(recording, label, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))

@@ -80,6 +80,16 @@ class Case:
         affected = [observable for observable in self.judge.observables if leak.affects(observable)]
         return min(affected, key=lambda observable: observable.chance, default=None)
 
+    @property
+    def rarest_chance(self) -> float:
+        """Probability that a healthy recording shows an observable as rare as the rarest one of all detectors.
+
+        It is the smallest calibrated p-value times the number of tests (Bonferroni correction). Observables with the
+        same distribution in healthy recordings (`null_key`) count as one test.
+        """
+        n_tests = len({null_key(observable) for observable in self.observables})
+        return min(1.0, n_tests * min(map(self.null.chance, self.observables), default=1.0))
+
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Sets of events that explain the test results, with posterior probabilities, the most probable first."""

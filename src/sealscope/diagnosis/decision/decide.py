@@ -94,7 +94,8 @@ def _decide_without_leak(case: Case) -> Evidence:
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
-    evidence = Evidence(verdict, reason="", cause=None if other is None else other.cause)
+    cause = None if other is None else other.cause
+    evidence = Evidence(verdict, reason="", cause=cause, rarest_chance=case.rarest_chance)
     evidence = _add_tests(case, evidence, alarm or next(iter(case.tests), None))
     if leak is not None:
         evidence = replace(

@@ -1,4 +1,4 @@
-"""Typed table of `verdict/priors.toml`: the default repair limit."""
+"""Typed tables of `verdict/priors.toml`: how a valve's supply is recognised, and the default repair limit."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
@@ -10,10 +10,17 @@ class RepairPriors(PriorTable):
     watch: float  # fraction of the limit under which a leak only has the level "monitor"
 
 
+class SupplyPriors(PriorTable):
+    """Pressure of a valve's supply."""
+
+    above: float  # smallest fraction of a recording in which p_1 is above both chamber pressures
+
+
 class VerdictPriors(PriorTable):
-    """The table of `verdict/priors.toml`, which is the default repair limit."""
+    """The tables of `verdict/priors.toml`."""
 
     repair: RepairPriors
+    supply: SupplyPriors
 
 
 VERDICT = read_priors("sealscope.diagnosis.verdict", VerdictPriors)

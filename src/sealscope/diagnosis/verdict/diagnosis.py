@@ -219,14 +219,15 @@ class Diagnosis(Evidence):
     def is_baseline(self) -> bool:
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
-        At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings, and in the
-        test for a step. The result is False without this comparison, if a cause of a change is stated, or if the total
-        leakage is surely above 0 and an undetected leak could be the whole of it.
+        At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings, in the test
+        for a step, and in the rarest of all tests (`rarest_chance`). The result is False without this comparison, if a
+        cause of a change is stated, or if the total leakage is surely above 0 and an undetected leak could be the whole
+        of it.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
             return False
-        if self.rises_within:
+        if self.rises_within or self.rarest_chance < _MIN_USUAL_CHANCE:
             return False
         total = self.total_leakage
         if total is None or total.lpm is None or total.interval_lpm is None or self.bound_lpm is None:

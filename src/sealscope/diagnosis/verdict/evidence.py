@@ -160,6 +160,8 @@ class Evidence:
         interval.
     bound_lpm : float, optional
         95 % upper bound of a leak [L/min] if none is reported.
+    rarest_chance : float
+        Probability that a healthy recording shows anything as rare as the rarest of all changes in this one.
     """
 
     verdict: Verdict
@@ -184,6 +186,7 @@ class Evidence:
     ratio: float | None = None
     ratio_interval: tuple[float, float] | None = None
     bound_lpm: float | None = None
+    rarest_chance: float = 1.0
 
     @property
     def alarmed(self) -> bool:

@@ -7,6 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+import numpy as np
+
+from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.parameters.rig import ASSUMED
 from sealscope.recordings.channels import METERS, flow_source
@@ -18,6 +21,8 @@ StatedBy = Literal["call", "recording", "nobody"]
 _GEOMETRY = ("cylinder.A_A", "cylinder.A_B", "pump.q_b")
 #: Name of the rig that is assumed if no rig is stated, and the reason that is noted with its values.
 _DEFAULT, _REASON = "thesis", "no rig was stated"
+#: The same of a machine whose recording shows the supply of a servo valve.
+_BEHIND_VALVE = "servo-valve"
 
 
 @dataclass(frozen=True)
@@ -75,11 +80,12 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
     A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
-    thesis's rig is used. It counts as stated by the recording if the recording was simulated with a packaged rig of the
-    same areas and displacement. Otherwise nobody stated it, and all values of the returned rig are marked as
-    assumptions. Raises InputError if `rig` cannot be read.
+    thesis's rig is used, or the one of `infer_rig`. The thesis's rig counts as stated by the recording if the recording
+    was simulated with a packaged rig of the same areas and displacement. Otherwise nobody stated it, and all values of
+    the returned rig are marked as assumptions. Raises InputError if `rig` cannot be read.
     """
-    used_rig = load_rig(_DEFAULT if rig is None else rig)
+    rig = infer_rig(None if rig is None else load_rig(rig), recording)
+    used_rig = load_rig(_DEFAULT) if rig is None else rig
     stated_by: StatedBy
     if rig is not None:
         stated_by = "call" if states_rig(used_rig) else "nobody"
@@ -99,6 +105,24 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
         areas=(used_rig.cylinder.A_A, used_rig.cylinder.A_B),
         bypass="q_leak" in recording.units,
     )
+
+
+def infer_rig(rig: Rig | None, recording: Recording) -> Rig | None:
+    """Replace a rig that nobody stated by one behind a servo valve, if the recording shows the valve's supply.
+
+    That is so if no flow and no pump is recorded, only the command, and if p_1 is above both chamber pressures in the
+    fraction `supply.above` (`priors.toml`) of the samples. Stated areas are kept. Any other `rig` is returned as it is.
+    """
+    is_stated = rig is not None and states_rig(rig)
+    if is_stated or flow_source(recording.channels) != "u" or not {"p_1", "p_A", "p_B"} <= set(recording.channels):
+        return rig
+    is_above = recording["p_1"] > np.fmax(recording["p_A"], recording["p_B"])
+    if not is_above.mean() > VERDICT.supply.above:
+        return rig
+    valve_rig = load_rig(_BEHIND_VALVE).as_assumed(_REASON)
+    if rig is None or not rig.states("cylinder.A_A", "cylinder.A_B"):
+        return valve_rig
+    return valve_rig.with_areas(rig.cylinder.A_A, rig.cylinder.A_B, source=rig.entry("cylinder.A_A").source)
 
 
 def states_rig(rig: Rig) -> bool:

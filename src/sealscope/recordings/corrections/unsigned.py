@@ -160,7 +160,8 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
     has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
     difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
     known = np.isfinite(speed) & np.isfinite(difference) & np.isfinite(magnitude)
-    speed, difference, magnitude = (np.where(known, values, 0.0) for values in (speed, difference, magnitude))
+    speed, difference = (np.where(known, values, 0.0) for values in (speed, difference))  # evidence for neither sign
+    magnitude = _interpolate_missing(magnitude)  # with 0, a change of sign beside a gap would cost nothing
     motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
     step_scale = _average_nearby(np.abs(np.diff(magnitude)), recording.rate)  # of the Laplace density below
     step_scale = np.maximum(step_scale, np.finfo(float).eps * magnitude.max() + np.finfo(float).tiny)
@@ -213,6 +214,12 @@ def _average_nearby(values: Array, rate: float) -> Array:
     return np.asarray((sums[after] - sums[first]) / (after - first))
 
 
+def _interpolate_missing(values: Array) -> Array:
+    """Interpolate missing values (n,) linearly; those at the ends equal the nearest known one, or 0 without any."""
+    known, rows = np.isfinite(values), np.arange(len(values))
+    return np.interp(rows, rows[known], values[known]) if known.any() else np.zeros(len(values))
+
+
 def _draw_noise_signs(values: Array, rate: float) -> Array:
     """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
 
@@ -224,7 +231,7 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
     if values.size < 3:
         return values
     known = np.isfinite(values)
-    values = np.where(known, values, 0.0)
+    values = _interpolate_missing(values)  # with 0, a gap would have the second difference of much noise
     mean = _average_nearby(values, rate)
     # the mean square of the second difference of white noise is six times the variance
     squares = np.pad(np.diff(values, 2) ** 2, 1, mode="edge") / 6.0
