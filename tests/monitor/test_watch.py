@@ -67,6 +67,23 @@ def test_a_leak_is_stated_in_litres_per_minute_with_its_onset():
     assert np.mean([estimate.leak_interval_lpm[0] == 0.0 for estimate in watched]) > 0.9  # a 95 % interval
 
 
+@pytest.mark.parametrize("flicker", [False, True])
+@pytest.mark.parametrize("wiring", [1.0, -1.0])
+def test_a_machine_that_stands_at_first_shows_the_sign_of_its_encoder_in_motion(wiring: float, flicker: bool):
+    """An angle that is constant, or jumps by a count, tells no sign: the leak was negative ever after."""
+    n_rest, random = round(30.0 * WORN.rate), np.random.default_rng(4)
+    count = 2.0 * np.pi / 4096.0 * flicker
+    rest = {name: np.full(n_rest, values[0]) for name, values in WORN.channels.items()}
+    rest["theta"] = rest["theta"] + count * random.integers(0, 2, n_rest)
+    rest |= {name: rest[name] + 1e3 * random.standard_normal(n_rest) for name in ("p_A", "p_B")}
+    channels = {name: np.r_[rest[name], values] for name, values in WORN.channels.items()}
+    channels["theta"] = wiring * channels["theta"]
+    t = np.arange(n_rest + len(WORN)) / WORN.rate
+    watch, estimates = run(replace(WORN, t=t, channels=channels), [500])
+    assert watch.leak is not None
+    assert estimates[-1].leak_lpm == pytest.approx(truth_lpm(WORN), rel=0.1)
+
+
 @settings(
     max_examples=2,
     deadline=None,

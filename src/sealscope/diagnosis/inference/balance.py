@@ -96,7 +96,7 @@ class BlockStream(SavedAttributes):
         Sensor offset [Pa] that is subtracted from p_A - p_B.
     left_signs : tuple of float
         Factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty to estimate
-        the factors from the first blocks.
+        the factors from the first blocks or, of a stream, from the first ones with motion.
     on_samples : callable, optional
         Called with the start time [s] and the samples of each block before the block is computed.
     """
@@ -136,7 +136,7 @@ class BlockStream(SavedAttributes):
         self._rest_limits: RestLimits | None = None  # known after the first samples
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
-        self.left_signs = left_signs  # sign of each balance's left side, known after the first blocks
+        self.left_signs = left_signs  # sign of each balance's left side, known after the first motion
         self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
         self.restart(start)
 
@@ -239,13 +239,25 @@ class BlockStream(SavedAttributes):
             odds_by_balance.append(log_odds)
         return tuple(odds_by_balance)
 
+    def _shows_motion(self, rows: Sequence[Array]) -> bool:
+        """Return True if the flow moves the piston, in either sense, in the `rows` of a volume balance.
+
+        Flow and motion must correlate by `sense.moves` (`priors.toml`) standard errors. Also True if no balance has a
+        position.
+        """
+        z_scores = []
+        for columns, values in zip(self.columns, rows, strict=True):
+            if motion := [k for k in columns.motion if columns.names[k].startswith("motion")]:
+                z_scores.append(_z_score(values[:, motion].sum(axis=1) * values[:, columns.left]))
+        return not z_scores or max(map(abs, z_scores)) > INFERENCE.sense.moves
+
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
-        weights. The first call also determines, for all blocks of the stream, the signs of the left sides, absolute
-        minus gauge pressures, and the speeds below which the machine rests. `on_samples` is called with the samples of
-        each block.
+        weights. The first call also determines, for all blocks of the stream, absolute minus gauge pressures, and the
+        speeds below which the machine rests; the first one in which the piston moves, the signs of the left sides.
+        `on_samples` is called with the samples of each block.
         """
         length = self._strides_per_block * self._stride  # samples in a block
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
@@ -266,10 +278,13 @@ class BlockStream(SavedAttributes):
         weights, is_counted, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         root_weights = np.sqrt(weights[is_counted])[:, None]  # roots, since sums are over products of two entries
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
-        if not self.left_signs:
+        left_signs = self.left_signs
+        if not left_signs:
             self.sign_log_odds = self._flow_sign_log_odds(rows)
-            self.left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
-        for equation_rows, columns, sign in zip(rows, self.columns, self.left_signs, strict=True):
+            left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
+            if self._n_first is None or self._shows_motion(rows):  # a stream may begin at rest, which tells no sign
+                self.left_signs = left_signs
+        for equation_rows, columns, sign in zip(rows, self.columns, left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
         # index past the last counted row of each block
         block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))

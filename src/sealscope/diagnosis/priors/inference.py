@@ -141,6 +141,7 @@ class SensePriors(PriorTable):
     work: float  # the load gives back more work than it takes
     leak: float  # offsets of sensors, compressed oil or losses of the pump look like a negative leak
     sides: float  # the sides A and B are exchanged in the log
+    moves: float  # standard errors by which flow and motion correlate, in either sense, while the piston moves
     rewired: float  # the sign is wrong, as the sensor was reversed since the healthy recordings
 
 
