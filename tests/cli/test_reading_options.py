@@ -79,6 +79,14 @@ def test_the_map_that_names_tell_is_kept(call, tmp_path):
     (kept,) = call(*words, rig).objects
     (auto,) = call(*words, rig, "--map", "auto").objects
     assert kept == auto
+    later, joined = tmp_path / "a_later.csv", tmp_path / "joined.toml"  # parts may be named in any order
+    heading, units, *rows = log.read_text().splitlines()
+    times = (f"{float(row.partition(',')[0]) + 4.0:.3f},{row.partition(',')[2]}" for row in rows)
+    later.write_text("\n".join([heading, units, *times, ""]))
+    for parts in ((log, later), (later, log)):
+        joined.write_text(RIG)
+        assert "map saved" in call("inspect", "--join", *parts, "--rig", joined, "--map", "auto", "--save-map").out
+        assert load_rig(joined).channel_map == load_rig(rig).channel_map
     own = tmp_path / "own.csv"
     assert call("convert", log, own, "--map", "auto").status == 0
     assert "must have a map to save" in call("inspect", own, "--rig", rig, "--map", "auto", "--save-map").refused(2)

@@ -47,6 +47,14 @@ def rms(values) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
+def test_friction_by_the_difference_of_the_pressures_is_the_preload_where_they_are_equal():
+    by_sum, by_difference = (
+        Flatness.from_rig(RIG.with_overrides({"coulomb_pressure": name})).F_C for name in ("sum", "difference")
+    )
+    assert by_sum == pytest.approx(RIG.friction.F_pr + 2.0 * RIG.friction.F_cfr * RIG.fluid.p_charge)
+    assert by_difference == RIG.friction.F_pr
+
+
 def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
     """Closed form: k_p (omega_d - omega) + K_i I = C_e omega + R i at constant speed and current."""
     drive, m = Drive.from_rig(RIG), RIG.motor

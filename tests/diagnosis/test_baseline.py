@@ -80,6 +80,20 @@ def test_what_may_not_be_compared_is_not(
     assert reason is None or reason in result.reason
 
 
+def test_a_baseline_refused_for_clipping_is_not_called_one_of_other_channels() -> None:
+    random = np.random.default_rng(1)
+    t = np.arange(2000) / 500.0
+    pressures = {name: 2e6 + 1e5 * random.standard_normal(len(t)) for name in ("p_A", "p_B")}
+    recording = Recording(t, pressures, dict.fromkeys(pressures, "Pa"), rate=500.0)
+    clipped = replace(recording, channels={**pressures, "p_B": np.minimum(pressures["p_B"], 1.95e6)})
+    slower = replace(recording, t=t * 2, rate=250.0)
+    lacks = [RmsChange().observe(recording, [other]).lack for other in (clipped, slower)]
+    assert "p_B" in lacks[0]
+    assert "clipped" in lacks[0]
+    assert "clipped" not in lacks[1]
+    assert not RmsChange().observe(clipped, [recording]).lack  # p_A alone is judged
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("change", ["other duty", "other level"])
 def test_another_duty_or_load_is_no_leak(change: str, records, sound_ones: list[Recording]) -> None:  # type: ignore[no-untyped-def]

@@ -39,6 +39,16 @@ def test_parts_rise_and_keep_the_mean_and_a_zero() -> None:
     np.testing.assert_allclose(sorted_part_means(pressure + 3e5, RATE), parts + 3e5, rtol=1e-9)
 
 
+def test_ringing_beside_missing_samples_counts_in_full() -> None:
+    """Of each stride of 62 samples, three of the five pieces of 12 lack a sample."""
+    t = np.arange(62 * 40) / RATE
+    recorded = 1e4 * np.sin(2.0 * np.pi * 40.0 * t) + NOISE * np.random.default_rng(4).standard_normal(len(t))
+    complete = mean_size(sorted_part_means(recorded, RATE))
+    for first in (0, 12, 24):
+        recorded[first::62] = np.nan
+    assert mean_size(sorted_part_means(recorded, RATE)) == pytest.approx(complete, rel=0.05)
+
+
 @pytest.mark.parametrize("missing", [slice(0), slice(100, 107), slice(None, None, 50), slice(None)])
 @pytest.mark.parametrize("rate", [8.0, 40.0, 100.0, 500.0])
 def test_missing_samples_and_low_rates_are_no_trouble(missing: slice, rate: float) -> None:

@@ -260,6 +260,37 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
     assert "the external leakage on side A changed" in trend.reason
 
 
+@pytest.mark.parametrize(("error", "compared"), [(0.0, 3), (1e-6, 3), (1e-2, 0)])
+def test_rates_by_unlike_clocks_are_compared(monkeypatch: pytest.MonkeyPatch, error: float, compared: int) -> None:
+    """Rates that are estimated from times differ in their last digits."""
+    used: list[int] = []
+    compare = trend_leak.compare_summaries
+    monkeypatch.setattr(
+        trend_leak,
+        "compare_summaries",
+        lambda judged, healthy, chambers: used.append(len(healthy)) or compare(judged, healthy, chambers),
+    )
+    days = [ss.simulate(duration="20 s", seed=seed) for seed in range(4)]
+    ss.trend(
+        replace(day, rate=day.rate * (1.0 + error * (k == 3)), provenance={"start": f"2024-05-0{k + 1}T08:00"})
+        for k, day in enumerate(days)
+    )
+    assert sum(used) == compared
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_change_begins_while_the_machine_is_known_to_be_healthy(seed: int) -> None:
+    wear = trend_of(life(30, wears=0.008, since=12.0, seed=seed), healthy=12).wear
+    assert wear is not None and wear.onset is not None
+    assert 12.0 <= wear.onset.low <= wear.onset.value <= wear.onset.high
+
+
+@pytest.mark.parametrize("days", [2, 5])
+def test_a_machine_whose_recordings_are_all_healthy_has_a_bound(days: int) -> None:
+    wear = trend_of(life(days), healthy=5).wear
+    assert wear is not None and 0.0 < wear.bound < math.inf
+
+
 @pytest.mark.slow
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:
     points = [simulated.points[row] for row in simulated.rows]

@@ -265,8 +265,19 @@ def test_a_damaged_state_is_refused_in_one_line(damage: dict[str, Any]):
     assert "\n" not in str(raised.value)
 
 
+def test_the_largest_rate_that_is_allowed_holds_through_the_run():
+    with pytest.raises(InputError) as refused:
+        ss.watch("thesis", false_alarms_per_1000_h=1e9)
+    largest = float(str(refused.value).split(" to ")[1].split(",")[0])
+    watch = ss.watch("thesis", false_alarms_per_1000_h=largest, learn_hours=0.01)
+    watch.update(ss.simulate(command="3 sin(4t)", duration="2 min", seed=1))
+    assert watch.baseline is not None and watch.blocks > 30
+
+
 def test_wrong_settings_are_refused():
     with refusal("false_alarms_per_1000_h"):
         ss.watch("thesis", false_alarms_per_1000_h=1e-6)
+    with refusal("false_alarms_per_1000_h", "60000"):  # more than the test of the level can have
+        ss.watch("thesis", false_alarms_per_1000_h=6e4)
     with refusal("learn_hours"):
         ss.watch("thesis", learn_hours=0.0)

@@ -132,6 +132,17 @@ def test_another_duty_and_a_lost_machine_are_not_judged(learned: str):
     assert watch.leak is None
 
 
+def test_a_fit_lost_to_impossible_readings_begins_anew(learned: str):
+    watch, half = Watch.from_state(json.loads(learned)), part(500, 610)
+    is_wrong = (half.t >= 506.0) & (half.t < 512.0)
+    wrong = {name: np.where(is_wrong, 1e20 * np.sin(2.0 * half.t), half[name]) for name in ("u",)}
+    _, estimates = run(Recording(half.t, {**half.channels, **wrong}, half.units, half.rate), 5_000, watch)
+    assert "not described by the model" in {estimate.status for estimate in estimates}
+    _, later = run(moved(part(510, 610), 100.0), 5_000, watch)
+    assert later[-1].status == "watched"
+    assert watch.leak is None
+
+
 def test_the_motion_is_the_pumps_flow(learned: str):
     """Of which a bound is a fraction; in volts any bound would have been small beside it."""
     rig = ss.load_rig("thesis")

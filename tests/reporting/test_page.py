@@ -224,6 +224,12 @@ def test_the_drawing_is_the_machines_own(recording):
     assert (unknown.cylinder, unknown.throttles) == ("cylinder", False)
 
 
+@pytest.mark.parametrize("ratio", [0.89, 0.9, 0.91, 0.93, 0.96])
+def test_a_single_rod_is_drawn_where_the_rig_has_one(recording, ratio):
+    rig = load_rig("thesis").with_overrides({"cylinder.A_B": ratio * 633e-6, "makeup.check_valves": "present"})
+    assert (build_circuit(rig, recording).cylinder == "single-rod cylinder") == rig.cylinder.single_rod
+
+
 def test_a_servo_valve_is_drawn_between_supply_and_return(recording):
     drawing = build_circuit(load_rig("servo-valve"), recording)
     text = Reader(schematic(recording, _judged(), drawing)).text

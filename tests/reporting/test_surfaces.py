@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from dataclasses import replace
 from importlib import resources
 
 import numpy as np
@@ -147,6 +149,7 @@ def test_the_repair_limit_counts_from_the_healthy_level(make_diagnosis):
     )
     limit = leaking.limit_lpm
     assert leaking.repair_lpm == pytest.approx(limit + 0.05)
+    assert replace(leaking, onset_s=math.nan).repair_lpm == leaking.repair_lpm  # an unknown onset is none
     healthy = make_diagnosis(machine=MACHINE, course=course, verdict="no leak", **NOTHING)
     assert healthy.repair_lpm == pytest.approx(limit + 1.15)
 

@@ -52,6 +52,15 @@ def test_the_oil_is_taken_out_where_every_recording_states_it() -> None:
         assert f"The oil's temperature is {words}." in text
 
 
+def test_relative_levels_name_the_recordings_they_are_relative_to() -> None:
+    days = [replace(own, states_flow=False) for own in life(6)]
+    for healthy, reference in ((1, "of the first;"), (4, "of the mean of the first 4;")):
+        trend = trend_of(days, healthy=healthy)
+        mean = np.mean([point.value for point in trend.points[:healthy]])
+        assert mean == pytest.approx(100.0)
+        assert reference in figures(trend)["healthy"]
+
+
 @pytest.mark.parametrize("left_out", [0, 10])
 def test_the_limit_is_reached_on_the_same_date_in_words_and_in_json(left_out: int) -> None:
     """The time until then counts from the last recording that is compared, whether or not others follow it."""

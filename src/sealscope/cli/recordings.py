@@ -351,7 +351,7 @@ def inspect(
             continue
         opt.say(overview_text(str(file), recording, find_defects(recording)))
         if columns is None:
-            columns = _resolve_map(stated.channel_map, file, recording)
+            columns = _resolve_map(stated.channel_map, files if join else [file], recording)
     if not is_complete:
         raise Exit(1)
     if save_map and rig is not None:
@@ -362,18 +362,18 @@ def inspect(
         opt.say(f"map saved in {rig}: later calls with --rig {rig} use it")
 
 
-def _resolve_map(channel_map: ChannelMap, file: Path, recording: Recording) -> dict[str, str]:
+def _resolve_map(channel_map: ChannelMap, files: Sequence[Path], recording: Recording) -> dict[str, str]:
     """Return the column of each channel in `channel_map`; `auto` is replaced by the columns that it found by name.
 
-    `recording`: read from `file` by this map. With `auto` the result is empty if the file was converted from another
-    one, whose columns the recording states.
+    `recording`: read by this map from one file, or joined from several. With `auto` the result is empty if it was
+    converted from another file: it then states that file's columns, and its own have the channels' names.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 
     stated_columns = explicit_columns(channel_map)
     if not uses_names(channel_map):
         return stated_columns
-    if recording.provenance.get("file") != file.name:
+    if recording.provenance.get("file") not in [file.name for file in files]:  # a joined one states its earliest file
         return {}
     return {**reconstruct_map(recording.provenance), **stated_columns}
 

@@ -13,6 +13,7 @@ from sealscope.compiled import entry, make_record, record_dtype, record_view
 from sealscope.control.controller import CompiledLaw, Measured, Started, measured_at
 from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, drive_of, drive_voltage
 from sealscope.control.position import FOLLOWING, PositionPI, following_voltage
+from sealscope.physics.friction import coulomb_friction
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -96,12 +97,13 @@ class Flatness:
     def from_rig(cls, rig: Rig) -> Self:
         """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
+        pressure, of_difference = drive.mean_pressure(rig), friction.coulomb_pressure == "difference"
         max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
         return cls(
             feedback=PositionPI.from_rig(rig),
             drive=drive,
             M=cylinder.M_eq,
-            F_C=friction.F_pr + 2.0 * friction.F_cfr * drive.mean_pressure(rig),  # with p_A = p_B
+            F_C=coulomb_friction(pressure, pressure, friction.F_pr, friction.F_cfr, of_difference),  # with p_A = p_B
             F_v=friction.F_v,
             v_th=friction.v_th,
             # behind a valve the pump's leakage does not connect the chambers

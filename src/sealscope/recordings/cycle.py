@@ -22,8 +22,8 @@ _EQUAL_PEAKS = 0.05
 def find_cycle(recording: Recording) -> float | None:
     """Find the period [s] of the duty cycle, after which the machine's motion repeats; None if nothing repeats.
 
-    The period is estimated from the command u if this moves, else from p_A - p_B or the only chamber pressure. Also
-    None if the recording has none of these channels. The result is cached with the recording.
+    The period is estimated from the command u if this moves and lacks no sample, else from p_A - p_B or the only
+    chamber pressure. Also None if the recording has none of these channels. The result is cached with the recording.
     """
     names = ("u",) if "u" in recording and is_moving(recording["u"]) else chambers_of(recording)
     if not names:

@@ -357,7 +357,8 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         estimates_flow = any(method.usable for method in diagnosis.methods if method.detector in ORDER)
         steps = [say("next.cause"), say("next.record")]
         if not estimates_flow and any(method.usable for method in diagnosis.methods):
-            steps.reverse()  # a channel is missing: first of all it must be recorded
+            # samples that serve a method with fewer needs most likely lack a channel, which must be recorded first
+            steps.reverse()
         if diagnosis.unused and not estimates_flow:
             steps.insert(0, say("next.map"))
     # a baseline that was left out, such as the recording itself, is no defect of the data
@@ -369,6 +370,7 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         if has_named_cause or diagnosis.verdict == "leak":
             steps.insert(0, say("next.rule_out", faults=faults))
         elif diagnosis.verdict == "cannot tell":
+            # the first step, the only one in the short text, can settle the verdict; a finding may not be its reason
             steps.insert(1, say("next.findings", faults=faults))
         else:
             steps.insert(0, say("next.care", faults=faults))

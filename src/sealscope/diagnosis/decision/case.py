@@ -82,7 +82,7 @@ class Case:
 
     @property
     def rarest_chance(self) -> float:
-        """Probability that a healthy recording shows an observable with a p-value as low as the lowest one here.
+        """Probability of p-values down to the lowest one here among the observables of a healthy recording.
 
         It is the smallest calibrated p-value times the number of tests (Bonferroni correction). Observables with the
         same distribution in healthy recordings (`null_key`) count as one test.

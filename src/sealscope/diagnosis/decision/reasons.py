@@ -42,9 +42,9 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
     """Compose the reason of a verdict in words.
 
     For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
-    upper `bound` of an undetected leak [m^3/s], and the cause of a change. This is the event `other` or, if that is
-    None and there is an alarm against which other causes are weighed, the most probable of these. Remarks on the
-    measured leakage follow.
+    upper `bound` of an undetected leak [m^3/s] or, if leakage is not measured, that of a change of the ringing
+    (`_bound_text`). The cause of a change follows: the event `other` or, if that is None and there is an alarm against
+    which other causes are weighed, the most probable of these. Remarks on the measured leakage come last.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)

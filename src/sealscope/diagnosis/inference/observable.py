@@ -145,9 +145,10 @@ class DatedTest(RiseTest, Protocol):
         """Return the most likely onset of the leak [s] with its 95 % interval."""
 
     def detectable_step(self, chance: float) -> float:
-        """Return the smallest increase of the leak's conductance [m^3/(s Pa)] that is detected with a high probability.
+        """Return the smallest increase of the leak's conductance [m^3/(s Pa)] that is detected with 90 % probability.
 
         `chance`: probability that the test finds an increase where there is none; it sets the threshold of the score.
+        The result is infinite if it is unknown.
         """
 
 

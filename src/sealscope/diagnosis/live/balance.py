@@ -327,8 +327,10 @@ class LiveBalance(SavedAttributes):
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
         """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.
 
-        The result is None if the stored blocks do not reach from the onset of the leakage's increase, `onset` [s], to
-        `end`, and empty if there are too few blocks.
+        A block is used if its first equation is at most half a stride before `since`. The result is None unless the
+        equations of the stored blocks begin by the onset of the leakage's increase, `onset` [s], and the samples of the
+        last block, which extend half a stride beyond its last equation, end within half a stride of `end`. It is empty
+        if too few blocks are used.
         """
         stored = self._stored
         if stored is None:

@@ -6,7 +6,7 @@ from sealscope.storage.toml_file import PriorTable, read_priors
 class WalkPriors(PriorTable):
     """Random walk of the logarithm of the RMS within a recording and between recordings."""
 
-    # half-Cauchy scales of its change in the time `time`
+    # half-Cauchy scales of its change in the time `time` [1 in 90 s]
     machine: float  # of the machine's ringing
     noise: float  # of the noise
     duty: float  # of the ringing in a duty that does not repeat

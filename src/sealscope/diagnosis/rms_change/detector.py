@@ -136,21 +136,23 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    Only recordings in `baseline` with the same chamber pressures and sampling rate are used, in which the pressures
-    that are judged here are not clipped. If there are none, the report only says so.
+    The pressures that are not mostly clipped are judged; if all are, all count (`judged_chambers`). Only recordings in
+    `baseline` with the same chamber pressures and sampling rate are used, in which none of the judged pressures is
+    mostly clipped, by the same rule. If there are none, the report only says so.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, which must therefore be the same; older summaries lack `recorded`
-    summaries = [
+    comparable = [
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
         if (summary.get("recorded") or summary["chambers"]) == recorded
-        and set(chambers) <= set(summary["chambers"])
         and abs(summary["rate"] / recording.rate - 1.0) < 1e-3  # error of clocks
     ]
+    summaries = [summary for summary in comparable if set(chambers) <= set(summary["chambers"])]
     if not summaries:
-        lack = f"no baseline recording has the same chambers at {recording.rate:g} Hz"
-        return Observed(RmsChange.name, lack=lack)
+        kind = f"the same chambers at {recording.rate:g} Hz"
+        clipped = f"{' or '.join(chambers)} is mostly clipped in every baseline recording with {kind}"
+        return Observed(RmsChange.name, lack=clipped if comparable else f"no baseline recording has {kind}")
     judged = RmsChange().learn(recording)
     observables, bound = compare_summaries(judged, summaries, chambers)
     is_dated = None not in [summary.get("start_s") for summary in (judged, *summaries)]

@@ -133,8 +133,9 @@ class Diagnosis(Evidence):
         """Repair limit [L/min] to draw in the plot of the leak over time (`course`); None without a plot.
 
         If the plot shows the leak alone, this is `limit_lpm`. If it shows the total leakage, that of the healthy
-        machine is added: the median of the plotted flow before the onset or, without an onset, over the recording. From
-        the latter a detected leak is subtracted, as it was open from the start. Also None if one of these is unknown.
+        machine is added: the median of the plotted flow before the onset or, without a finite onset, over the
+        recording. From the latter a detected leak is subtracted, as it was open from the start. Also None if one of
+        these is unknown.
         """
         course, limit = self.course, self.limit_lpm
         if course is None or limit is None:
@@ -147,7 +148,7 @@ class Diagnosis(Evidence):
         if not lpm_before.size:
             return None
         median_lpm = float(np.median(lpm_before))
-        if self.verdict == LEAK and self.onset_s is None:  # the leak was open from the first sample on
+        if self.verdict == LEAK and onset == math.inf:  # the leak was open from the first sample on
             return None if self.leak_lpm is None else limit + max(0.0, median_lpm - self.leak_lpm)
         return limit + median_lpm
 

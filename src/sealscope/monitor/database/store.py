@@ -93,8 +93,9 @@ class StoredRows:
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any], first_kept: int) -> None:
         """Add settings (JSON) and state of an actuator; drop its pending samples before the block `first_kept`.
 
-        The state includes the effect of all pending samples. Those from this running number on are kept, because they
-        belong to a recording that has not ended.
+        `first_kept`: running number of the first block to keep. The state includes the effect of all pending samples;
+        those kept belong to a recording that has not ended. After a restart they are collected again for it, but not
+        judged again, as the state also has the number of the last block whose effect it includes (`n_stored`).
         """
         self.pending = [row for row in self.pending if row["actuator"] != actuator or row["number"] >= first_kept]
         self.first_kept[actuator] = first_kept

@@ -40,7 +40,8 @@ _MIN_POSITIONS = 10
 _GAPS = RECORDINGS.gaps
 #: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
-#: Samples on either side of a gap whose means set the offset of a copied cycle.
+#: Samples on either side of a gap whose means set the offset of a copied cycle. A cycle is compared only if so many
+#: samples beside the gap are in the recording, and so many in total are known; a spline needs more known values.
 _N_END = 8
 #: Largest rms difference of a copied cycle around the gap, relative to its rms about the mean.
 _MAX_MISMATCH = 0.4

@@ -1,4 +1,4 @@
-"""Chapter 3: Fourier, short-time Fourier and wavelet transforms of a signal (Figs. 3.2-3.4, eqs. 3.3-3.6)."""
+"""Chapter 3: Fourier, short-time Fourier and wavelet transforms of a signal (Figs. 3.2-3.4, eqs. 3.2-3.6)."""
 
 from __future__ import annotations
 
@@ -152,7 +152,7 @@ def two_tone_signal(t: Array) -> Array:
 
 
 def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz], by eq. (3.2)."""
+    """Compute the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz], from its DFT, eq. (3.2)."""
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     # 2: half of a cosine's amplitude is at its negative frequency; mean and Nyquist frequency have no such half
     spectrum[0] /= 2.0

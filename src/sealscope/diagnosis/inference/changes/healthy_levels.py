@@ -166,6 +166,10 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     not drift, and p-value and score of this explanation are
 
         chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
+
+    A score is the square of a z score. With equal errors of both drifts, z_A^2 + z_B^2 = z_mean^2 + z_difference^2, so
+    that what remains is the score of their mean; a p-value is about exp(-z^2 / 2). The size of "drift of both" is still
+    that of the difference.
     """
     judged_drifts = _read_drifts(judged)
     if judged_drifts is None:

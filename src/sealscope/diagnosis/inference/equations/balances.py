@@ -156,9 +156,11 @@ def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
     The volume A dx displaced by the piston equals the flow over the valve's edges, less compression and leakage. The
-    left side is -A dx, so that a leak from A to B has a positive coefficient in both balances. An overlap of the edges
-    (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B change its
-    sign with the direction of motion. Only the prior on a healthy piston separates a leak from an overlap.
+    left side is -A dx, so that a leak from A to B has a positive coefficient in both balances; a flow into A, which
+    moves the piston by dx > 0, is negative there (`flow_sign`). An overlap of the edges (dead band) reduces the flow in
+    both directions of motion. So does a leak, if friction makes p_A - p_B change its sign with the direction of motion.
+    Only the prior on a healthy piston separates a leak from an overlap. The leak counts only in motion; at rest a flow
+    over the valve's null takes its place, whose unknown sign is the same throughout (`_separate_at_rest`).
     """
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B

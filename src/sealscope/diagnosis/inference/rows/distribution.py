@@ -1,9 +1,10 @@
 """The distribution of p_A - p_B over a block, from which a sensor offset may be subtracted afterwards.
 
-Means over `SMOOTHED` seconds hide the ringing of a stiff circuit, but single samples contain noise. Therefore the
-samples' deviations from these means are reduced. If their variance within a stride of the weak form is v, they are
-multiplied by sqrt(max(v - s^2, 0) / v). The variance of white noise is s^2 = (mean square of the sixth differences of
-the samples) / 924, where 924 is the sum of the squared coefficients of such a difference.
+Means over pieces of `SMOOTHED` seconds hide the ringing of a stiff circuit, but single samples contain noise. Therefore
+the samples' deviations from these means are reduced. If their variance is v, estimated separately in each stride of the
+weak form from its pieces without a missing sample, they are multiplied by sqrt(max(v - s^2, 0) / v). The variance of
+white noise is s^2 = (mean square of the sixth differences of all samples) / 924, where 924 is the sum of the squared
+coefficients of such a difference.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
 
     The spread due to white noise is removed first (see the module). `pressure` (n,): samples [Pa] at the sampling
     `rate` [Hz], NaN where missing. They are used in pieces of `SMOOTHED` seconds, and only whole pieces within whole
-    strides of the weak form count. The means (PARTS,) are zeros if all samples are missing.
+    strides of the weak form count, without a missing sample; a shorter `pressure` is one stride. The means (PARTS,) are
+    zeros if no piece counts.
     """
     piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
     stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]
@@ -43,8 +45,10 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
         noise_gain = math.comb(2 * _ORDER, _ORDER)  # variance of a difference of white noise of variance 1
         # not by BLAS (@), whose rounding depends on the number of threads
         noise_variance = float((differences**2).sum()) / max(len(differences), 1) / noise_gain
-        variance = np.nansum(deviation**2, axis=(1, 2), keepdims=True) / (n_pieces * (piece - 1))  # one per stride
-        min_variance = max(noise_variance, np.finfo(float).tiny)
+        n_complete = np.isfinite(mean).sum(axis=1, keepdims=True)  # pieces without a missing sample in each stride
+        squares = np.nansum(deviation**2, axis=(1, 2), keepdims=True)
+        variance = squares / (np.maximum(n_complete, 1) * (piece - 1))
+        min_variance = max(noise_variance, np.finfo(float).tiny)  # a smaller variance is all noise: the factor is 0
         deviation *= np.sqrt(1.0 - noise_variance / np.maximum(variance, min_variance))
     values = (mean + deviation).ravel()
     values = np.sort(values[np.isfinite(values)])

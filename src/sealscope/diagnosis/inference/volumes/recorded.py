@@ -493,15 +493,16 @@ class RecordedBalance:
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)
-        has_flow_unit = source in METERS or (source, COUNTS) not in self.units  # the area scales a meter without unit
+        # the measured area scales even a meter in counts, but not an angle, a speed or a command in counts
+        is_flow_scalable = source in METERS or (source, COUNTS) not in self.units
         has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & self.units
-        states_displacement = rig.states("pump.q_b") and has_flow_unit and source not in METERS
+        states_displacement = rig.states("pump.q_b") and is_flow_scalable and source not in METERS
         states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
         if len(self.columns) > 1 or self.is_creep:  # behind a servo valve, or for a load that shut valves hold
             deviation = float(np.hypot(prior.area, prior.creep)) if self.is_creep else prior.area
             return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
         area = self._loaded_area if ("x", "m") in self.units else None
-        if area is None or not area.measured > 0.0 or not has_flow_unit:
+        if area is None or not area.measured > 0.0 or not is_flow_scalable:
             deviation = prior.meter if is_meter else prior.displacement
             return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
         if is_meter:

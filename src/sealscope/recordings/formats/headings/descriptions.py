@@ -23,8 +23,10 @@ _UNIT_WITH_QUANTITY = re.compile(r"([^()]{0,20})\([^()]{0,40}\)")
 def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -> list[Label]:
     """Replace the names of columns by the descriptions that a user has entered for them in the logger.
 
-    They are in a table of channels above the heading, or in a row of labels, whose first cell is `label` or `labels`.
-    `rows`: cells of all these lines. A description may state the unit. Replaced names are kept in `Label.called`.
+    They are in a table of channels above the heading, whose rows begin with the last word of a column's name, or in a
+    row of labels, in the order of the columns, with `label` or `labels` in place of the first. The first description of
+    a column counts; it may state the unit. `rows`: cells of all these lines. The last word of a replaced name is kept
+    in `Label.called`.
     """
     names: dict[str, str] = {}
     name_column: int | None = None

@@ -42,14 +42,18 @@ def is_json(head: bytes) -> bool:
     if not _BEGINS.match(text):
         return False
     first, newline, _ = text.partition("\n")
-    # an object, a line of opening brackets, or a first line longer than `head`
-    if text.startswith("{") or not first.strip("[ \t\r") or (not newline and len(head) >= SNIFF):
+    if (
+        text.startswith("{")  # an object
+        or not first.strip("[ \t\r")  # a line of opening brackets
+        or (not newline and len(head) >= SNIFF)  # a first line longer than `head`
+    ):
         return True
     first = first.strip().rstrip(",")
     try:
         json.loads(first)
     except json.JSONDecodeError as error:
-        # an array that goes on in the next line fails at its end, a remark such as `[2024-05-31 12:00] started` earlier
+        # an array that goes on in the next line fails at the end of this one, and one that breaks off in a number such
+        # as `2.` at its last character; a remark such as `[2024-05-31 12:00] started` fails earlier
         return error.pos >= len(first) - 1
     except (ValueError, RecursionError):
         return False
@@ -84,7 +88,8 @@ def read_json(path: Path, request: Request) -> RecordingFields:
 def _read_members(text: str, place: str) -> tuple[list[Any], bool]:
     """Read the complete values of a JSON text; also return whether the text breaks off within the next value.
 
-    Raises InputError for other damage. `place`: the file, for messages.
+    After a first complete value, an unterminated text and any damage in the last `_MAX_TRUNCATED` characters count as
+    breaking off. Raises InputError for other damage. `place`: the file, for messages.
     """
     members, is_cut = list[Any](), False
     try:

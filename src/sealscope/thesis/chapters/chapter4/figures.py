@@ -52,7 +52,7 @@ FIGURE_UNITS: dict[str, FigureUnit] = {
 }
 #: Gauge pressure [MPa] of a vacuum.
 _VACUUM = -1e-6 * P_ATM
-#: Curves with an rms difference below this fraction of their range coincide; one is then drawn as this many marks.
+#: Curves with an rms difference below this fraction of their range coincide; one is drawn as so many marks or more.
 _COINCIDENCE_FRACTION, _N_MARKS = 0.005, 80
 _CLOSING_ROLES: dict[float, Role] = {25.0: "25 %", 50.0: "50 %", 75.0: "75 %"}
 #: Line volumes V_1 = V_2 [cm^3] that are compared, and those of a quick reproduction.
@@ -103,7 +103,10 @@ def _line_curve(run: SimulatedRun, name: str, label: str, role: Role) -> FigureC
 
 
 def _mark_points(curve: FigureCurve) -> FigureCurve:
-    """Convert a line to about 80 marks, between which another curve with the same values stays visible."""
+    """Convert a line to 80 to 159 marks, between which another curve with the same values stays visible.
+
+    A line of fewer than 80 points gets a mark at each.
+    """
     step = max(1, curve.x.size // _N_MARKS)
     return replace(curve, x=curve.x[::step], y=curve.y[::step], label=f"{curve.label} (the same)", kind="points")
 

@@ -311,7 +311,10 @@ class HeldChambers:
         return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' deviations from this offset."""
+        """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' offsets, up to constants.
+
+        Of a hold's offset only the squared deviation from `offset` counts (`LockedHold.offset_in_hold`).
+        """
         return float(offset_cost(offset)) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
 
     def leaks_since(self, onset: float) -> Array | None:
