@@ -2,9 +2,10 @@
 
 Numba's ``cache=True`` stores the machine code of a function by the source of its own file only. After an edit to
 another file, with a function that it calls, it would silently return the old machine code. Here the name of the cache
-folder is a hash over the sources of all packages with compiled code, the versions of numba and Python, and the
-processor. It is in the user's cache folder, unless `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off.
-Compiled code is unpickled, which can run any command: only folders that no other user can write are used.
+folder is a hash over the sources of all packages with compiled code and of the modules from which these take constants,
+the versions of numba and Python, and the processor. It is in the user's cache folder, unless `SEALSCOPE_CACHE_DIR`
+moves it; an empty value turns caching off. Compiled code is unpickled, which can run any command: only folders that no
+other user can write are used.
 
 Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call.
 """
@@ -38,9 +39,10 @@ numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
 _MESSAGE_LIMITS = "monitor/sources/message_limits.py"
-#: Packages and modules with compiled code that is cached. That of `fmu` is compiled anew for each unit (`plain_code`).
+#: Packages and modules with compiled code that is cached, or from which it takes constants (`units`) or the order of a
+#: record's fields (`parameters`). The code of `fmu` is compiled anew for each unit (`plain_code`).
 _COMPILED_PACKAGES = (
-    *("compiled.py", "numba_pipeline.py", "numba_private.py"),
+    *("compiled.py", "numba_pipeline.py", "numba_private.py", "units.py", "units.toml", "parameters"),
     *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
 )
 #: Number of cache folders that are kept, those of the current sources and of the sources used before.
@@ -68,7 +70,7 @@ def _compiler() -> ModuleType:
 
 
 def source_hash(root: Path) -> str:
-    """Compute a hash, in hex digits, over the sources of all packages with compiled code in the folder `root`."""
+    """Compute a hash, in hex digits, over the sources in the folder `root` that compiled code depends on."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
         files = [root / package]

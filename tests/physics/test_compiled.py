@@ -210,6 +210,14 @@ def test_the_hash_follows_every_source_of_a_compiled_room(copy):
     assert len({before, added, source_hash(root)}) == 3
 
 
+@pytest.mark.parametrize("file", ["units.py", "units.toml", "parameters/rig.py"])
+def test_the_hash_follows_what_compiled_code_takes_from_elsewhere(copy, file):
+    """The atmosphere's pressure, and the order of a rig's numbers in the records of the laws."""
+    source = copy / "sealscope" / file
+    source.write_text(source.read_text(encoding="utf-8") + "# edited\n", encoding="utf-8")
+    assert source_hash(copy / "sealscope") != source_hash(PACKAGE)
+
+
 def test_numba_s_own_setting_is_left_as_it_was():
     from sealscope.compiled import kernel
 

@@ -99,14 +99,27 @@ def test_the_work_of_the_pressures_is_in_piston_friction_and_load(check_rig, dri
     assert np.abs(x).max() > 1e-3
 
 
+@pytest.mark.parametrize("force", ["500 N", "500 N sin(2t + 1)"])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_a_load_is_a_sum_in_any_order(force, sign):
+    t, spring = np.linspace(0.0, 3.0, 7), "20 N/mm over x"
+    alone = parse_force(force)
+    first = parse_force(f"{'' if sign > 0 else '-'}{force} + {spring}")
+    last = parse_force(f"{spring} {'+' if sign > 0 else '-'} {force}")
+    assert first.over_x == last.over_x == parse_force(spring).over_x
+    for load in (first, last):
+        np.testing.assert_allclose(load.value_at(t), sign * alone.value_at(t))
+
+
 def test_words_and_tables_that_cannot_be(tmp_path):
     force = parse_force("500 N sin(2t) + 100 N - 20 N/m over x from -1 cm + 2 kN s/m over v")
     assert (force.over_x, force.over_v) == (((0.0, 0.0), (-0.01, -20.0)), ((0.0, 2000.0),))
     assert force.value_at(np.array([0.0])) == 100.0
     falling = parse_force(table(tmp_path / "v.csv", "v [mm/s],F [N]", (10, 5.0), (0, 1.0)))
     assert falling.over_v == ((1.0, 0.0), (0.0, 400.0), (0.01, -400.0))
-    with refusal("load"):
-        parse_force("20 N/mm over y")
+    for text in ("20 N/mm over y", "500 N + 20 N/mm over x +", "20 N/mm over x +", "20 N/mm over x + 500 N -"):
+        with refusal("load"):
+            parse_force(text)
     with refusal("200", "2"):
         parse_force(table(tmp_path / "x.csv", "x [mm],F [N]", (1, 5.0), (1, 7.0)))
     with refusal("F", "x"):

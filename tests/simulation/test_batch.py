@@ -148,6 +148,21 @@ def test_a_fault_of_the_machine_comes_in_when_it_does_by_itself(rms_of):
     assert np.abs(result[0, 1] / result[0, 0] - 1.0).max() > 0.05
 
 
+@pytest.mark.parametrize("onset", ["from 5 s", "growing from 4 s to 5 s"])
+def test_a_fault_that_needs_a_shorter_step_gets_it_as_by_itself(onset):
+    """It begins after the seconds of the run in which the step is sought."""
+    one = Experiment.of(fault=f"friction x10 {onset}", set={"p_charge": "1 MPa"}, duration=6.0)
+    assert simulate_batch([one]).steps[0] == simulate_experiment(one).recording.provenance["solver"]["step_s"] < 5e-4
+    for simulate in (simulate_experiment, lambda experiment: simulate_batch([experiment])):
+        with refusal("step", "0.0005 s", error=SimulationFailed):
+            simulate(replace(one, step=5e-4))
+
+
+def test_a_fault_that_has_hardly_begun_needs_no_shorter_step():
+    one = Experiment.of(fault="friction x10 growing from 5 s to 200 s", set={"p_charge": "1 MPa"}, duration=6.0)
+    assert simulate_batch([replace(one, step=5e-4)]).steps[0] == 5e-4
+
+
 @pytest.mark.slow
 def test_valves_in_the_lines_move_as_they_do_by_themselves(check_rig, rms_of):
     rig = check_rig(True, volumes="position", p_charge="2 MPa", G_circ=2e-10, **QUIET)

@@ -14,6 +14,8 @@ from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.simulate import (
+    Difference,
+    Proof,
     compare_trajectories,
     prove,
     simulate,
@@ -148,6 +150,14 @@ def test_an_under_resolved_run_is_refused_and_says_what_moved():
     proof = prove(Experiment.of(**coarse, allow_unresolved=True))
     assert not proof.resolved
     assert not proof.worst().resolved
+
+
+def test_what_must_not_move_at_all_is_the_worst_that_moves():
+    steady, still = Difference("p_A", 5.0, "Pa", 10.0), Difference("d1", 1e-3, "Pa", 0.0)
+    for rows in ((steady, still), (still,)):
+        proof = Proof("rk4", 1e-3, 5e-4, rows)
+        assert not proof.resolved
+        assert proof.worst() is still
 
 
 def test_a_chattering_run_cannot_prove_itself():

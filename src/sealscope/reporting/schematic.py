@@ -21,8 +21,8 @@ _VALUES = {
     "closed_A": ("line.closed_A", "%", 1e-2),
     "closed_B": ("line.closed_B", "%", 1e-2),
 }
-#: A cylinder is drawn as double-rod if the smaller area is more than this fraction of the larger one.
-_MIN_DOUBLE_ROD_RATIO = 0.95
+#: Smallest ratio of the areas of a double-rod cylinder: they differ by 10 % of their mean, as in `Cylinder.single_rod`.
+_MIN_DOUBLE_ROD_RATIO = 0.95 / 1.05
 #: Height of the cylinder's bore in the drawing, and of a rod of unknown diameter.
 _BORE, _ROD = 78.0, 18.0
 
@@ -78,7 +78,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     sqrt(1 - smaller/larger area), but at most 0.8. That of a double-rod cylinder is unknown: it is drawn as `_ROD`.
     """
     ratio = min(areas) / max(areas)
-    if ratio > _MIN_DOUBLE_ROD_RATIO:
+    if ratio >= _MIN_DOUBLE_ROD_RATIO:
         return "double-rod cylinder", "AB", _ROD
     rod = round(min(0.8, sqrt(1.0 - ratio)) * _BORE, 1)  # at most 0.8 of the bore, so that both remain visible
     return "single-rod cylinder", "A" if areas[0] <= areas[1] else "B", rod

@@ -126,17 +126,17 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     return np.unique(np.rint(np.r_[part_starts, n_out]).astype(np.int64))
 
 
-def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers) -> tuple[RigNumbers, ...]:
-    """Collect the sets of model parameters in a run for which the length of the solver's step is checked.
+def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers, duration: float) -> tuple[RigNumbers, ...]:
+    """Collect the sets of model parameters in a run of `duration` [s] for which the solver's step is checked.
 
-    The first is `base`, without effects. The others are those just before and just after each breakpoint of a fast
-    effect, such as a valve that switches (`min_block` below `SHORTEST_BLOCK`). All other effects, drifts and most
-    faults, are left out.
+    The first is `base`, without effects. The others are those just before and just after each breakpoint of a fault,
+    between which its effects rise or fall, and at the end of the run if a breakpoint is later. Effects without
+    breakpoints, such as smooth drifts, are left out.
     """
-    fast_effects = [effect for effect in effects if effect.min_block < SHORTEST_BLOCK]
-    times = np.array(sorted({t for effect in fast_effects for t in effect.breakpoints if math.isfinite(t)}))
-    before_and_after = np.concatenate([times - 1e-9, times + 1e-9])  # a nanosecond from each switch
-    values = changing_values(fast_effects, base, before_and_after) if times.size else {}
+    faults = [effect for effect in effects if effect.breakpoints]
+    times = np.array(sorted({min(t, duration) for effect in faults for t in effect.breakpoints}))
+    before_and_after = np.concatenate([times - 1e-9, times + 1e-9])  # a nanosecond from each
+    values = changing_values(faults, base, before_and_after) if times.size else {}
     if not values:
         return (base,)
     distinct_rows = np.unique(np.array(list(values.values())).T, axis=0)  # a row has the changing parameters at a time

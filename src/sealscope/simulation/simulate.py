@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -104,9 +105,9 @@ class Proof:
         return "\n".join(lines)
 
     def worst(self) -> Difference:
-        """Find the quantity with the largest difference relative to its tolerance, among those with a tolerance > 0."""
-        limited = [row for row in self.differences if row.tolerance]
-        return max(limited, key=lambda row: row.difference / (row.tolerance or math.inf))  # `or`: for the type checker
+        """Find the quantity with the largest difference relative to its tolerance, among those with a tolerance."""
+        limited = [row for row in self.differences if row.tolerance is not None]
+        return max(limited, key=lambda row: row.difference / (row.tolerance or sys.float_info.min))  # `or`: it may be 0
 
 
 @dataclass(frozen=True)

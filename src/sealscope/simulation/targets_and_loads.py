@@ -132,7 +132,8 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
         example = f"step 100 {next(iter(units))}"
         raise InputError(f"{what} must have its unit ({', '.join(units)}), such as '{example}', got {text!r}")
     in_si = number_with_unit.sub(lambda match: repr(float(match[1]) * units[match[2]]), text)
-    if re.fullmatch(NUMBER, in_si.strip()):
+    in_si = re.sub(r"^-\s+", "-", in_si.strip())  # a number may have blanks after its sign
+    if re.fullmatch(NUMBER, in_si):
         return Sine(amplitude=0.0, omega=0.0, offset=float(in_si))  # a constant
     try:
         return parse_command(in_si)
@@ -229,8 +230,7 @@ def parse_force(text: str) -> Force:
     over_x, signal = _extract_terms(normalized, "x")
     over_v, signal = _extract_terms(signal, "v")
     if over_x or over_v:
-        # the plus that joined the signal to a term before it, and a plus at the end of the text, which joins nothing
-        signal = re.sub(r"^\s*\+|[+]\s*$", "", signal).strip()
+        signal = re.sub(r"^\+(?=.)", "", signal.strip())  # the plus that joined the signal to a term before it
         if not signal:
             return Force(_NO_FORCE, normalized, over_x, over_v)
     return Force(_parse_signal(signal, _FORCES, "load"), normalized, over_x, over_v)

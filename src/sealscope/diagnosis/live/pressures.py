@@ -86,15 +86,15 @@ class PressureEstimator(SavedAttributes):
     @property
     def has_begun(self) -> bool:
         """True once the machine has moved long enough for its response to be fitted."""
-        return self._follower is not None
+        return self._follower is not None or self._rows.size > 0  # the fit may be lost
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block that they complete.
 
-        Before the first block, the model is fitted to `response.begins` (`priors.toml`) seconds of samples. If these
-        cannot be used, the reason is yielded, and the fit is tried again with their second half and as many new
-        samples. Samples before a gap that do not fill a block are dropped. A block is processed only when its result is
-        asked for.
+        Before the first block, and after a block that leaves no finite parameters, the model is fitted to
+        `response.begins` (`priors.toml`) seconds of samples. If these cannot be used, the reason is yielded, and the
+        fit is tried again with their second half and as many new samples. Samples before a gap that do not fill a block
+        are dropped. A block is processed only when its result is asked for.
         """
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
@@ -163,13 +163,16 @@ class PressureEstimator(SavedAttributes):
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
         """Report a block that the model of the pressures does not describe, and restart the fit if it is lost.
 
-        It is lost after `response.lost` (`priors.toml`) such blocks in succession, or if a parameter is not finite.
+        It is lost after `response.lost` (`priors.toml`) such blocks in succession, or if a parameter is not finite. In
+        the latter case nothing of it can be kept: the next samples are fitted as the first ones were (`take`).
         `end`: end of the block [s]; `is_settling`: True if the fit had not settled before this block; `restarts`: True
         if this block cannot be compared with earlier ones.
         """
         self._misfits += 1
-        if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
+        is_finite = np.isfinite(follower.theta).all()
+        if self._misfits >= _PRIORS.lost or not is_finite:
             follower.interrupt(math.inf)
+            self._follower = follower if is_finite else None
             self._misfits, self._settling = 0, _SETTLING
             return NotJudged.with_count(end, "not described by the model", restarts=True)
         self._settling = self._settling if is_settling else _RESUMING

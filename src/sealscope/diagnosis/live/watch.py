@@ -61,6 +61,26 @@ Estimator = LiveBalance | PressureEstimator
 _ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBalance, PressureEstimator)}
 
 
+def _rate_of_certain_alarms(test: str, seconds: float) -> float:
+    """Compute the rate of false alarms [per 1000 h] at which a test made once in `seconds` always raises one.
+
+    The `test`, `STEP` or `LEVEL`, has a fixed part of all false alarms (`priors.toml`).
+    """
+    return float(1000.0 / getattr(_PRIORS, test) * 3600.0 / seconds)
+
+
+def _check_false_alarm_rate(rate: float) -> None:
+    """Raise InputError unless each test, in each way of watching, has a false-alarm probability of 1e-12 to 0.05."""
+    rates = [
+        _rate_of_certain_alarms(test, blocks * kind.block_seconds)
+        for kind in _ESTIMATORS.values()
+        for test, blocks in ((STEP, 1), (LEVEL, GROUP))
+    ]
+    min_rate, max_rate = 1e-12 * max(rates), 0.05 * min(rates)
+    if not min_rate <= rate <= max_rate:
+        raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.5g}, got {rate:g}")
+
+
 class Watch:
     """Watch one running actuator for leaks; created by the function `watch`, with a state that can be saved.
 
@@ -106,8 +126,8 @@ class Watch:
         litres: Mapping[str, bool] | None = None,
         healthy: HealthyLevel | None = None,
     ) -> None:
+        _check_false_alarm_rate(false_alarms_per_1000_h)
         self.false_alarms_per_1000_h, self.learn_hours = false_alarms_per_1000_h, learn_hours
-        self._false_alarm_probability(STEP, LiveBalance.block_seconds)  # raises InputError for an impossible rate
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig, self.healthy = rig, healthy
@@ -126,17 +146,8 @@ class Watch:
         self._since = math.nan  # beginning of the first block since the tests restarted [s]
 
     def _false_alarm_probability(self, test: str, seconds: float) -> float:
-        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`.
-
-        It is `seconds` times the test's part of the false-alarm rate. Raises InputError unless it is 1e-12 to 0.05.
-        """
-        rate: float = self.false_alarms_per_1000_h
-        fraction_of_alarms = getattr(_PRIORS, test)
-        rate_per_probability: float = 1000.0 / fraction_of_alarms * 3600.0 / seconds  # rate at a probability of 1
-        min_rate, max_rate = 1e-12 * rate_per_probability, 0.05 * rate_per_probability  # supported probabilities
-        if not min_rate <= rate <= max_rate:
-            raise InputError(f"false_alarms_per_1000_h must be {min_rate:.2g} to {max_rate:.3g}, got {rate:g}")
-        return rate / rate_per_probability
+        """Compute the false-alarm probability of a test, `STEP` or `LEVEL`, that is made once in `seconds`."""
+        return self.false_alarms_per_1000_h / _rate_of_certain_alarms(test, seconds)
 
     @cached_property
     def _rig_text(self) -> str:

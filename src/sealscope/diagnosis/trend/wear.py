@@ -419,14 +419,14 @@ def _interval_of_draws(draws: Array) -> Interval:
     return Interval(float(median), float(low), float(high))
 
 
-def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int | None) -> Wear:
+def estimate_wear(levels: Levels, n_healthy: int, allowed_rise: float | None, change_begin: int | None) -> Wear:
     """Estimate leakage level, growth and time to the repair limit after the last recording.
 
-    `allowed_rise` is the rise above the healthy level at which a repair is due, None if there is no limit.
-    `change_begin` is the index of the first recording after the change that the test has found. If it is None, an even
-    growth or decrease over all recordings is estimated, with a wide prior. If the recordings span less than a day,
-    growth and time are NaN with unlimited intervals. For a single recording the rise (`leak`) is 0 with an infinite
-    interval.
+    A change begins after the first `n_healthy` recordings, or with the last one if all are healthy. `allowed_rise` is
+    the rise above the healthy level at which a repair is due, None if there is no limit. `change_begin` is the index of
+    the first recording after the change that the test has found. If it is None, an even growth or decrease over all
+    recordings is estimated, with a wide prior. If the recordings span less than a day, growth and time are NaN with
+    unlimited intervals. For a single recording the rise (`leak`) is 0 with an infinite interval.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -434,12 +434,13 @@ def estimate_wear(levels: Levels, allowed_rise: float | None, change_begin: int 
     months = (levels.t - levels.t[0]) / DAYS_PER_MONTH if is_long else np.zeros(len(levels))
     # prior scale: 100 times the scatter in each interval
     even_growth = _Changes.from_profile(months, _WIDE * DAYS_PER_MONTH / levels.interval)
-    changes = _Changes.enumerate(levels, 1) if is_changed else even_growth
+    n_healthy = min(n_healthy, len(levels) - 1)
+    changes = _Changes.enumerate(levels, n_healthy) if is_changed else even_growth
     draws = _Draws.sample(levels, changes, signed=not is_changed)
     leak, leak_upper_95 = Interval(0.0, -math.inf, math.inf), math.inf
     if len(levels) > 1:
         # a leak is bounded by the rise that the levels allow, even if the test has found no change
-        rises = changes if is_changed else _Changes.enumerate(levels, 1)
+        rises = changes if is_changed else _Changes.enumerate(levels, n_healthy)
         leak_draws = (draws if is_changed else _Draws.sample(levels, rises)).last_rises(rises)
         leak, leak_upper_95 = _interval_of_draws(leak_draws), float(np.quantile(leak_draws, BOUND_PROBABILITY))
     current_level = draws.mean_before + draws.last_rises(changes)
@@ -517,7 +518,7 @@ def find_episodes(
         if alarm is not None and alarm >= end:  # an alarm after the repair belongs to the next episode
             alarm = None
         change_begin = None if alarm is None else int(rise.begin[end - 1])  # by all recordings of the period
-        wear = estimate_wear(remaining.select(slice(0, end)), allowed_rise, change_begin)
+        wear = estimate_wear(remaining.select(slice(0, end)), n_healthy, allowed_rise, change_begin)
         alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
         # `log_R`: logarithm of the mean time [days] until a healthy machine scores as high; each period but the first
         # begins with a repair, a fall of the level

@@ -111,7 +111,8 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
     flow_sum = flow_sum + abs(piston_leakage(p_A - p_B, leak[4] * opening, leak[5] * opening, q.dp_0))
     min_pressure = min(min_pressure, p_A)
     min_pressure = min(min_pressure, p_B)
-    if len(q.throttled) > 0:  # rigs with lines; else p_1 and p_2 are p_A and p_B, or those of a supply, not checked
+    # else p_1 and p_2 are p_A and p_B, or those of a supply, which falls no lower than the chamber into which it flows
+    if len(q.throttled) > 0:  # rigs with lines
         min_pressure = min(min_pressure, p_1)
         min_pressure = min(min_pressure, p_2)
     state_sum = z[0] + z[1] + z[2] + z[3] + z[4] + z[5] + z[6] + z[7] + z[8] + z[9] + z[10] + z[11] + z[12] + z[13]

@@ -99,7 +99,10 @@ def figures(trend: Trend) -> dict[str, str]:
     at_pressure = "" if trend.pressure is None else f" at {number(trend.pressure / BAR, 2)} bar"
     # without a rig, leakage is in % of the healthy recordings' mean, by default that of the first recording alone;
     # ringing is always in % above this mean, with or without a rig
-    reference = " of the first; no rig was stated" if trend.unit == "%" and trend.basis != "ringing" else ""
+    reference = ""
+    if trend.unit == "%" and trend.basis != "ringing":
+        healthy_mean = "the first" if trend.healthy == 1 else f"the mean of the first {trend.healthy}"
+        reference = f" of {healthy_mean}; no rig was stated"
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high
     remark = "95 of 100 recordings" if is_whole else "cut off at the limit; some healthy recordings lie above"

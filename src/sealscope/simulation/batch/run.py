@@ -55,8 +55,8 @@ class Member:
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The model's parameters without changes and at each fast change, which limit the solver's step."""
-        return step_limiting_parameters(self.effects, self.numbers)
+        """The model's parameters without changes and at each fault, which limit the solver's step."""
+        return step_limiting_parameters(self.effects, self.numbers, self.experiment.duration)
 
 
 @dataclass(frozen=True)
