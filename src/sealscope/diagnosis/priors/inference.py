@@ -99,6 +99,7 @@ class SizePriors(PriorTable):
     laminar: float  # prior probability of a laminar leak
     usual: float  # scale of the prior on the flow of a leak, over the pump's flow
     present: float  # prior probability that there is a leak in a recording
+    within: float  # prior probability that a leak began within the recording, not before
     readings: int  # number of independent residuals by which a recording tells the leak's law
     meter: float  # scale of a flow meter
     area: float  # piston area

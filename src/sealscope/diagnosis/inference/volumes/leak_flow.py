@@ -213,16 +213,16 @@ def fit_rise(
     - The rise r, with the standard deviation d, measures f s, where f is the sum of the weights times c_k.
 
     N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
-    and p = `size.present` the prior probability of a leak. The weights of the hypotheses, up to a common factor, are as
-    follows; those of leaks are also multiplied by the probability that the flow is positive, and by the priors of law,
-    growth and onset.
+    p = `size.present` the prior probability of a leak, and q = `size.within` that of its onset within the recording,
+    each onset being as probable. The weights of the hypotheses, up to a common factor and those of law and growth, are
+    as follows, without the factor 2 of the half-normal density; those of leaks are also multiplied by the probability
+    that the flow is positive.
 
-        leak within the recording: exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
-        older leak:                N(r; d^2 + R^2),
-        no leak:                   N(r; d^2) (1 - p) / p.
+        leak within the recording: q exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+        older leak:                (1 - q) N(r; d^2 + R^2),
+        no leak:                   N(r; d^2) (1 - p) / (2 p).
 
-    The flow of an older leak follows from the rise alone. All onsets together are as probable beforehand as an older
-    leak: each has p / 2, and this half cancels the factor 2 of the half-normal density. With the small probability 2
+    The flow of an older leak follows from the rise alone. Without a step test q is 0. With the small probability 2
     `scatter.tail` the rise is no evidence, as the recording is like none that the healthy ones predict. Its density is
     then 1 / R, and only s'' and e'' give the flow.
     """
@@ -234,11 +234,12 @@ def fit_rise(
     usual_rises = usual_flow / unit_flows
     log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
     present: float = INFERENCE.size.present
+    within: float = INFERENCE.size.within
     # the hypothesis of no leak gets the sum of the laws' weights, which are not normalised
-    log_none = math.log((1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
+    log_none = math.log(0.5 * (1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
     log_none += float(normal_log_density(rise.value, rise.deviation**2))
-    if test is None:
-        log_none -= math.log(2.0)  # an older leak then has the whole probability p, instead of p / 2
+    if test is not None:
+        log_weights = log_weights + math.log(1.0 - within)
     flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
     # onsets: before the recording; parts: all of it; by_rise: true
     older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
@@ -249,7 +250,7 @@ def fit_rise(
         for step_fit in step_fits:
             usual_rise = float(usual_rises[step_fit.law])
             combined = _combine_with_rise(step_fit, rise, usual_flow, usual_rise, weights)
-            log_prior = law_log_weights[step_fit.law] - math.log(len(positions))
+            log_prior = law_log_weights[step_fit.law] + math.log(within / len(positions))
             for by_rise, (likelihoods, flows, deviations) in zip((True, False), combined, strict=True):
                 flags, log_weights = np.full(len(positions), by_rise), log_prior + likelihoods
                 fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
