@@ -53,7 +53,9 @@ class Unit(NamedTuple):
     def times(self, other: Unit, power: Fraction) -> Unit:
         """Multiply by `other` raised to a `power`; the product has no offset, such as that of degC.
 
-        Raises ValueError if the factor of the product is beyond the range of doubles.
+        Raises ValueError if the numerator or the denominator of the factor of the power or the product would have more
+        than `_MAX_BITS` bits, or the magnitude of the product's power of pi exceeds `_MAX_PI`. Both limits keep the
+        factor and the power of pi within the range of doubles.
         """
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MAX_BITS:  # checked first, as the power itself could take forever

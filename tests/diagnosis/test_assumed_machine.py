@@ -121,6 +121,44 @@ def test_who_states_the_machine() -> None:
     assert assumed.area == pytest.approx(9e-4)
 
 
+def logged(rig: str, command: str, load: str) -> Recording:
+    """A recording of a machine that nobody stated: the command, the position and four pressures."""
+    recording = simulate(rig=rig, command=command, load=load, duration="10 s", seed=1)
+    names = ("u", "x", "p_A", "p_B", "p_1", "p_2")
+    units = {name: recording.units[name] for name in names}
+    return replace(recording, channels={name: recording[name] for name in names}, units=units, provenance={})
+
+
+def changed(recording: Recording, **channels: np.ndarray) -> Recording:
+    return replace(recording, channels={**recording.channels, **channels})
+
+
+def test_a_supply_above_both_chambers_is_that_of_a_valve() -> None:
+    """Dropouts and an area that is stated change nothing; the area stays."""
+    recording = logged("servo-valve", "2 sin(4t)", "0 N")
+    missing = np.where(np.arange(len(recording)) % 5 == 0, np.nan, recording["p_1"])
+    for each, rig in ((recording, None), (changed(recording, p_1=missing), stated(area="1000 mm^2"))):
+        used, assumed = assumed_rig(rig, each)
+        assert used.circuit.valve_controlled
+        assert assumed.stated_by == "nobody"
+        assert assumed.area_stated == (rig is not None)
+    assert abs(used.cylinder.A_A - 1e-3) < 1e-9
+    assert not assumed_rig("thesis", recording)[0].circuit.valve_controlled
+    assert not assumed_rig(stated(displacement="5 cm^3/rev"), recording)[0].circuit.valve_controlled
+
+
+@pytest.mark.parametrize(
+    ("rig", "command", "load"), [("single-rod-eha", "2 sin(4t)", "8 kN"), ("thesis", "1 sin(4t) + 2", "0 N")]
+)
+def test_the_port_of_a_pump_is_no_supply(rig: str, command: str, load: str) -> None:
+    """Its pressure is that of the loaded chamber, but for a zero, and counts compare with nothing."""
+    recording = logged(rig, command, load)
+    counts = replace(recording, units={**recording.units, "p_A": "count", "p_B": "count"})
+    scaled = changed(counts, p_A=1e-4 * recording["p_A"], p_B=1e-4 * recording["p_B"])
+    for each in (recording, changed(recording, p_1=recording["p_1"] + 5e4), scaled, recording.samples(slice(0, 0))):
+        assert not assumed_rig(None, each)[0].circuit.valve_controlled
+
+
 def test_no_leak_passes_a_share_of_the_pumps_flow() -> None:
     result = diagnose(machine(1))
     assert result.verdict == "no leak"

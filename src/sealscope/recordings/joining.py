@@ -6,6 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from numbers import Real
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,7 @@ def _time_zero(recording: Recording) -> float | None:
     It is the entry `start_epoch_s`, if this counts from 1970 and not from another origin, or else the entry `start`.
     """
     epoch = recording.provenance.get("start_epoch_s")
-    if isinstance(epoch, int | float) and counts_from_1970(epoch):
+    if isinstance(epoch, Real) and counts_from_1970(float(epoch)):
         return float(epoch)
     return parse_epoch(str(recording.provenance.get("start", "")))
 

@@ -50,11 +50,11 @@ class DetailChange(NamedTuple):
 
 
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
-    """Compute the wavelet details of `channel`, a chamber's pressure; return them with a note on omitted samples.
+    """Compute the wavelet details of `channel`, a chamber's pressure; return them with a note on what is missing.
 
     Only parts of the recording that are long enough and without a defect are transformed. The details are None if there
-    is no such part, the channel is missing, or the transform fails. The note then states the reason. It is "" if no
-    samples are omitted.
+    is no such part, the channel is missing, or the transform fails. The note then states the reason. Otherwise it
+    states omitted samples, and that no part is long enough for an RMS window; it is "" if neither is the case.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."

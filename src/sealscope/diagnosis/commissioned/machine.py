@@ -350,7 +350,7 @@ def commission(
         A folder of healthy recordings, or their files.
     rig : Rig, str or path-like, optional
         Stated parameters of the machine: a Rig, the name of a packaged rig or the path of a TOML file; by default
-        nothing is stated.
+        nothing is stated, but the first recording may show a servo valve (`infer_rig`).
     map : mapping of str to str, or "auto", optional
         Name of the column in the logs by channel, such as ``{"p_A": "PG_1"}``, as for `sealscope.read`; by default the
         map in the rig's file.

@@ -282,7 +282,8 @@ class BlockStream(SavedAttributes):
         if not left_signs:
             self.sign_log_odds = self._flow_sign_log_odds(rows)
             left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
-            if self._n_first is None or self._shows_motion(rows):  # a stream may begin at rest, which tells no sign
+            # a stream may begin at rest, which tells no sign; the block in which it starts already has one of its own
+            if self._n_first is None or self._shows_motion(rows):
                 self.left_signs = left_signs
         for equation_rows, columns, sign in zip(rows, self.columns, left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
@@ -476,12 +477,13 @@ def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples (n,) of the channels `names`, with NaN where a pressure is clipped.
+    """Return the samples (n,) of the channels `names`, in which holes are bridged and clipped pressures are NaN.
 
-    Names that the recording lacks are left out. Holes, i.e. long gaps of missing samples, keep the values with which
-    the recording fills them in. If there are holes, the additional entry `HOLE` is 1 there and 0 elsewhere. If a
-    pressure is clipped, and `names` contains p_A and p_B, the additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as
-    recorded.
+    Names that the recording lacks are left out. Holes, i.e. long gaps of missing samples, are bridged: they keep the
+    values with which the inspection filled them (`corrections.gaps`). If there are holes, the additional entry `HOLE`
+    is 1 there and 0 elsewhere. If a pressure is clipped, and the result has p_A and p_B, the additional entry
+    `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values are closer to the
+    true ones than the mean of the other samples.
     """
     samples, is_clipped = {}, False
     is_hole = flag_holes(recording)
@@ -686,8 +688,10 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 
     Both are those of `max_rest_rate`, with two exceptions:
 
-    - In a balance with terms of its own at rest (`is_separate_at_rest`) the piston alone decides, with the fraction
-      `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
+    - A balance with terms of its own at rest (`is_separate_at_rest`) needs the stops of the piston only. The limit
+      `pump`, of the left side, is `NEVER`: the flow never counts as resting, and a stop of the piston is `holding`. The
+      piston's limit is the fraction `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than
+      `MIN_REST` count.
     - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
       valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is then `NEVER`: the
       piston never counts as resting.

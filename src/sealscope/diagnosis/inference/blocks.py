@@ -143,9 +143,8 @@ class Blocks:
         first = np.arange(0, len(self), group_size)
         end = np.append(first[1:], len(self))
         rows, sizes = np.add.reduceat(self.rows, first), end - first
-        weights = self.rows / np.repeat(
-            np.where(rows > 0.0, rows, 1.0), sizes
-        )  # 1.0 avoids 0/0 in a group without rows
+        rows_per_group = np.where(rows > 0.0, rows, 1.0)  # 1.0 avoids 0/0 in a group without rows
+        weights = self.rows / np.repeat(rows_per_group, sizes)
         pressure_weights = self.pressure_weights / np.repeat(np.add.reduceat(self.pressure_weights, first), sizes)
         return Blocks(
             start=self.start[first],

@@ -29,8 +29,9 @@ _MIN_STEP, _MAX_STEP = _PRIORS.follows
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels by which an actuator can be watched, the best first; some need no position x."""
-    # the response of the pressures to the command needs no position
+    """Return the sets of channels by which an actuator can be watched, the best first; one may be without x."""
+    # the response of the pressures to the command needs no position x, but its model (`pressures.reduced_rig`) has a
+    # pump and one piston area, the mean of two nearly equal ones
     has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
     return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
 

@@ -553,9 +553,12 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        The leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is left out
-        if there is neither a baseline nor an alarm. The total is left out if the `estimator` states only changes, and
-        both flows are left out if it states no L/min.
+        `blocks` (n,) have the fields of `BlockConductance`; `offset` includes the errors of the machine's sizes. The
+        leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is left out if
+        there is neither a baseline nor an alarm. The total is left out if the `estimator` states only changes, and both
+        flows are left out if it states no L/min. The limits of the leak are those above the highest and the lowest
+        reference level, minus and plus a half-width, times the smallest and the largest ratio of a true to the
+        estimated leak; both at least 0.
         """
         if not estimator.litres:
             return estimate
@@ -576,7 +579,7 @@ class Watch:
             min_fraction, reference_sd = estimator.min_internal_fraction, self.leak.rise_sd
         leak = mean_flow((blocks["g"] - reference.level) * lpm, errors)
         half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
-        # an uncertain reference level, and flow that may be to the outside or through an orifice, widen the interval
+        # flow to the outside lowers `low` (after an alarm), flow through an orifice raises `high`
         low = min_fraction * (leak.value + (reference.level - reference.high) * mean_lpm - half_width)
         high = estimator.orifice_factor * (leak.value + (reference.level - reference.low) * mean_lpm + half_width)
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))

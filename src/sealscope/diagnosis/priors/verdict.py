@@ -13,7 +13,8 @@ class RepairPriors(PriorTable):
 class SupplyPriors(PriorTable):
     """Pressure of a valve's supply."""
 
-    above: float  # smallest fraction of a recording in which p_1 is above both chamber pressures
+    above: float  # smallest fraction of a recording in which p_1 is above both chamber pressures by the margin
+    margin: float  # [Pa] smallest difference that counts
 
 
 class VerdictPriors(PriorTable):

@@ -55,9 +55,9 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
-    g is the log RMS of the pressures' wavelet details, up to a constant, after noise (`subtract_noise`) and the effect
-    of the duty were subtracted. Returns for each column of `blocks.log_rms` a normal likelihood of g over the blocks
-    (`Information`), and the mean fraction w (columns,) of energy that is not noise: the log RMS itself changes by w g.
+    The log RMS y of a wavelet detail without its noise (`subtract_noise`) is w g + error, up to a constant and the
+    effect of the duty, which is eliminated; w is the fraction of energy that is not noise. Returns for each column of
+    `blocks.log_rms` a normal likelihood of g over the blocks (`Information`), and the means of w (columns,).
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance

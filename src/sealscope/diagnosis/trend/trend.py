@@ -351,12 +351,15 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Add values with 95 % intervals from the converted `levels` to a trend's points, and outliers to its findings.
+    """Add values with 95 % intervals from `levels` to a trend's points, and outliers to its findings.
 
-    Returns the new points and findings.
+    `levels`: those of `_convert_levels`, in the trend's unit and, if known, at one oil temperature, in the order of
+    `trend.rows`. Returns the new points and findings.
     """
     points, findings = [*trend.points], [*trend.findings]
-    _, excess = outlier_excess(levels)  # part of each level beyond the limit of outliers
+    # part of each level beyond the limit of outliers; of two results, that for the whole series, which is known here: a
+    # level that the next one confirms is a change of the machine and no outlier
+    _, excess = outlier_excess(levels)
     outliers = np.flatnonzero(excess)
     remark = "far from the recordings before and after, and counted as if nearer"
     for k, row in enumerate(trend.rows):

@@ -110,14 +110,19 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 def infer_rig(rig: Rig | None, recording: Recording) -> Rig | None:
     """Replace a rig that nobody stated by one behind a servo valve, if the recording shows the valve's supply.
 
-    That is so if no flow and no pump is recorded, only the command, and if p_1 is above both chamber pressures in the
-    fraction `supply.above` (`priors.toml`) of the samples. Stated areas are kept. Any other `rig` is returned as it is.
+    That is so if no flow and no pump is recorded, only the command, and if p_1 exceeds both chamber pressures by
+    `supply.margin` (`priors.toml`) in the fraction `supply.above` of the samples: at the port of a pump, p_1 is about
+    the pressure of one chamber. Pressures in raw counts cannot be compared, and a stated displacement is that of a pump
+    that feeds the chambers: `rig` is then returned as it is. Stated areas are kept.
     """
-    is_stated = rig is not None and states_rig(rig)
-    if is_stated or flow_source(recording.channels) != "u" or not {"p_1", "p_A", "p_B"} <= set(recording.channels):
+    is_stated = rig is not None and (states_rig(rig) or rig.states("pump.q_b"))
+    if is_stated or flow_source(recording.channels) != "u":
         return rig
-    is_above = recording["p_1"] > np.fmax(recording["p_A"], recording["p_B"])
-    if not is_above.mean() > VERDICT.supply.above:
+    if any(recording.units.get(name) != "Pa" for name in ("p_1", "p_A", "p_B")):
+        return rig
+    excess = recording["p_1"] - np.maximum(recording["p_A"], recording["p_B"])
+    excess = excess[np.isfinite(excess)]
+    if not excess.size or not np.mean(excess > VERDICT.supply.margin) > VERDICT.supply.above:
         return rig
     valve_rig = load_rig(_BEHIND_VALVE).as_assumed(_REASON)
     if rig is None or not rig.states("cylinder.A_A", "cylinder.A_B"):

@@ -33,7 +33,8 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
     try:
         if "machine" not in read_toml(path, "a machine's file", rig):
             return ""
-        # a machine's file has times since 1970; the samples' clock may start anywhere
+        # a machine's file has times since 1970; the samples' clock may start anywhere. On it, `updated_s` is the
+        # present, as the mark has just changed the alarm
         shift = 0.0 if counts_from_1970(alarm.onset_s) else time.time() - alarm.updated_s
         leak_lpm = None if mark == "invalid" else alarm.leak_lpm
         times = {"date_s": time.time(), "onset_s": alarm.onset_s + shift}

@@ -1,4 +1,7 @@
-"""Parquet and Feather tables, with pyarrow: units are in the names of columns, the description in the metadata."""
+"""Parquet and Feather tables, with pyarrow: units are in the names or the metadata of columns.
+
+Sealscope writes Parquet only, with the description of the recording in the metadata of the table.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,10 @@ _DESCRIPTION_KEY = b"sealscope"
 
 
 def read_parquet(path: Path, request: Request) -> RecordingFields:
-    """Read the requested columns of a Parquet or Feather table; raise MissingExtra without pyarrow."""
+    """Read the requested columns of a Parquet or Feather table; raise MissingExtra without pyarrow.
+
+    A Feather table has no description by Sealscope. It is read as a whole, so a check of its size would come too late.
+    """
     import_library("pyarrow", "Parquet", "pyarrow")
     with path.open("rb") as beginning:
         is_feather = beginning.read(6) == b"ARROW1"
@@ -38,7 +44,7 @@ def read_parquet(path: Path, request: Request) -> RecordingFields:
         schema, rows = file.schema_arrow, file.metadata.num_rows
 
     def read_column(number: int) -> Any:
-        """Read a column of the table by its number."""
+        """Read a column of the table by its number; reopens the file, as `read_dictionary` is an option of opening."""
         name = schema.field(number).name
         texts = [name] if _is_text(schema.field(number)) else []
         with parquet.ParquetFile(path, read_dictionary=texts) as file:  # stores repeated texts once

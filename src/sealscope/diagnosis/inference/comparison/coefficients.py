@@ -126,10 +126,10 @@ def subtract_reference(
     - indices of the c columns whose coefficients may differ between recordings;
     - precisions (c,) of the priors on these differences.
 
-    Columns that may differ without limit (infinite `between_deviation`) are not fitted. Behind a servo valve, whose
-    overlap can look like a leak, the leak of the reference recordings has the prior of a healthy piston. `has_leak`:
-    true if the coefficient of the leak is among the c coefficients, with the prior of the pump's leakage,
-    `between.pump` (`priors.toml`).
+    The leak is always fitted to the reference recordings. Behind a servo valve, whose overlap can look like a leak, it
+    then has the prior of a healthy piston. Other columns are fitted unless they may differ between recordings without
+    limit (infinite `between_deviation`). The c columns are the fitted ones, with the leak only if `has_leak` is true;
+    the prior on the difference of a laminar leak is that of the pump's leakage, `between.pump` (`priors.toml`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
     matrix, leak = reference[np.ix_(compared, compared)].copy(), compared.index(roles.leak)

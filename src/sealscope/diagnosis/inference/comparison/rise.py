@@ -142,8 +142,9 @@ class Rise(NamedTuple):
     def log_ratio_within(self, rise: float, tail: float) -> float:
         """Compute the log likelihood ratio of a rise by `rise` to no rise, robust to an outlying estimate `value`.
 
-        Each of the two densities of `value` is at least the density at the quantiles `tail` and 1 - `tail` of a healthy
-        recording. An estimate that is improbable with the rise and without it is therefore evidence for neither.
+        Both densities of `value` have a floor: the smaller of the densities of a healthy recording at its quantiles
+        `tail` and 1 - `tail` (for a `share` of 1). An estimate that is improbable with the rise and without it is
+        therefore evidence for neither.
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)

@@ -311,9 +311,11 @@ class HeldChambers:
         return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
     def _offset_cost(self, offset: float) -> float:
-        """Compute -2 log of the prior density of a sensor offset [Pa] and of the holds' offsets, up to constants.
+        """Compute the cost of a sensor offset [Pa]: -2 log of its prior density, up to a constant, plus costs of holds.
 
-        Of a hold's offset only the squared deviation from `offset` counts (`LockedHold.offset_in_hold`).
+        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from `offset`, in
+        standard deviations. A hold that is taken as loaded has the offset `offset` and adds 0
+        (`LockedHold.offset_in_hold`).
         """
         return float(offset_cost(offset)) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
 
