@@ -207,13 +207,16 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
     ...), with log weights. The difference of judged and predicted value follows the mixture over all estimates, without
     parts of negligible weight. The rise is the median of this difference, and the standard deviation is half the width
-    of the central 68 % interval.
+    of the central 68 % interval, infinite if no weight is a number.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
     centres = (predicted.centres - judged).ravel()
-    is_counted = log_weights > log_weights.max() - NEGLIGIBLE
-    weights = np.exp(log_weights[is_counted] - log_weights.max())
+    max_log_weight = float(np.max(log_weights, initial=-np.inf, where=np.isfinite(log_weights + centres)))
+    is_counted = (log_weights > max_log_weight - NEGLIGIBLE) & np.isfinite(centres)
+    if not is_counted.any():  # impossible readings, of which nothing can be predicted
+        return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=1.0)
+    weights = np.exp(log_weights[is_counted] - max_log_weight)
     mixture = Mixture(weights / weights.sum(), deviations[is_counted], centres[is_counted])  # predicted minus judged
     low, median, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
     errors = mixture._replace(centres=mixture.centres - median)
