@@ -43,6 +43,15 @@ def test_standard_input_is_read_by_its_content(call, piped, recordings):
     assert call("convert", "-", recordings / "copy.csv", *MAP).status == 0
 
 
+def test_standard_input_is_read_with_the_map_of_a_machine(call, piped, tmp_path):
+    """The file of a commissioned machine states the columns, of a log on standard input, too."""
+    (tmp_path / "day.csv").write_text(LOG)
+    assert call("commission", tmp_path / "day.csv", "-o", tmp_path / "press.toml", *MAP).status == 0
+    piped(LOG.encode())
+    (result,) = call("diagnose", "-", "--machine", tmp_path / "press.toml", "--format", "jsonl").objects
+    assert result["file"] == "-"
+
+
 def test_standard_input_that_is_none(call, piped, tmp_path):
     piped(b"nonsense")
     assert "standard input" in call("diagnose", "-").refused(1)

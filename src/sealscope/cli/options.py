@@ -208,9 +208,7 @@ class StatedMachine:
         Without `--map`, the rig's map is used for files that have the columns it names. Raises UnreadableFile, also for
         a folder.
         """
-        if self.commissioned is not None:
-            return self.commissioned.read(file)
-        if file.is_dir():
+        if self.commissioned is None and file.is_dir():
             remedy = "name its files, or state its machine by --machine"
             raise UnreadableFile(f"a recording must be a file, got a folder: {remedy} ({file})")
         if file != STANDARD_INPUT:
@@ -225,7 +223,9 @@ class StatedMachine:
                 raise UnreadableFile(str(error).replace(str(path), path.name)) from error
 
     def _read(self, file: Path) -> Recording:
-        """Read the recording in a file by the call's channel map or, without one, by the rig's if it fits the file."""
+        """Read the recording in a file by the channel map of the machine, of the call or, if it fits, of the rig."""
+        if self.commissioned is not None:
+            return self.commissioned.read(file)
         if not self._rig_map:
             from sealscope.recordings import read
 

@@ -66,9 +66,11 @@ def volume_observables(
     flow_scale: float = 1.0,
     with_orifice: bool = True,
 ) -> tuple[Observable, ...]:
-    """Test each coefficient of a volume balance for a step, and return the results by falling score.
+    """Test coefficients of a volume balance for a step (`_step_hypotheses`), and return the results by falling score.
 
-    A leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A - p_B below 1.
+    The piston's leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A -
+    p_B below 1. A scale of both pressures looks like a step of it or of the pump's leak, so that their results state
+    the scale (`_pressure_scale`). A laminar leak has no prior on its size, but pays for an improbable sensor offset.
     The coefficients of the motion are tested together, for a change of their common scale. The `advantage` of a result
     comes from the priors on its size and on the power, from the sensor offset, and from the oil that the accumulator
     lost or the fall of the charge pressure.

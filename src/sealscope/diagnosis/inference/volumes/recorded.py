@@ -272,10 +272,11 @@ class RecordedBalance:
         return np.where(flag_lowering(pumped, signals.step("x"), rate), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
-        """Compute the averaged magnitude of the pump's flow [m^3/s] that does not move the piston, shape (n - 1,).
+        """Compute the pump's flow [m^3/s] beyond the one that moves the piston, shape (n - 1,), at least 0.
 
-        It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
-        the area of the side with the higher pressure.
+        It is positive while the pump holds a load or compresses oil. Both flows are averaged over `LOST_FLOW_TIME`, and
+        the difference is that of their magnitudes. The flow that moves the piston is its speed times the area of the
+        side with the higher pressure, which carries the load.
         """
         recording = self.recording
         is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
