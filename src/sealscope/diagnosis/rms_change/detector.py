@@ -146,7 +146,7 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
         if (summary.get("recorded") or summary["chambers"]) == recorded
-        and abs(summary["rate"] / recording.rate - 1.0) < 1e-3  # error of clocks
+        and has_same_rate(summary["rate"], recording.rate)
     ]
     summaries = [summary for summary in comparable if set(chambers) <= set(summary["chambers"])]
     if not summaries:
@@ -158,6 +158,11 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
     is_dated = None not in [summary.get("start_s") for summary in (judged, *summaries)]
     ringing = Ringing(bound, recording.rate, len(summaries), is_dated, recording.unused)
     return Observed(RmsChange.name, observables, ringing=ringing)
+
+
+def has_same_rate(rate: float, other: float) -> bool:
+    """Tell whether two sampling rates [Hz] are equal within the error of a logger's clock (0.1 %)."""
+    return abs(rate / other - 1.0) < 1e-3
 
 
 def compare_summaries(

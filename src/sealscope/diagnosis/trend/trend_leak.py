@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixtur
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
-from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries
+from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries, has_same_rate
 from sealscope.diagnosis.trend.reading import TrendPoint
 from sealscope.diagnosis.trend.wear import Episode, Wear
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence, TotalLeakage
@@ -192,7 +192,7 @@ def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
         for point in before
         if point.ringing is not None
         and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded"))
-        and abs(point.ringing["rate"] / judged["rate"] - 1.0) < 1e-3  # error of clocks
+        and has_same_rate(point.ringing["rate"], judged["rate"])
     ]
     if not healthy:
         return Observed(RMS_CHANGE)

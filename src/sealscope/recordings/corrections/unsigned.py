@@ -120,8 +120,7 @@ def _piston_speed(x: Array, rate: float) -> Array:
     `rate`: sampling rate [Hz]. Missing positions are interpolated; the speed is 0 if all are missing.
     """
     n_half = _half_span(rate)
-    known = np.isfinite(x)
-    x = np.interp(np.arange(x.size), np.flatnonzero(known), x[known]) if known.any() else np.zeros(x.size)
+    x = _interpolate_missing(x)
     # the position is constant before the beginning and after the end
     padded = np.concatenate([x[:1].repeat(n_half), x, x[-1:].repeat(n_half)])
     return np.asarray((padded[2 * n_half :] - padded[: -2 * n_half]) * (0.5 * rate / n_half))

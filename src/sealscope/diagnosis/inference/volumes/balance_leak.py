@@ -191,6 +191,11 @@ class BalanceLeak(LeakMeasure):
         return self._add_law_uncertainty(self._mix_with_holds(self._rise_fits.flow))
 
     @cached_property
+    def _block_weights(self) -> Array:
+        """Weight (K,) of each block with motion in the rise over the healthy recordings."""
+        return self.balance.block_weights(self.healthy)
+
+    @cached_property
     def _rise_fits(self) -> RiseFits:
         """Fits of a leak to the rise over healthy recordings and to the course of the leakage (`fit_rise`)."""
         balance, motion_rise = self.balance, self._motion_rise
@@ -199,7 +204,7 @@ class BalanceLeak(LeakMeasure):
             balance.running_blocks,
             balance.columns,
             balance.leak,
-            balance.block_weights(self.healthy),
+            self._block_weights,
             self.step,
             rise=Estimate(motion_rise.value, motion_rise.normal_deviation),
             laws=self._rise_laws(),
@@ -411,7 +416,7 @@ class BalanceLeak(LeakMeasure):
         older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
         if rise_after is None:
             is_after = balance.running_blocks.time >= step.onset().value
-            fraction = float(np.clip(balance.block_weights(self.healthy)[is_after].sum(), 0.0, 1.0))
+            fraction = float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
             mean_rise = step.fitted.value * fraction  # mean over the recording
             step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
             return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
