@@ -86,7 +86,7 @@ def week(folder: Path, days: float, names: list[str], keep_days: float, rate: in
 
     service = Service(settings, stdout=io.StringIO(), sources=[source])
     service.run()
-    _, state, _ = service.store.checkpoint(names[0]) or ("", {}, [])
+    _, state = service.store.checkpoint(names[0]) or ("", {})
     statuses = service.actuators.summaries()
     print(f"shown: {statuses[names[0]]['status']}, {statuses[names[0]]['counters']}; {service.actuators.counters}")
     print(f"state {len(json.dumps(state))} bytes as JSON", end="; ")

@@ -8,9 +8,7 @@ import logging
 import re
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from importlib import import_module
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -18,7 +16,7 @@ from sealscope.monitor.database.export import ESTIMATE_COLUMNS, export_labels
 from sealscope.monitor.outputs.events import Webhook
 from sealscope.monitor.outputs.grafana import dashboard
 from sealscope.monitor.outputs.prometheus import format_metrics
-from sealscope.monitor.settings import MonitorSettings, OutputSettings, template
+from sealscope.monitor.settings import template
 from sealscope.monitor.supervisor import PartAway
 
 from ..refusals import refusal
@@ -26,13 +24,6 @@ from .plant import WORN, lines_of, served, settings_in
 
 LINES = lines_of({"press 1": WORN}, 150)
 ROOT = Path(__file__).resolve().parents[2]
-#: Table of the settings -> its class, of each output.
-OUTPUTS = {
-    name: kind
-    for name, field in MonitorSettings.model_fields.items()
-    for kind in get_args(field.annotation)
-    if isinstance(kind, type) and issubclass(kind, OutputSettings)
-}
 
 
 class Receiver:
@@ -108,12 +99,8 @@ def test_the_service_posts_what_is_left_when_it_ends(tmp_path):
     assert receiver.got[0][0]["Authorization"] == "Bearer hook"
 
 
-@pytest.mark.parametrize("name", OUTPUTS)
-def test_an_output_has_a_table_a_class_and_a_line_on_the_page(name):
-    module, _, sender = OUTPUTS[name].sender.partition(":")
-    output = getattr(import_module(f"sealscope.monitor.outputs.{module}"), sender)
-    assert output.part
-    assert all(callable(getattr(output, function)) for function in ("from_settings", "deliver", "end"))
+@pytest.mark.parametrize("name", ["sparkplug", "webhook"])
+def test_an_output_has_lines_in_the_template_and_on_the_page(name):
     assert f"# [{name}]" in template()
     assert re.search(rf"^\|.*`\[{name}\]`", (ROOT / "docs" / "monitor.md").read_text(encoding="utf-8"), re.MULTILINE)
 

@@ -112,7 +112,7 @@ def test_only_the_samples_of_a_recording_that_has_not_ended_are_stored(commissio
     service, _ = served(settings_of(tmp_path, commissioned), b"".join(lines[:70]))
     recorder = service.actuators._actuator("press").recorder
     assert recorder is not None
-    numbers = [block.number for block in service.store.checkpoint("press").pending]
+    numbers = [block.number for block in service.store.pending("press")]
     assert numbers == list(range(numbers[0], 71))
     assert sum(map(len, recorder.blocks)) < 7000
     again = Service(service.settings, once=True)
@@ -131,7 +131,7 @@ def test_a_mark_that_ends_an_alarm_forgets_the_samples_before_it(commissioned, t
     actuator.judge.update_from_verdict(verdict("leak", **leak), None, 1, WatchSettings())
     service.actuators.apply_mark("press", "repaired")
     assert (actuator.recorder.blocks, actuator.recorder.first) == ([], 0)
-    assert service.store.checkpoint("press").pending == []
+    assert service.store.pending("press") == []
 
 
 def pieces(duration: float, start: float = 0.0, rate: float = 10.0) -> list[Recording]:

@@ -31,7 +31,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database import tables
 from sealscope.monitor.database.machine_files import record_mark
-from sealscope.monitor.database.store import MAX_IDENTITIES, MonitorStore, StoredCheckpoint, StoredRows, outage_reason
+from sealscope.monitor.database.store import MAX_IDENTITIES, MonitorStore, StoredRows, StoredSamples, outage_reason
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
 from sealscope.monitor.sources.source_block import SourceBlock, count_bytes
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
@@ -43,18 +43,20 @@ from sealscope.storage.plain_state import require_part, restore, restore_attribu
 
 _log = logging.getLogger(__name__)
 _MAX_COMMENT_LENGTH = 2000
+#: How long an alarm is shelved, on the clock of the samples [s].
+_SHELVED_S = 8 * 3600.0
 #: Blocks of samples between two checkpoints, and their bytes, at most.
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Counter of the blocks that raised an error.
 DROPPED = "blocks that raised an error"
 #: Fields of the verdict on a recording that the summary of an actuator contains.
 _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
+#: Fields of the healthy baseline that the summary contains.
+_BASELINE_VALUES = ("version", "hours", "lpm")
 #: Last results of an actuator that a checkpoint stores: type of each by attribute, which may also be None.
 _RESULT_TYPES = {"last": BlockEstimate, "oil_celsius": float, "judged_s": float, "verdict": RecordingVerdict}
 #: Length of the last samples that are kept during an alarm [s].
 _ALARM_SAMPLES_S = 120.0
-
-
 #: A change of an alarm: the changed alarm, name of the event, such as "raised" or "returned" (the leak has ended), and
 #: time of the change [s].
 _AlarmEvent = tuple[Alarm, str, float]
@@ -209,23 +211,18 @@ class _Actuator:
         The status is that of the verdict on the last recording, if there is one, else of the last block. The flows are
         those of this verdict only if it decides (`RecordingVerdict.decides`). Unknown values are None.
 
-        - `blocks`: number of blocks of some seconds that the detector has processed; `counters`: its counters; `by`:
-          quantity that it watches, "volumes" or "pressures"; `why_no_litres`: reason why it states no L/min, else "",
-          and "" beside a verdict, whose own texts are shown;
-        - `t`: end of the last block or of the verdict's recording, whichever is later [s]; `status`: result in words;
-          `state`: state by NAMUR NE 107;
+        - `blocks`: number of blocks of some seconds so far; `t`: end of the last block or of the verdict's recording,
+          whichever is later [s]; `status`: result in words; `state`: state by NAMUR NE 107;
+        - `by`: quantity that the detector watches, "volumes" or "pressures"; `counters`: its counters; `why_no_litres`:
+          reason why it states no L/min, else "", and "" beside a verdict, whose own texts are shown;
         - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
-          found; `total_interval_lpm`, `leak_interval_lpm`: 95 % intervals; `recording`: texts of the last verdict;
-        - `oil_celsius`: oil temperature [deg C]; `baseline`: version, hours and leakage of the healthy baseline;
-        - `alarm`: id of the open alarm; `status_word`: its status word, 0 without an alarm.
+          found; `recording`: texts of the last verdict; `alarm`: id of the open alarm; `status_word`: 0 without one.
         """
         baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
         last = self.last or BlockEstimate(0, math.nan, "waits for samples")
-        result: BlockEstimate | RecordingVerdict = last if verdict is None or not verdict.decides else verdict
+        deciding_verdict = verdict if verdict is not None and verdict.decides else None
+        result = deciding_verdict or last
         t = None if self.last is None else last.t
-        baseline_values = None
-        if baseline is not None:
-            baseline_values = {"version": baseline.version, "hours": baseline.hours, "lpm": baseline.lpm}
         return {
             "blocks": self.watch.blocks,
             "t": t if verdict is None else max(verdict.end_s, t or -math.inf),
@@ -236,11 +233,11 @@ class _Actuator:
             "total_interval_lpm": result.total_interval_lpm,
             "leak_lpm": result.leak_lpm,
             "leak_interval_lpm": result.leak_interval_lpm,
-            "bound_lpm": None if verdict is None or not verdict.decides else verdict.bound_lpm,
+            "bound_lpm": None if deciding_verdict is None else deciding_verdict.bound_lpm,
             "recording": None if verdict is None else {name: getattr(verdict, name) for name in _VERDICT_TEXTS},
             "why_no_litres": self.watch.why_no_litres if verdict is None else "",
             "oil_celsius": self.oil_celsius,
-            "baseline": baseline_values,
+            "baseline": None if baseline is None else {name: getattr(baseline, name) for name in _BASELINE_VALUES},
             "alarm": None if alarm is None else alarm.id,
             "status_word": 0 if alarm is None else alarm.status_word,
             "counters": self.watch.counters,
@@ -283,21 +280,21 @@ class WatchedActuators:
         recorder = StreamRecorder(name, settings.recording_s) if is_cut_into_recordings else None
         actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
         checkpoint = self.store.checkpoint(name)
-        if checkpoint is None or self._load_checkpoint(actuator, checkpoint):  # a new checkpoint is needed
+        if checkpoint is None or self._load_checkpoint(actuator, *checkpoint):  # a new checkpoint is needed
             rows = StoredRows()
             self._checkpoint(actuator, rows)
             self.store.commit_rows(rows)
         return actuator
 
-    def _load_checkpoint(self, actuator: _Actuator, stored: StoredCheckpoint) -> bool:
-        """Restore an actuator from its checkpoint `stored` in the database, and judge the samples since then again.
+    def _load_checkpoint(self, actuator: _Actuator, settings_json: str, state: Mapping[str, Any]) -> bool:
+        """Restore an actuator from the settings and `state` of its checkpoint, and judge the samples since then again.
 
         The detector (`watch`) starts anew if another version of Sealscope saved its state, or if its rig or learning
         time has changed. A pump displacement within 5 % of the stored one counts as the same, measured again. Returns
         True if a new checkpoint must be saved, because the detector starts anew or the settings have changed.
         """
         settings, name = actuator.settings, actuator.settings.name
-        fresh, state = actuator.watch, stored.state
+        fresh = actuator.watch
         actuator.judge = restore(AlarmJudge, state["judge"], "alarm")
         if (version := require_part(state["watch"], "version", int)) != STATE_VERSION:
             _log.warning("%s: starts anew, as its state has version %s, not %d", name, version, STATE_VERSION)
@@ -308,9 +305,9 @@ class WatchedActuators:
         actuator.load_state(state)
         stored_settings = None
         with suppress(ValidationError):  # another version may have written them in another form
-            stored_settings = WatchSettings.model_validate_json(stored.settings)
+            stored_settings = WatchSettings.model_validate_json(settings_json)
         n_judged = state.get("n_stored", 0)  # number of the last block whose effect the state includes
-        for number, samples, follows, verdict in stored.pending:
+        for number, samples, follows, verdict in self.store.pending(name):
             if number <= n_judged:
                 if actuator.recorder is not None:
                     actuator.recorder.refill(number, samples)
@@ -396,8 +393,7 @@ class WatchedActuators:
                     raise _AlreadyStored from None
             for block, actuator in pairs:
                 actuator.n_stored += 1
-                if block.samples is not None:
-                    self._add_samples(rows, actuator, block, block.samples)
+                self._add_samples(rows, actuator, block)
             self.store.write_rows(connection, rows)
 
     def _actuator(self, name: str) -> _Actuator:
@@ -406,13 +402,16 @@ class WatchedActuators:
             self._actuators[name] = self._restore(self.settings[name])
         return self._actuators[name]
 
-    def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock, samples: Recording) -> None:
-        """Judge the samples of an actuator's block, and add the results to the database rows that will be stored.
+    def _add_samples(self, rows: StoredRows, actuator: _Actuator, block: SourceBlock) -> None:
+        """Judge any samples of an actuator's block, and add the results to the database rows that will be stored.
 
         If a recording of the stream ends with the block, it is judged, too. A checkpoint is added when it is due.
         """
-        settings, follows, verdict = actuator.settings, block.follows, block.verdict
-        name, number, recorder = settings.name, actuator.n_stored, actuator.recorder
+        samples, follows, verdict = block.samples, block.follows, block.verdict
+        if samples is None:
+            return
+        settings, recorder = actuator.settings, actuator.recorder
+        name, number = settings.name, actuator.n_stored
         if recorder is not None and (recording := recorder.take(number, samples)) is not None:
             try:
                 verdict = judge_stream(settings.rig, recording, limit_lpm=settings.error_lpm)
@@ -430,18 +429,14 @@ class WatchedActuators:
         else:
             self._add_summary(actuator, rows)
         if not is_due or (recorder is not None and recorder.first):  # the recording that has not ended needs the block
-            rows.add_pending(name, number, samples, follows, verdict)
+            rows.add_pending(name, StoredSamples(number, samples, follows, verdict))
 
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
-        """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion.
-
-        Of the pending samples, those of a stream's recording that has not ended are kept (`first_kept`). The
-        size of the samples since the last checkpoint becomes 0.
-        """
-        settings = actuator.settings
-        state, recorder = actuator.state(), actuator.recorder
+        """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion."""
+        settings, recorder = actuator.settings, actuator.recorder
+        # the pending samples of a stream's recording that has not ended are kept
         first_kept = recorder.first if recorder is not None and recorder.first else actuator.n_stored + 1
-        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), state, first_kept)
+        rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state(), first_kept)
         self._add_summary(actuator, rows)
         n_kept_estimates = self._keep_s / actuator.watch.block_seconds
         rows.old_blocks[settings.name] = actuator.n_stored - MAX_IDENTITIES
@@ -456,13 +451,13 @@ class WatchedActuators:
             actuator.stored_summary = summary
             rows.add_summary(actuator.settings.name, summary)
 
-    def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "", hours: float = 8.0) -> Alarm:
+    def apply_mark(self, name: str, mark: str, *, by_whom: str = "", text: str = "") -> Alarm:
         """Apply the mark that a person gives an actuator's alarm, store it in one transaction, and return the alarm.
 
         `name`: the actuator; `by_whom`: name of the person; `text`: comment, or reason of ``invalid``; `mark`:
 
         - ``acknowledged``, ``comment``, or ``valid``, which confirms the leak;
-        - ``shelved``: the alarm is not announced for `hours` on the clock of the samples;
+        - ``shelved``: the alarm is not announced for 8 h on the clock of the samples;
         - ``invalid``: the detector withdraws the leak; ``repaired``: it also learns a new healthy baseline.
 
         A mark ``valid``, ``invalid`` or ``repaired`` is also written to the file of a commissioned machine, and an
@@ -472,23 +467,22 @@ class WatchedActuators:
             raise InputError(f"a comment must have at most {_MAX_COMMENT_LENGTH} characters, a name 80")
         if "\0" in text + by_whom or any("\ud800" <= letter <= "\udfff" for letter in text + by_whom):
             raise InputError("a comment must be text, got a NUL or half of a surrogate pair")
-        if not 0.0 < hours <= 10_000.0:
-            raise InputError(f"an alarm must be shelved for > 0 h, got {hours:g}")
         with self._lock:
             if name not in self.settings:
                 raise InputError(f"the settings have no actuator {name[:60]!r}")
             actuator, rows = self._actuator(name), StoredRows()
             open_alarm = actuator.judge.alarm
             t = 0.0 if open_alarm is None else open_alarm.updated_s  # without an open alarm, the mark is refused below
-            if actuator.last is not None:  # time of the last estimate
+            if actuator.last is not None:
                 t = actuator.last.t
             alarm_samples = list(actuator.alarm_samples)
-            alarm = actuator.judge.apply_mark(mark, t, until=t + hours * 3600.0, reason=text)
+            alarm = actuator.judge.apply_mark(mark, t, until=t + _SHELVED_S, reason=text)
             try:
-                if mark in ("invalid", "repaired") and actuator.verdict is not None:
-                    actuator.verdict = actuator.verdict.neutral_after_mark(mark)
-                if mark in ("invalid", "repaired") and actuator.recorder is not None:
-                    actuator.recorder.clear()
+                if mark in ("invalid", "repaired"):
+                    if actuator.verdict is not None:
+                        actuator.verdict = actuator.verdict.neutral_after_mark(mark)
+                    if actuator.recorder is not None:
+                        actuator.recorder.clear()
                 if mark == "invalid":
                     actuator.watch.dismiss()
                 elif mark == "repaired":

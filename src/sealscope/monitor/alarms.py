@@ -44,13 +44,13 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 class Alarm:
     """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
 
-    `id`: name of the actuator with a running number; `raised_s`, `updated_s`: times at which the alarm was raised and
-    last changed; `onset_s`, `returned_s`: begin of the leak, and its end, None while it lasts; `leak_lpm`: leak flow
-    [L/min], None if unknown; `cause`: path of the leaking oil; `evidence`: reason for the alarm, in one line;
-    `next_check`: recommended inspection; `baseline`: version of the healthy baseline, 0 while it is being learned;
-    `mark`: last mark of a person ("valid", "invalid" or "repaired"); `reason`: why the alarm is invalid;
-    `shelved_until_s`: time before which it is not announced; `by_chance_per_1000_h`: most false alarms of this strength
-    that a healthy actuator raises in 1000 operating hours, None if unknown.
+    `id`: name of the actuator with a running number; `updated_s`: time of the last change; `onset_s`, `returned_s`:
+    begin of the leak, and its end, None while it lasts; `leak_lpm`: leak flow [L/min], None if unknown; `cause`: path
+    of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended inspection; `baseline`:
+    version of the healthy baseline, 0 while it is being learned; `mark`: last mark of a person ("valid", "invalid" or
+    "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is not announced;
+    `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours,
+    None if unknown.
     """
 
     id: str
@@ -100,6 +100,15 @@ class Alarm:
         new_bit = NEW_BIT if self.state == "new" and not self.shelved else 0
         return (level_bit if self.active else 0) | new_bit
 
+    def with_level(self, level: Level) -> Alarm:
+        """Change the level; a person must acknowledge a higher one again, unless the leak is confirmed."""
+        is_worse = level == "error" and self.level == "warning"
+        return replace(self, level=level, state="new" if is_worse and self.state != "valid" else self.state)
+
+    def with_end(self, t: float) -> Alarm:
+        """Store that the leak ended at the time `t` [s]; the alarm is then closed, unless nobody has seen it."""
+        return replace(self, state="new" if self.state == "new" else "closed", returned_s=t, updated_s=t)
+
     def as_dict(self) -> dict[str, Any]:
         """Convert the alarm to plain values, with the code of its level and the machine's state by NAMUR NE 107."""
         machine_state = state_of(self.condition, self.cause if self.active else None, since_s=self.onset_s)
@@ -136,13 +145,12 @@ class AlarmJudge:
     ) -> tuple[Alarm, str] | None:
         """Update the alarm with the estimate of one block of samples; return the alarm and the name of the event.
 
-        `leak`: leak that the detector has found, or None; `baseline`: version of the healthy baseline; `allowed_rate`:
-        most false alarms of the detector in 1000 h. An alarm is raised if there is a leak and its flow reaches
-        `warning_lpm` or `error_lpm` of the `settings`. It ends when the flow is below `return_share` times the
-        threshold of its level; an error whose flow still reaches `warning_lpm` then becomes a warning instead. Each
-        change needs `debounce_blocks` successive blocks. A leak without a flow in L/min is a warning. A leak that comes
-        back before anybody has acknowledged its alarm raises the same alarm again. After a restart of the detector,
-        when `leak` is None, the alarm stays: the leak may last.
+        `leak`: leak that the detector has found, or None; `allowed_rate`: most false alarms of the detector in 1000 h.
+        An alarm is raised if there is a leak and its flow reaches `warning_lpm` or `error_lpm` of the `settings`. It
+        ends when the flow is below `return_share` times the threshold of its level; an error whose flow still reaches
+        `warning_lpm` then becomes a warning instead. Each change needs `debounce_blocks` successive blocks. A leak
+        without a flow in L/min is a warning. A leak that comes back before anybody has acknowledged its alarm raises
+        the same alarm again. After a restart of the detector, when `leak` is None, the alarm stays: the leak may last.
 
         The event is "raised", "error" or "warning" (a change of the level), "returned" (the cause has ended), or "" for
         none of these. Returns None if the block is not judged, or if no alarm was active and none is raised.
@@ -184,25 +192,22 @@ class AlarmJudge:
         if self.below >= settings.debounce_blocks:
             self.below = 0
             if updated.level == "error" and is_warning and not is_error:
-                updated, event = replace(updated, level="warning"), "warning"
+                updated, event = updated.with_level("warning"), "warning"
             else:
-                end_state: AlarmState = "new" if updated.state == "new" else "closed"
-                updated, event = replace(updated, state=end_state, returned_s=estimate.t), "returned"
+                updated, event = updated.with_end(estimate.t), "returned"
         elif updated.level == "warning" and self.error >= settings.debounce_blocks:
-            # a person must acknowledge the higher level again, unless the leak is confirmed
-            error_state: AlarmState = "valid" if updated.state == "valid" else "new"
-            updated, event = replace(updated, level="error", state=error_state), "error"
+            updated, event = updated.with_level("error"), "error"
         if leak is not None:
             by_chance, interval = allowed_rate * leak.rarity, estimate.leak_interval_lpm
             updated = replace(updated, leak_lpm=lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
-        """Raise a new alarm, or raise the open alarm again if there is one; return the raised alarm.
+        """Raise a new alarm, or raise the open alarm, whose leak has ended, again; return the raised alarm.
 
-        The open alarm, whose leak has ended, keeps its id and shelving. `findings`: the alarm's other fields, by name.
+        The open alarm keeps its id and shelving. `findings`: the alarm's other fields, by name.
         """
-        if self.alarm is None:  # otherwise the open alarm is raised again, with the same number
+        if self.alarm is None:
             self.raised += 1
         alarm_id = f"{self.actuator}-{self.raised}"
         shelved_until_s = 0.0 if self.alarm is None else self.alarm.shelved_until_s
@@ -235,8 +240,7 @@ class AlarmJudge:
         (`RecordingVerdict.is_rare`). For a stream (`is_stream`), the attribute `evidence`, collected from its
         recordings, must reach 1/alpha, where alpha is the allowed false-alarm probability of one recording. The alarm
         is an error if the leak is over the repair limit, by the state in the verdict. The verdict `no leak`, or a leak
-        below the warning threshold, ends an active alarm, and only then resets `evidence`. `baseline`: version of the
-        healthy baseline; `settings`: thresholds and the allowed rate of false alarms.
+        below the warning threshold, ends an active alarm, and only then resets `evidence`.
 
         The events are those of `update`. Returns None for the verdict `cannot tell`, or if no alarm was active and none
         is raised.
@@ -247,9 +251,8 @@ class AlarmJudge:
         if not is_above:
             if alarm is None or not is_active or not (verdict.excludes_leak or verdict.leaks):
                 return None
-            end_state: AlarmState = "new" if alarm.state == "new" else "closed"
-            end_s, self.evidence = verdict.end_s, 0.0
-            return self._set_alarm(replace(alarm, state=end_state, returned_s=end_s, updated_s=end_s)), "returned"
+            self.evidence = 0.0
+            return self._set_alarm(alarm.with_end(verdict.end_s)), "returned"
         level: Level = "error" if verdict.state["condition"] == _CONDITIONS["error"] else "warning"
         by_chance = verdict.by_chance_per_1000_h
         if is_stream:
@@ -265,10 +268,8 @@ class AlarmJudge:
             "by_chance_per_1000_h": by_chance,
         }
         if alarm is not None and is_active:
-            # a person must acknowledge the higher level again, unless the leak is confirmed
-            is_worse = level == "error" and alarm.level == "warning"
-            state: AlarmState = "new" if is_worse and alarm.state != "valid" else alarm.state
-            return self._set_alarm(replace(alarm, **findings, state=state)), "" if level == alarm.level else level
+            updated = replace(alarm.with_level(level), **findings)
+            return self._set_alarm(updated), "" if level == alarm.level else level
         if is_stream:
             is_enough = self.evidence * verdict.allowed_chance(STREAM_SHARE * settings.false_alarms_per_1000_h) >= 1.0
         else:
@@ -277,10 +278,9 @@ class AlarmJudge:
         if not is_enough:
             return None
         onset_s = verdict.start_s if verdict.onset_s is None else verdict.onset_s
-        # a leak present from the first sample on began after the last recording without a leak
-        min_onset_s = (
-            verdict.start_s if earlier is None or not earlier.excludes_leak else min(earlier.end_s, verdict.start_s)
-        )
+        min_onset_s = verdict.start_s
+        if earlier is not None and earlier.excludes_leak:  # a leak present from the first sample on began after it
+            min_onset_s = min(earlier.end_s, min_onset_s)
         interval = verdict.onset_interval_s or (min_onset_s, onset_s)
         findings |= {"raised_s": verdict.end_s, "onset_s": onset_s, "onset_interval_s": interval}
         return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
@@ -288,22 +288,19 @@ class AlarmJudge:
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.
 
-        An alarm whose cause has ended stays open until a person has seen it. If the alarm is not active, `over_s`
-        becomes the time of its last change.
+        An alarm whose cause has ended stays open until a person has seen it.
         """
         if not alarm.active:  # the cause has ended, or the alarm is closed or invalid
             self.over_s = alarm.updated_s
-        self.alarm = None if alarm.is_over else alarm  # closed or invalid
+        self.alarm = None if alarm.is_over else alarm
         return alarm
 
     def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
-        """Apply the mark that a person gives the open alarm at time `t` [s], and return the changed alarm.
+        """Apply the mark (`MARKS`) that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
-        `mark`: "acknowledged", "comment" (which changes nothing), "shelved", "valid", "invalid" or "repaired"; `until`
-        [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. If its
-        leak has ended, "acknowledged" and "valid" close the alarm. All marks but a comment also reset the counts of
-        successive blocks beyond a threshold, "invalid" and "repaired" the `evidence`, too. Raises InputError for an
-        unknown mark or one that the alarm has already, if there is no open alarm, or if "invalid" has no reason.
+        `until` [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. A
+        comment changes nothing. If its leak has ended, "acknowledged" and "valid" close the alarm. Raises InputError
+        for an unknown mark or one that the alarm has already, if there is no open alarm, or if "invalid" has no reason.
         """
         if mark not in MARKS:
             raise InputError(f"the mark of an alarm must be one of {', '.join(MARKS)}, got {mark[:40]!r}")
@@ -338,13 +335,10 @@ def latest_alarms(alarms: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Sort the summaries of actuators by urgency; add to each the `name` and the open `alarm`, None if there is none.
 
-    The criteria are, in this order: severity of the state; whether the alarm is new; how rarely a healthy actuator
-    raises such an alarm; lower end of the leak's interval; leak; and name. `summaries`: by name of the actuator
-    (`WatchedActuators.summaries`); `alarms`: the open alarms, for each actuator the latest first.
+    `summaries`: by name of the actuator; `alarms`: the open alarms, for each actuator the latest first.
     """
 
     def rank(row: Mapping[str, Any]) -> tuple[Any, ...]:
-        """Build the sorting key of a summary, the lowest for the most urgent one."""
         low_lpm, _ = row["leak_interval_lpm"] or (0.0, 0.0)
         by_chance = (row["alarm"] or {}).get("by_chance_per_1000_h")
         false_alarm_rate = math.inf if by_chance is None else by_chance  # unknown: after the others

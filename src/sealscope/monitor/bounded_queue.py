@@ -38,7 +38,6 @@ class BoundedQueue(Generic[_Item]):
         """
 
         def has_room() -> bool:
-            """Return True if the item may be appended."""
             fits = len(self._items) < self._max_items and self._bytes + size <= self._max_bytes
             return always or not self._items or fits
 

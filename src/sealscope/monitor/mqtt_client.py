@@ -44,7 +44,6 @@ class MqttLink:
         will: Callable[[], _Message] | None = None,
         retain: bool = False,
     ) -> None:
-        """Build the client of the library paho, which `open` connects; the class describes the parameters."""
         check_mqtt()
         from paho.mqtt.client import Client
         from paho.mqtt.enums import CallbackAPIVersion, MQTTProtocolVersion

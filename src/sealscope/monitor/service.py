@@ -6,7 +6,7 @@ import logging
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack
 from functools import partial
 from io import BytesIO
@@ -19,11 +19,11 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import DROPPED, WatchedActuators
 from sealscope.monitor.bounded_queue import BoundedQueue, QueueLoad
 from sealscope.monitor.database.store import MonitorStore, outage_reason
-from sealscope.monitor.outputs.events import EventLines
-from sealscope.monitor.outputs.output import open_outputs
+from sealscope.monitor.outputs.events import EventLines, Webhook
+from sealscope.monitor.outputs.sparkplug_node import SparkplugNode
 from sealscope.monitor.page.live import LiveSamples
 from sealscope.monitor.page.site import PageServer
-from sealscope.monitor.settings import MonitorSettings
+from sealscope.monitor.settings import MonitorSettings, read_secret
 from sealscope.monitor.sources.broker import broker_source
 from sealscope.monitor.sources.folder import watch_folders
 from sealscope.monitor.sources.lines import line_source
@@ -143,8 +143,8 @@ class Service:
         try:
             repeat, write_events = self.supervisor.repeat, self._write_events
             threads.append(repeat("standard output", write_events, every_s=_POLL_S, last=write_events))
-            outputs = open_outputs(self.actuators, self.settings)
-            threads += [repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end) for output in outputs]
+            for output in self._outputs():
+                threads.append(repeat(output.part, output.deliver, every_s=_POLL_S, last=output.end))
             for name, source in sources:
                 work = partial(source, self)
                 threads.append(self.supervisor.start(name, work, restart=not self.once, on_end=put_end))
@@ -175,6 +175,19 @@ class Service:
         if self.settings.opcua is not None:
             sources.append(("OPC UA source", opcua_source(self.settings.opcua)))
         return sources
+
+    def _outputs(self) -> Iterator[Webhook | SparkplugNode]:
+        """Build and yield the outputs of alarms in the settings; raise InputError if a secret cannot be read.
+
+        `deliver` of an output sends the new events, again and again, and `end` once the remaining ones; `part` is the
+        name under which its outages are shown.
+        """
+        webhook, node, broker = self.settings.webhook, self.settings.sparkplug, self.settings.mqtt
+        if webhook is not None:
+            token = read_secret(webhook.token_file, "webhook.token_file")
+            yield Webhook(self.store, webhook.url, token, webhook.timeout_s)
+        if node is not None and broker is not None:  # never without a broker: the settings are checked
+            yield SparkplugNode(self.actuators, broker, node)
 
     def _store_queued(self) -> None:
         """Store the next blocks of the queue; after an error the next call tries the same blocks again."""

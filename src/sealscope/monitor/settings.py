@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
@@ -199,25 +199,17 @@ class OpcUaSettings(_Table):
     timeout_s: float = Field(default=10.0, gt=0, le=300)
 
 
-class OutputSettings(_Table):
-    """The settings of an output of alarms; `sender`: "module:class" of the `Output` in `monitor/outputs/`."""
-
-    sender: ClassVar[str]
-
-
-class SparkplugSettings(OutputSettings):
+class SparkplugSettings(_Table):
     """The settings of the Sparkplug B node that publishes alarms and, every `every_s` [s], changed values."""
 
-    sender: ClassVar[str] = "sparkplug_node:SparkplugNode"
     group: _Level = "Sealscope"
     node: _Level = "monitor"
     every_s: float = Field(default=10.0, ge=0.1, le=86_400)
 
 
-class WebhookSettings(OutputSettings):
+class WebhookSettings(_Table):
     """The settings of a web address that gets the events of alarms by POST requests of at most `timeout_s` [s] each."""
 
-    sender: ClassVar[str] = "events:Webhook"
     url: Annotated[str, Field(pattern=r"^https?://[^\s@]+$", max_length=2000)]
     token_file: _File | None = None
     timeout_s: float = Field(default=10.0, gt=0, le=300)

@@ -13,7 +13,6 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from sealscope.errors import printable
@@ -40,16 +39,12 @@ class PartAway(Exception):  # noqa: N818 (says what happened)
 class SupervisedPart:
     """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
-    `since` [s since 1970], `reason`: start of the present outage, None if there is none, and its reason; `count`:
-    number of outages so far; `seconds` [s]: total length of the outages that have ended. Only one thread at a time may
-    call `attempt`.
+    `name`: name in the log, on the page and in metrics; `since` [s since 1970], `reason`: start of the present outage,
+    None if there is none, and its reason; `count`: number of outages so far; `seconds` [s]: total length of the outages
+    that have ended. Only one thread at a time may call `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
-        """Set up a part that has had no outage; the class describes its attributes.
-
-        `name`: name of the part in the log, on the page and in metrics.
-        """
         self.name, self._supervisor = name, supervisor
         self.since: float | None = None
         self.reason, self.count, self.seconds = "", 0, 0.0
@@ -160,7 +155,7 @@ class Supervisor:
         part = self.part(name)
 
         def work_with_timer() -> None:
-            """Run `work`, perhaps for as long as the monitor; end the outage of the part after `_WORKING_S` seconds."""
+            # `work` may run as long as the monitor
             timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()
@@ -170,14 +165,13 @@ class Supervisor:
                 timer.cancel()
 
         def run_until_success() -> None:
-            """Run `work` as the part, again after an error if `restart`, and call `on_end` at the end."""
             while not part.attempt(work_with_timer) and restart and not self.stopping.wait(part.pause_s):
                 pass
             on_end()
 
         return _start_thread(run_until_success, name)
 
-    def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work | None = None) -> threading.Thread:
+    def repeat(self, name: str, step: _Work, every_s: float, *, last: _Work) -> threading.Thread:
         """Start a thread that runs `step` every `every_s` [s] as the part `name`, and `last` when the monitor stops.
 
         After an error, `step` runs again when the pause of the part has ended.
@@ -185,11 +179,9 @@ class Supervisor:
         part = self.part(name)
 
         def run_steps() -> None:
-            """Run `step` again and again until the monitor stops, and then `last`, if there is one."""
             while not self.stopping.wait(max(every_s, part.pause_s)):
                 part.attempt(step)
-            if last is not None:
-                part.attempt(last, at_once=True)
+            part.attempt(last, at_once=True)
 
         return _start_thread(run_steps, name)
 
@@ -227,17 +219,15 @@ class LimitedLines(logging.Filter):
 def describe_error(error: BaseException) -> str:
     """Describe an error in one line, with the innermost line of this package in its traceback."""
     message = "".join(traceback.format_exception_only(error)[-1:]).strip()  # the last line has type and text
-    place, frame = "", error.__traceback__
-    while isinstance(frame, TracebackType):
-        file = Path(frame.tb_frame.f_code.co_filename)
+    place = ""
+    for frame, line in traceback.walk_tb(error.__traceback__):
+        file = Path(frame.f_code.co_filename)
         if file.is_relative_to(_PACKAGE):  # the last such frame is the innermost
-            place = f" ({file.relative_to(_PACKAGE).as_posix()}, line {frame.tb_lineno})"
-        frame = frame.tb_next
+            place = f" ({file.relative_to(_PACKAGE).as_posix()}, line {line})"
     return f"{' '.join(message.split())[:120]}{place}"
 
 
 def _start_thread(work: Callable[[], None], name: str) -> threading.Thread:
-    """Start a daemon thread that runs `work`, and return it."""
     thread = threading.Thread(target=work, name=name, daemon=True)
     thread.start()
     return thread

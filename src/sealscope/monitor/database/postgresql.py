@@ -47,17 +47,15 @@ def limit_answers(engine: Engine) -> None:
     from psycopg import Connection, OperationalError
 
     class LimitedConnection(Connection[Any]):
-        """A connection that is closed if the server does not answer within `ANSWER_S`."""
+        """A connection that is closed, with OperationalError, if the server does not answer for `ANSWER_S`."""
 
         def wait(self, gen: Any, *arguments: Any, **options: Any) -> Any:
-            """Run `gen`, the generator by which psycopg waits for an answer, under the time limit."""
             return super().wait(self._with_time_limit(gen), *arguments, **options)
 
         def _with_time_limit(self, gen: Generator[Any, Any, Any]) -> Generator[Any, Any, Any]:
-            """Run psycopg's generator `gen` and return its result.
+            """Run `gen`, by which psycopg waits for an answer, and return its result, under the time limit.
 
-            Close the connection and raise OperationalError if PostgreSQL does not answer for `ANSWER_S`. Psycopg
-            resumes this generator several times a second; `ready` is false while there is no answer.
+            Psycopg resumes this generator several times a second; `ready` is false while there is no answer.
             """
             last_answer = time.monotonic()
             ready: Any = None

@@ -5,13 +5,13 @@ SQLite in WAL mode with full synchronisation, or any database that SQLAlchemy kn
 
 from __future__ import annotations
 
+import itertools
 import json
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +36,18 @@ MAX_IDENTITIES = 100_000
 MAX_REFUSED = 1000
 #: Attempts to create the tables, as several monitors may start at once.
 _ATTEMPTS = 10
+
+
+class StoredSamples(NamedTuple):
+    """Samples of a stored block, with its running `number` among all blocks of the actuator.
+
+    `follows`: False after a gap; `verdict`: verdict on the recording that ends with the samples, None for none.
+    """
+
+    number: int
+    samples: Recording
+    follows: bool
+    verdict: RecordingVerdict | None
 
 
 @dataclass
@@ -68,16 +80,9 @@ class StoredRows:
             row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": status}
             self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
-    def add_pending(
-        self, actuator: str, number: int, samples: Recording, follows: bool, verdict: RecordingVerdict | None = None
-    ) -> None:
-        """Add a block of samples that a restart must judge again, or collect again for a recording that has not ended.
-
-        `number`: running number of the block among all blocks of the actuator; `follows`: False if there is a gap
-        before these samples; `verdict`: verdict on the recording that ends with the samples, None for none.
-        """
-        packed_samples = _pack_samples(samples, follows, verdict)
-        self.pending.append({"actuator": actuator, "number": number, "samples": packed_samples})
+    def add_pending(self, actuator: str, block: StoredSamples) -> None:
+        """Add samples that a restart must judge again, or collect again for a recording that has not ended."""
+        self.pending.append({"actuator": actuator, "number": block.number, "samples": _pack_samples(block)})
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add the row of an alarm in its present state, and that of the event that changed it at the time `t` [s].
@@ -91,11 +96,10 @@ class StoredRows:
             self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any], first_kept: int) -> None:
-        """Add settings (JSON) and state of an actuator; drop its pending samples before the block `first_kept`.
+        """Add settings (JSON) and state of an actuator; drop its pending samples before block number `first_kept`.
 
-        `first_kept`: running number of the first block to keep. The state includes the effect of all pending samples;
-        those kept belong to a recording that has not ended. After a restart they are collected again for it, but not
-        judged again, as the state also has the number of the last block whose effect it includes (`n_stored`).
+        The state includes the effect of all pending samples. Those kept belong to a recording that has not ended: a
+        restart collects them again for it, but does not judge them again (`n_stored` of the state).
         """
         self.pending = [row for row in self.pending if row["actuator"] != actuator or row["number"] >= first_kept]
         self.first_kept[actuator] = first_kept
@@ -108,29 +112,6 @@ class StoredRows:
 
         plain = orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode()
         self.summaries[actuator] = {"actuator": actuator, "summary": plain}
-
-
-class StoredSamples(NamedTuple):
-    """Samples of a stored block, with its running `number` among all blocks of the actuator.
-
-    `follows`: False after a gap; `verdict`: verdict on the recording that ends with the samples, None for none.
-    """
-
-    number: int
-    samples: Recording
-    follows: bool
-    verdict: RecordingVerdict | None
-
-
-class StoredCheckpoint(NamedTuple):
-    """The stored checkpoint of an actuator: its settings as JSON, its state, and the pending samples.
-
-    Pending samples arrived after the checkpoint, or before it and belong to a recording that has not ended.
-    """
-
-    settings: str
-    state: dict[str, Any]
-    pending: list[StoredSamples]
 
 
 class MonitorStore:
@@ -147,30 +128,28 @@ class MonitorStore:
             limit_answers(self.engine)
             if self.engine.dialect.name == "sqlite":
                 sa.event.listen(self.engine, "connect", _prepare_sqlite)
-            version = self._prepare_tables(_ATTEMPTS)
+            version = self._prepare_tables()
         except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
         if version != str(tables.SCHEMA):
             raise InputError(f"the monitor's database must have version {tables.SCHEMA}, got {version} ({database})")
 
-    def _prepare_tables(self, attempts: int) -> str:
-        """Create missing tables, and return the version of the database's schema, which the table `facts` stores.
-
-        `attempts`: number of attempts left; one fails if another monitor creates the tables at the same time.
-        """
+    def _prepare_tables(self) -> str:
+        """Create missing tables, and return the version of the database's schema, which the table `facts` stores."""
         facts = tables.facts
-        try:
-            with self.engine.begin() as connection:
-                tables.metadata.create_all(connection)
-                version = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
-                if version is None:
-                    connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
-        except (IntegrityError, ProgrammingError):
-            if attempts == 1:
-                raise
-            time.sleep(0.2)  # another monitor is creating the tables
-            return self._prepare_tables(attempts - 1)
+        for attempt in itertools.count(1):
+            try:
+                with self.engine.begin() as connection:
+                    tables.metadata.create_all(connection)
+                    version = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
+                    if version is None:
+                        connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
+                break
+            except (IntegrityError, ProgrammingError):
+                if attempt == _ATTEMPTS:
+                    raise
+                time.sleep(0.2)  # another monitor is creating the tables
         return str(version or tables.SCHEMA)
 
     @contextmanager
@@ -198,7 +177,6 @@ class MonitorStore:
                     connection.commit()
 
     def _rows(self, query: Any) -> Sequence[sa.Row[Any]]:
-        """Execute a query, and return all its rows."""
         with self.engine.connect() as connection:
             return connection.execute(query).all()
 
@@ -233,13 +211,9 @@ class MonitorStore:
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
 
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
-        """Write rows to their tables within the transaction of `connection`, and delete rows that are no longer needed.
-
-        The deleted rows are the samples before a new checkpoint, the identities up to the numbers `rows.old_blocks`,
-        and the estimates up to `rows.old_estimates`.
-        """
+        """Write rows to their tables within the transaction of `connection`, and delete old ones (`StoredRows`)."""
         actuator = bindparam("name", type_=sa.String)
-        if rows.actuators:  # a checkpoint replaces the samples before it
+        if rows.first_kept:  # a checkpoint replaces the samples before it
             pending = tables.pending.c
             is_replaced = (pending.actuator == actuator) & (pending.number < bindparam("first"))
             parameters = [{"name": name, "first": first} for name, first in rows.first_kept.items()]
@@ -259,7 +233,7 @@ class MonitorStore:
                 connection.execute(table.delete().where(is_old), parameters)
 
     def commit_rows(self, rows: StoredRows) -> None:
-        """Write rows to their tables in a separate transaction, and delete rows that are no longer needed."""
+        """Write rows in a separate transaction (`write_rows`)."""
         with self.writing() as connection:
             self.write_rows(connection, rows)
 
@@ -314,21 +288,23 @@ class MonitorStore:
         """Read the highest running number of an actuator's rows in `table` (`blocks` or `estimates`), 0 for no rows."""
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
-    def checkpoint(self, actuator: str) -> StoredCheckpoint | None:
-        """Read the checkpoint of an actuator with its pending samples; return None if there is no checkpoint."""
-        states, pending = tables.actuators, tables.pending
-        samples = (
-            select(pending.c.number, pending.c.samples).where(pending.c.actuator == actuator).order_by(pending.c.number)
-        )
-        with self.engine.connect() as connection:
-            row = connection.execute(select(states).where(states.c.actuator == actuator)).first()
-            blocks = [_unpack_samples(number, data) for number, data in connection.execute(samples)]
-        return None if row is None else StoredCheckpoint(row.settings, json.loads(row.checkpoint), blocks)
+    def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any]] | None:
+        """Read settings (JSON) and state of an actuator at its last checkpoint; return None if there is none."""
+        rows = self._rows(select(tables.actuators).where(tables.actuators.c.actuator == actuator))
+        return (rows[0].settings, json.loads(rows[0].checkpoint)) if rows else None
+
+    def pending(self, actuator: str) -> list[StoredSamples]:
+        """Read the pending samples of an actuator in the order of their blocks.
+
+        They arrived after the last checkpoint, or before it and belong to a recording that has not ended.
+        """
+        columns = tables.pending.c
+        query = select(columns.number, columns.samples).where(columns.actuator == actuator).order_by(columns.number)
+        return [_unpack_samples(row.number, row.samples) for row in self._rows(query)]
 
     def last_samples(self, actuator: str) -> list[Recording]:
-        """Read the pending samples of an actuator (`StoredCheckpoint`), one recording for each block."""
-        checkpoint = self.checkpoint(actuator)
-        return [] if checkpoint is None else [block.samples for block in checkpoint.pending]
+        """Read the pending samples of an actuator, one recording for each block."""
+        return [block.samples for block in self.pending(actuator)]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last summary of each actuator, by name."""
@@ -419,31 +395,21 @@ def outage_reason(error: BaseException) -> str | None:
     return " ".join(str(error.orig).split())[:200]
 
 
-def _pack_samples(samples: Recording, follows: bool, verdict: RecordingVerdict | None) -> bytes:
-    """Pack samples as bytes: a line of JSON, then the times and all channels as little-endian doubles.
-
-    The line has units, rate, `follows` (False after a gap), and the verdict unless it is None.
-    """
-    header = _format_header(tuple((name, samples.units[name]) for name in samples.channels), samples.rate, follows)
-    if verdict is not None:
-        header = json.dumps({**json.loads(header), "verdict": vars(verdict)}).encode() + b"\n"
-    return header + np.array([samples.t, *samples.channels.values()], dtype="<f8").tobytes()
-
-
-@lru_cache(maxsize=64)
-def _format_header(units: tuple[tuple[str, str], ...], rate: float, follows: bool) -> bytes:
-    """Format the first line of packed samples as JSON; it is cached, since many blocks have the same line.
-
-    `units`: pairs (channel, unit); `rate`: sampling rate [Hz]; `follows`: False after a gap.
-    """
-    return json.dumps({"units": dict(units), "rate": rate, "follows": follows}).encode() + b"\n"
+def _pack_samples(block: StoredSamples) -> bytes:
+    """Pack samples as bytes: a line of JSON, then the times and all channels as little-endian doubles."""
+    samples = block.samples
+    units = {name: samples.units[name] for name in samples.channels}
+    header: dict[str, Any] = {"units": units, "rate": samples.rate, "follows": block.follows}
+    if block.verdict is not None:
+        header["verdict"] = vars(block.verdict)
+    numbers = np.array([samples.t, *samples.channels.values()], dtype="<f8")
+    return json.dumps(header).encode() + b"\n" + numbers.tobytes()
 
 
 def _unpack_samples(number: int, data: bytes) -> StoredSamples:
     """Unpack the block of samples with a running `number` from the bytes that `_pack_samples` made."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
-    # a row of the times, then a row for each channel
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)
     samples = Recording(t, dict(zip(header["units"], channels, strict=True)), header["units"], header["rate"])
     verdict = header.get("verdict")

@@ -10,19 +10,22 @@ import asyncio
 import json
 import logging
 import os
-from typing import TYPE_CHECKING, Any, Self, TextIO
+from collections.abc import Mapping
+from typing import Any, TextIO
 
 import httpx
 
 from sealscope.monitor.database.store import MonitorStore
-from sealscope.monitor.outputs.output import is_announced
-from sealscope.monitor.settings import MonitorSettings, WebhookSettings, read_secret
 from sealscope.monitor.supervisor import PartAway
 
-if TYPE_CHECKING:
-    from sealscope.monitor.actuators import WatchedActuators
-
 logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
+#: Events that the detector causes; they are not announced while an alarm is shelved.
+_DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
+
+
+def _is_announced(event: Mapping[str, Any]) -> bool:
+    """Return True if an event is to be sent; for a shelved alarm, only the marks and comments of persons are sent."""
+    return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
 
 
 class EventLines:
@@ -40,12 +43,12 @@ class EventLines:
         self._store.deliver("lines", self._write_line)
 
     def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an event as one line of JSON if it is to be announced (`is_announced`), and return True.
+        """Write an event as one line of JSON if it is to be announced, and return True.
 
         Raises PartAway if the stream refuses the line or a part of it; the next call, for the same event, writes the
         rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
         """
-        if not is_announced(event):
+        if not _is_announced(event):
             return True
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
@@ -76,17 +79,10 @@ class Webhook:
     part = "webhook"
 
     def __init__(self, store: MonitorStore, url: str, token: str | None = None, timeout: float = 10.0) -> None:
-        """Prepare the headers of all requests; the class describes the parameters."""
         self._store, self._url, self._timeout = store, url, timeout
         self._headers = {"Content-Type": "application/json", "User-Agent": "sealscope"}
         if token is not None:
             self._headers["Authorization"] = f"Bearer {token}"
-
-    @classmethod
-    def from_settings(cls, actuators: WatchedActuators, table: WebhookSettings, settings: MonitorSettings) -> Self:
-        """Build the output from its `table` of the settings; raise InputError if the token cannot be read."""
-        token = read_secret(table.token_file, "webhook.token_file")
-        return cls(actuators.store, table.url, token, table.timeout_s)
 
     def deliver(self) -> None:
         """Post the new alarm events to the web address; raise PartAway if one is not confirmed."""
@@ -96,7 +92,7 @@ class Webhook:
 
     def _send_post(self, event: dict[str, Any]) -> bool:
         """Post an event, if it is to be announced, and return True; raise PartAway if the server does not confirm."""
-        if not is_announced(event):
+        if not _is_announced(event):
             return True
         try:
             asyncio.run(self._post(event))

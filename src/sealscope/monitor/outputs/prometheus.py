@@ -47,14 +47,12 @@ def format_metrics(
 ) -> str:
     """Format the metrics of all actuators and of the monitor in the text format of Prometheus.
 
-    `summaries`: summary of each actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`: for
-    each part, such as the database, (True if it works now, number of outages, their total length [s]); `queue_load`:
-    load of the queue of blocks, None for an empty queue.
+    `summaries`: summary of each actuator; `counters`: numbers of dropped messages and blocks, by reason; `parts`:
+    outages of each part (`Supervisor.outage_totals`); `queue_load`: load of the queue of blocks, None for an empty one.
     """
     families: dict[str, Any] = {}
 
-    def add(name: str, text: str, value: float | None, **labels: str) -> None:
-        """Add `value` with its labels to the metric `name`, which has the help `text`; do nothing for None."""
+    def add(name: str, text: str, value: float | None, **labels: str) -> None:  # `text`: help
         if value is not None:
             kind = CounterMetricFamily if name.endswith("_total") else GaugeMetricFamily
             families.setdefault(name, kind(name, text, labels=[*labels])).add_metric([*labels.values()], float(value))

@@ -11,20 +11,17 @@ import logging
 import threading
 import time
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from importlib.resources import files
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any
 
 from sealscope.monitor import sparkplug as spb
+from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import latest_alarms
-from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.mqtt_client import MqttLink
-from sealscope.monitor.settings import BrokerSettings, MonitorSettings, SparkplugSettings, read_secret, topic_level
+from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, read_secret, topic_level
 from sealscope.recordings.formats.timebase import counts_from_1970
-
-if TYPE_CHECKING:
-    from sealscope.monitor.actuators import WatchedActuators
 
 _log = logging.getLogger(__name__)
 #: Names under which the database stores the numbers of the last sent event, and of the last birth message.
@@ -32,26 +29,15 @@ _NAME, _BIRTHS = "sparkplug", "sparkplug bdSeq"
 
 
 class SparkplugNode:
-    """The Sparkplug B edge node by which a monitor publishes its alarms and values.
-
-    `store`: database with the events; `summaries`: function that returns the summary of each actuator; `count`:
-    function called with the reason for each dropped message; `password`: for the `broker`, None for none.
-    """
+    """The Sparkplug B edge node by which a monitor publishes its alarms and values; `deliver` connects it."""
 
     part = "Sparkplug node"
 
-    def __init__(
-        self,
-        store: MonitorStore,
-        summaries: Callable[[], dict[str, dict[str, Any]]],
-        count: Callable[[str], None],
-        broker: BrokerSettings,
-        settings: SparkplugSettings,
-        password: str | None = None,
-    ) -> None:
-        """Build the node and its link to the broker, which `deliver` opens; the class describes the parameters."""
+    def __init__(self, actuators: WatchedActuators, broker: BrokerSettings, settings: SparkplugSettings) -> None:
+        """Prepare the connection to the broker; raise InputError if its password cannot be read."""
+        password = read_secret(broker.password_file, "mqtt.password_file")
         spb.payload_class()  # fails here rather than at the first message
-        self._store, self._summaries, self._count = store, summaries, count
+        self._actuators, self._store = actuators, actuators.store
         self._settings, self._broker = settings, broker
         name = f"{broker.client_id}-{settings.group}-{settings.node}"
         self._link = MqttLink(broker, name, password, will=self._death_message)
@@ -63,14 +49,6 @@ class SparkplugNode:
         self._birth_due = threading.Event()
         self._sent_values: dict[str, dict[str, Any]] = {}  # by actuator and metric
         self._next_update = 0.0
-
-    @classmethod
-    def from_settings(cls, actuators: WatchedActuators, table: SparkplugSettings, settings: MonitorSettings) -> Self:
-        """Build the node from its `table` of the `settings`; raise InputError if a password cannot be read."""
-        broker = settings.mqtt
-        assert broker is not None  # `MonitorSettings` refuses Sparkplug without a broker
-        password = read_secret(broker.password_file, "mqtt.password_file")
-        return cls(actuators.store, actuators.summaries, actuators.count, broker, table, password)
 
     def deliver(self) -> None:
         """Send births that are due, new events of alarms and, every few seconds, changed values to the broker.
@@ -95,7 +73,7 @@ class SparkplugNode:
         self._store.deliver(_NAME, self._send_event)
         if time.monotonic() >= self._next_update:
             self._next_update = time.monotonic() + self._settings.every_s
-            for actuator, summary in self._summaries().items():
+            for actuator, summary in self._actuators.summaries().items():
                 if actuator not in self._sent_values:  # its birth was not sent yet
                     self._send_device_birth(actuator, summary, alarm={})
                     continue
@@ -148,7 +126,7 @@ class SparkplugNode:
         try:
             request = spb.decode_payload(message.payload).find_metric(spb.REBIRTH)
         except ValueError as error:
-            self._count("invalid Sparkplug commands")
+            self._actuators.count("invalid Sparkplug commands")
             _log.info("an invalid Sparkplug command: %s", error)
             return
         if request is not None and request.value is True:
@@ -173,12 +151,11 @@ class SparkplugNode:
         """
         self._store.write_position(_BIRTHS, self._connection_birth_number)
         self._sent_birth_number = self._connection_birth_number
-        summaries = self._summaries()
         latest = latest_alarms(self._store.alarms())
         self._seq, self._sent_values = 255, {}  # the birth of the node gets the sequence number 0
         # a birth that is not sent in time stays in the client's queue, before the data; a new connection sends all anew
         self._send("NBIRTH", [self._birth_number_metric(), spb.SparkplugMetric(spb.REBIRTH, False, spb.BOOLEAN)])
-        for actuator, summary in summaries.items():
+        for actuator, summary in self._actuators.summaries().items():
             self._send_device_birth(actuator, summary, latest.get(actuator, {}))
 
     def _send_device_birth(self, actuator: str, summary: dict[str, Any], alarm: dict[str, Any]) -> None:

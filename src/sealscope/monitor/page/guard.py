@@ -35,11 +35,10 @@ class Admission:
     """
 
     def __init__(self, token: str, now: Callable[[], float] = time.monotonic) -> None:
-        """Begin without wrong tokens; the class describes the parameters."""
         self._token, self._now = token, now
-        #: By network: number of wrong tokens, and time of the last one [s].
+        # by network: number of wrong tokens, and time of the last one [s]
         self._failures: dict[str, tuple[int, float]] = {}
-        #: Cookie of a browser that has stated the token.
+        # cookie of a browser that has stated the token
         self.session = hmac.new(token.encode(), b"sealscope session", hashlib.sha256).hexdigest()
 
     def pause_s(self, address: str) -> float:
@@ -107,7 +106,6 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
         """A limited connection; `last_activity` [s]: time at which it was made, or last found to be active."""
 
         def connection_made(self, transport: Any) -> None:
-            """Accept the connection; if there are too many, close the one that has been silent for longest."""
             super().connection_made(transport)
             self.last_activity = self.loop.time()
             if len(self.connections) > max_connections:
@@ -117,19 +115,15 @@ def limit_protocol(max_connections: int, silent_s: float = SILENT_S) -> type[asy
                 self.connections.discard(surplus)  # a closed connection must not be chosen again
             self.loop.call_later(_CHECK_INTERVAL_S, self.check_silence)
 
-        def is_sending_answer(self) -> bool:
-            """Return True if the answer to a request is still being prepared or sent."""
+        def is_sending_answer(self) -> bool:  # or preparing it
             return self.cycle is not None and not self.cycle.response_complete
 
         def check_silence(self) -> None:
-            """Close the connection if it has been silent for too long; otherwise schedule the next check.
-
-            A connection is silent if no answer is under way, or if its client leaves the answer unread.
-            """
+            """Close the connection if it has been silent for too long; otherwise schedule the next check."""
             if self.transport.is_closing():
                 return
             now = self.loop.time()
-            if self.is_sending_answer() and not self.flow.write_paused:
+            if self.is_sending_answer() and not self.flow.write_paused:  # paused: the client leaves the answer unread
                 self.last_activity = now
             if now - self.last_activity > silent_s:
                 self.transport.abort()

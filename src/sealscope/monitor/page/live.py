@@ -90,8 +90,7 @@ class LiveSamples:
     def viewing(self, name: str) -> Iterator[bool]:
         """Keep the samples of the actuator `name` while the context lasts, and yield True.
 
-        If too many other actuators are viewed, nothing is kept, and False is yielded. The first viewer of an actuator
-        sees the last stored samples until new ones arrive.
+        If too many other actuators are viewed, nothing is kept, and False is yielded.
         """
         with self._lock:
             is_first = name not in self._windows
@@ -136,11 +135,7 @@ class LiveSamples:
 
         `pressure`: channel whose wavelet details are computed; `detail_form`: "details", or "rms" for their RMS in
         windows of `WINDOW_SIZE` samples. Numbers that are not finite become None, and curves that are not recorded are
-        left out. Among the returned values are:
-
-        - `t`: time of the last sample [s], None if there are no samples; the times of the curves are relative to it;
-        - `pressures`: the chamber pressures [bar]; `details`: the wavelet details d1 to d4 [kPa], or their RMS;
-        - `motion`: position [mm], pressures [bar], and speeds of piston [mm/s] and pump [rpm].
+        left out. The times of the curves are relative to `t`, that of the last sample [s] (None without samples).
         """
         with self._lock:
             window = self._windows.get(name) or _Window()
@@ -170,23 +165,21 @@ def _round_to_json(values: Array, digits: int = 3) -> list[float | None]:
 def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None]]:
     """Reduce series of samples (n,) at times `t` (n,) [s] to the minimum and maximum in each bin, for a chart.
 
-    A bin is a group of successive samples. There are at most `_BINS` bins of equal size, and the first samples are left
-    out if they do not fill a bin. Series that would have at most two samples per bin are not reduced. Returns lists of
-    rounded numbers: "t" with the times of each bin's first and middle sample, and by name each bin's minimum and
-    maximum, in the order in which they occur.
+    A bin is a group of successive samples; there are at most `_BINS`, of equal size. Series that would have at most two
+    samples per bin are not reduced. Returns lists of rounded numbers: "t" with the times of each bin's first and middle
+    sample, and by name each bin's minimum and maximum, in the order in which they occur.
     """
     bin_size = -(-t.size // _BINS)  # rounded up
     if bin_size <= 2:
         return {"t": _round_to_json(t, 4), **{name: _round_to_json(values) for name, values in series.items()}}
     n_bins = t.size // bin_size
-    first = t.size - n_bins * bin_size
+    first = t.size - n_bins * bin_size  # the samples before do not fill a bin
     bin_times = t[first:].reshape(n_bins, bin_size)[:, [0, bin_size // 2]]  # of the first and middle samples
     curves = {"t": _round_to_json(bin_times.ravel(), 4)}
     for name, values in series.items():
         bins = values[first:].reshape(n_bins, bin_size)
         ends = np.stack([bins.min(axis=1), bins.max(axis=1)], axis=1)
-        # the minimum occurs before the maximum
-        is_rising = (bins.argmin(axis=1) < bins.argmax(axis=1))[:, None]
+        is_rising = (bins.argmin(axis=1) < bins.argmax(axis=1))[:, None]  # the minimum occurs first
         curves[name] = _round_to_json(np.where(is_rising, ends, ends[:, ::-1]).ravel())
     return curves
 
@@ -194,10 +187,9 @@ def _envelope(t: Array, series: dict[str, Array]) -> dict[str, list[float | None
 def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: str) -> dict[str, Any]:
     """Compute the curves of the wavelet details [kPa] of a pressure, or of their RMS, as plain values.
 
-    `signal` (n,) [Pa]: the pressure at the times `t` (n,) [s], None if it is not recorded; `pressure`: its name;
-    `detail_form`: "details" or "rms". Only the samples after the last missing one are used. If there are fewer (`has`
-    in the result) than the wavelet transform and a window of the RMS need (`needs`), or if numbers overflow, there are
-    no curves, and "t" is empty.
+    `signal` (n,) [Pa]: the pressure, None if it is not recorded; `pressure`: its name; `detail_form`: "details" or
+    "rms". Only the samples after the last missing one are used. If there are fewer (`has` in the result) than needed
+    (`needs`), or if numbers overflow, there are no curves, and "t" is empty.
     """
     samples = np.empty(0) if signal is None else signal / _KILOPASCAL
     missing_indices = np.flatnonzero(~np.isfinite(samples))
@@ -224,10 +216,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
     """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
 
-    The last `_MOTION_S` seconds of the channels (n,) in SI units, sampled at the times `t` (n,) [s] with the `rate`
-    [Hz], are averaged over bins, groups of successive samples 1/`_MOTION_HZ` s long. The speeds are computed from the
-    averages, except a recorded speed of the pump. Returns plain values by name, with only an empty "t" if there are
-    fewer than two bins.
+    The last `_MOTION_S` seconds of the channels (n,) in SI units are averaged over groups of successive samples,
+    1/`_MOTION_HZ` s long. Returns only an empty "t" if there are fewer than two groups.
     """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))
@@ -235,14 +225,14 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
         return {"t": []}
 
     def bin_means(values: Array) -> Array:
-        """Average the last samples of `values` (n,) over bins of `bin_size` successive samples; return (n_bins,)."""
         return np.asarray(values[values.size - n_bins * bin_size :].reshape(n_bins, bin_size).mean(axis=1))
 
     times = bin_means(t)
-    averages = {name: bin_means(channels[name]) for name in channels}
+    averages = {name: bin_means(values) for name, values in channels.items()}
     curves: dict[str, Any] = {"t": _round_to_json(times, 4)}
-    pressures = ("p_A", "p_B", "p_1", "p_2")
-    curves |= {name: _round_to_json(averages[name] / _BAR) for name in pressures if name in averages}
+    for name in ("p_A", "p_B", "p_1", "p_2"):
+        if name in averages:
+            curves[name] = _round_to_json(averages[name] / _BAR)
     if "x" in averages:
         curves["x"] = _round_to_json(averages["x"] / _MILLIMETRE)
         curves["v"] = _round_to_json(np.gradient(averages["x"], times) / _MILLIMETRE)
@@ -256,9 +246,9 @@ def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[st
 def describe_rig(rig: str) -> dict[str, Any]:
     """Describe the parts of a rig that the page draws, as plain values by name.
 
-    `rig`: name of a packaged rig, or path of a rig's or machine's file. The values are: `title`; `stroke` of the
-    cylinder [mm]; `rods`: sides of the cylinder at which a rod leaves it; `valve`: True if a servo valve drives the
-    cylinder; `displacement` of the pump [L/rev]; `area`: mean piston area, as flow per speed [L/min per mm/s].
+    `rig`: name of a packaged rig, or path of a rig's or machine's file. `rods`: sides of the cylinder at which a rod
+    leaves it; `valve`: True if a servo valve drives the cylinder; `stroke` [mm]; `area`: mean piston area, as flow per
+    speed [L/min per mm/s]; `displacement` of the pump [L/rev].
     """
     loaded_rig = load_watched(rig).rig
     circuit = build_circuit(loaded_rig, ())

@@ -101,7 +101,6 @@ class _Pages:
     def __init__(
         self, actuators: WatchedActuators, token: str | None, queue_load: Callable[[], QueueLoad], live: LiveSamples
     ) -> None:
-        """Prepare the answers to requests; `site` describes the parameters."""
         self._actuators, self._store, self._queue_load, self._live = actuators, actuators.store, queue_load, live
         self._supervisor = actuators.supervisor
         self._machines = {name: describe_rig(settings.rig) for name, settings in actuators.settings.items()}
@@ -194,14 +193,13 @@ class _Pages:
         return _EventStream(self._events(request, name, pressure, detail_form), self._remove_listener)
 
     def _remove_listener(self) -> None:
-        """Decrease the number of listeners by 1; called at the end of an event stream."""
         self._n_listeners -= 1
 
     async def _events(self, request: Request, name: str, pressure: str, detail_form: str) -> AsyncIterator[str]:
         """Yield the server-sent events of `changes`, as text, until the client disconnects or the monitor ends.
 
-        `name`: actuator whose curves are sent, "" for none; `pressure`, `detail_form`: as `pressure` and `drawn` of
-        `changes`. If too many actuators are viewed already, an event "live" states this error.
+        `name`: actuator whose curves are sent, "" for none. If too many actuators are viewed already, an event "live"
+        states this error.
         """
         live, actuators = self._live, self._actuators
         with ExitStack() as contexts:
@@ -231,10 +229,7 @@ class _Pages:
         return format_metrics(summaries, self._actuators.counters, totals, load)
 
     async def answer_outage(self, request: Request, error: Exception) -> Response:
-        """Answer with status 503 in an outage of the database and report the outage; raise any other error again.
-
-        The path /metrics is answered with the metrics that need no database, other paths with JSON.
-        """
+        """Answer with status 503 in an outage of the database and report the outage; raise any other error again."""
         reason = outage_reason(error)
         if reason is None:
             raise error
@@ -268,14 +263,9 @@ class _Pages:
         return Response(read_package_file("login.html", _PACKAGE), status, media_type="text/html")
 
     def _find_refusal(self, request: Request) -> Response | None:
-        """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it.
-
-        Every request is admitted if the page has no token, and the login form always is. Without a valid token, a
-        request for the page is redirected to the form, and any other is refused with status 401. A client that must
-        wait after wrong tokens gets status 429.
-        """
-        admission = self._admission
-        if admission is None or request.url.path in ("/login", "/login.css"):
+        """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it."""
+        admission, path = self._admission, request.url.path
+        if admission is None or path in ("/login", "/login.css"):
             return None
         authorization, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
         if authorization is not None or session is not None:
@@ -286,8 +276,7 @@ class _Pages:
                 return None
             if session is not None and admission.admits(address, session, session=True):
                 return None
-        is_page = request.url.path == "/"
-        answer: Response = RedirectResponse("/login", 303) if is_page else _make_refusal("a token is needed", 401)
+        answer: Response = RedirectResponse("/login", 303) if path == "/" else _make_refusal("a token is needed", 401)
         if session is not None:  # an invalid cookie, for example of an earlier token
             answer.delete_cookie(_COOKIE)
         return answer
@@ -307,7 +296,6 @@ class _EventStream(StreamingResponse):
         self._on_end = on_end
 
     async def __call__(self, *connection: Any) -> None:
-        """Send the response to the client, and then call `on_end`."""
         try:
             await super().__call__(*connection)
         finally:
@@ -315,7 +303,6 @@ class _EventStream(StreamingResponse):
 
 
 def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
-    """Build the answer that refuses a request, with the reason `error` and an HTTP status."""
     return JSONResponse({"error": error}, status, headers)
 
 
@@ -346,10 +333,9 @@ async def _read_body(request: Request) -> bytes:
 
 
 class PageServer:
-    """The web server of the page, which runs in a separate thread until `close`.
+    """The web server of the page (`site`), which runs in a separate thread until `close`.
 
-    `queue_load`: function that returns the load of the queue of blocks; `live`: the last samples of the service, by
-    default only the stored ones. Raises InputError if the port is taken or the token cannot be read.
+    Raises InputError if the port is taken or the token cannot be read.
     """
 
     def __init__(
@@ -359,7 +345,6 @@ class PageServer:
         queue_load: Callable[[], QueueLoad] = QueueLoad,
         live: LiveSamples | None = None,
     ) -> None:
-        """Open the port, and start the thread that serves the page; the class describes the parameters."""
         token = read_secret(settings.token_file, "page.token_file")
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, queue_load, live)

@@ -66,7 +66,7 @@ def broker_source(settings: BrokerSettings) -> Callable[[BlockReceiver], None]:
     Raises InputError if a secret cannot be read, and MissingExtra if the MQTT library is not installed.
     """
     password = read_secret(settings.password_file, "mqtt.password_file")
-    check_mqtt()
+    check_mqtt()  # before the service starts
     return lambda service: _Connection(settings, password, service).run()
 
 
@@ -74,14 +74,12 @@ class _Connection:
     """The connection of a monitor to its MQTT broker, by which blocks arrive and alarms are published."""
 
     def __init__(self, settings: BrokerSettings, password: str | None, service: BlockReceiver) -> None:
-        """Prepare the connection and its callbacks; `run` opens it."""
         self._settings, self._service = settings, service
         self._broker = service.supervisor.part(BROKER)
         self._names = {actuator.topic: actuator.name for actuator in service.settings.actuator if actuator.topic}
         self._units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
-        self._name = settings.client_id
         will = None if settings.host_id is None else self._offline_message
-        self._link = MqttLink(settings, self._name, password, will, retain=True)
+        self._link = MqttLink(settings, settings.client_id, password, will, retain=True)
         self._client = self._link.client
         self._host: SparkplugHost | None = None
         if any(actuator.sparkplug is not None for actuator in service.settings.actuator):
@@ -209,7 +207,6 @@ class _Connection:
         number, qos = message.mid, message.qos
 
         def acknowledge() -> None:
-            """Acknowledge the message to the broker, if it has QoS 1 and came by the present connection."""
             # on a new connection the number may be that of another message, and the broker sends this one again
             if qos and connection == self._connection:
                 self._client.ack(number, qos)
@@ -244,7 +241,7 @@ class _Connection:
         store, digest = self._service.store, compute_digest(message.payload)
         n_starts = 0
         with suppress(SQLAlchemyError):  # an outage of the database, which the storage of the block reports
-            n_starts = store.begin_decoding(self._name, digest)
+            n_starts = store.begin_decoding(self._settings.client_id, digest)
         try:
             if n_starts >= _MAX_ATTEMPTS:
                 rule = "the decoding of a message must end"
@@ -252,7 +249,7 @@ class _Connection:
             yield
         finally:
             with suppress(SQLAlchemyError):
-                store.end_decoding(self._name, digest)
+                store.end_decoding(self._settings.client_id, digest)
 
     def _deliver(self) -> None:
         """Publish the alarms of new events, and the states that have changed, as retained messages."""

@@ -50,6 +50,10 @@ _READ_AHEAD_BYTES = 64_000_000
 _GAP_S = 1.0
 
 
+#: A recording and "", or None and the reason why its file cannot be read.
+_Reading = tuple[Recording | None, str]
+
+
 class _FoundFile(NamedTuple):
     """A file in a watched folder; `modified_s` [s since 1970]: last change; `identity`: text of name, size and time."""
 
@@ -72,7 +76,6 @@ class WatchedFolder:
         is_stored: Callable[[str, str], bool],
         newest_s: float = -math.inf,
     ) -> None:
-        """Prepare reading the folder in the settings of its actuator; the class describes the parameters."""
         assert settings.folder is not None
         self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
         self.settle_s, self._is_stored = settle_s, is_stored
@@ -80,11 +83,7 @@ class WatchedFolder:
         self._channel_map = settings.map or load_watched(settings.rig).channel_map
         # start and end of the newest recording [s since 1970]; after a restart both are the last stored sample's time
         self._newest_s = self._end_s = newest_s
-        # by identity of the file: time at which it was first found [s], and time of its first sample [s since 1970]
-        self._first_found: dict[str, float] = {}
-        self._starts: dict[str, float] = {}
-        # by identity: recording or None, and reason why it cannot be read, of files that were read to find their order
-        self._read_ahead: dict[str, tuple[Recording | None, str]] = {}
+        self._first_found: dict[str, float] = {}  # by identity of the file: time at which it was first found [s]
         self._submitted, self._unreadable = set[str](), set[str]()  # identities
         self._outside_links = set[str]()  # names
 
@@ -99,19 +98,16 @@ class WatchedFolder:
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
         self._submitted &= self._first_found.keys()  # forget the files that are gone
         self._unreadable &= self._first_found.keys()
-        self._read_ahead.clear()  # of an earlier call that did not come to its end
-        self._starts = {identity: start for identity, start in self._starts.items() if identity in self._first_found}
         due_files = [file for file in files if file.identity not in self._submitted and self._is_due(file)]
-        if len(due_files) > 1:  # files may be copied in another order than recorded
-            due_files.sort(key=self._start_time)
-        for file in due_files:
+        for file, reading in self._sort_by_start(due_files):
             identity = file.identity
-            is_read = identity in self._read_ahead
-            samples, reason = self._read_ahead.pop(identity) if is_read else self._read(file.path)
+            samples, reason = reading or self._read(file.path)
             if reason and self._may_be_incomplete(file):
                 self._unreadable.add(identity)  # tried again later
                 continue
-            if reason := reason or self._find_refusal_reason(samples, file):
+            if samples is not None:
+                reason = self._find_refusal_reason(samples, file)
+            if reason:
                 yield RefusedMessage(UNREADABLE_FILE, f"{self.actuator}: {reason}")
                 samples = None
             block = SourceBlock(self.actuator, identity, None, follows=False)
@@ -121,10 +117,8 @@ class WatchedFolder:
             yield block
 
     def _unchanged_s(self, file: _FoundFile) -> float:
-        """Compute the time [s] since a file changed or since it was first found, whichever is longer.
-
-        The time of the change may lie in the future.
-        """
+        """Compute the time [s] since a file changed or since it was first found, whichever is longer."""
+        # the time of the change may lie in the future
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
@@ -144,24 +138,28 @@ class WatchedFolder:
         """Return True if an unreadable file may be unfinished: it changed within `_PATIENCE_FACTOR` x `settle_s`."""
         return self._unchanged_s(file) < _PATIENCE_FACTOR * self.settle_s
 
-    def _start_time(self, file: _FoundFile) -> float:
-        """Find the time of a file's first sample [s since 1970], or the time of its last change if it is unreadable.
+    def _sort_by_start(self, files: list[_FoundFile]) -> list[tuple[_FoundFile, _Reading | None]]:
+        """Sort files by the time of their first sample, or of their last change if they are unreadable.
 
-        The file is read for this; `blocks` need not read it again while such recordings fit in `_READ_AHEAD_BYTES`.
+        They may be copied in another order than recorded. Several files are read for this. The result has what was read
+        of each file, or None where it must be read again, as the recordings exceed `_READ_AHEAD_BYTES`.
         """
-        modified_s, path, identity = file
-        if identity not in self._starts:
-            samples, reason = self._read(path)
-            n_bytes = sum(count_bytes(recording) for recording, _ in self._read_ahead.values() if recording is not None)
-            if samples is None or n_bytes + count_bytes(samples) < _READ_AHEAD_BYTES:
-                self._read_ahead[identity] = samples, reason
-            if samples is None:
-                return modified_s
-            self._starts[identity] = file_seconds(samples, path)
-        return self._starts[identity]
+        if len(files) < 2:
+            return [(file, None) for file in files]
+        rows: list[tuple[float, _FoundFile, _Reading | None]] = []
+        n_bytes = 0
+        for file in files:
+            samples, reason = self._read(file.path)
+            size = 0 if samples is None else count_bytes(samples)
+            is_kept = n_bytes + size < _READ_AHEAD_BYTES
+            n_bytes += size if is_kept else 0
+            start = file.modified_s if samples is None else file_seconds(samples, file.path)
+            rows.append((start, file, (samples, reason) if is_kept else None))
+        rows.sort(key=lambda row: row[0])
+        return [(file, reading) for _, file, reading in rows]
 
-    def _read(self, path: Path) -> tuple[Recording | None, str]:
-        """Read a file; return its recording and "", or None and the reason why it cannot be read."""
+    def _read(self, path: Path) -> _Reading:
+        """Read a file."""
         try:
             return read_by_map(path, self._channel_map, self._rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
@@ -169,15 +167,13 @@ class WatchedFolder:
         except Exception as error:
             return None, f"{escape_text(path.name)}: {describe_error(error)}"
 
-    def _find_refusal_reason(self, samples: Recording | None, file: _FoundFile) -> str:
+    def _find_refusal_reason(self, samples: Recording, file: _FoundFile) -> str:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
         After a restart, the time of the last stored sample replaces the start of the newest recording. An earlier
         recording is accepted if it states only the day of the newest one, by a start at midnight, or if the newest one
         is dated in the future. A new recording that is dated in the future is logged.
         """
-        if samples is None:
-            return ""
         path, now = file.path, time.time()
         start = file_seconds(samples, path)
         if max(start, file.modified_s) > now + _AHEAD_S:
@@ -193,9 +189,7 @@ class WatchedFolder:
 
         The samples are corrected for the defects of loggers, and their times converted to seconds since 1970. A
         recording without a time of day begins `_GAP_S` after the previous one of its day. An oil temperature in the
-        file's header becomes the channel `T_oil`. If the comparison with the machine's healthy recordings raises an
-        error, the error is logged, and the block gets no verdict. Raises PartAway if the file of the machine cannot be
-        read.
+        file's header becomes the channel `T_oil`. Raises PartAway if the file of the machine cannot be read.
         """
         start = file_seconds(recording, path)
         # long gaps, which the correction fills in, become NaN again
@@ -214,7 +208,7 @@ class WatchedFolder:
         verdict = None
         try:
             verdict = judge_recording(watched, recording, escape_text(path.name), shift, limit_lpm=self._limit_lpm)
-        except Exception as error:
+        except Exception as error:  # the samples are still watched
             reason = describe_error(error)
             _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
@@ -266,7 +260,6 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
             folders[folder_part] = WatchedFolder(actuator, settle_s, service.store.is_known, newest_s)
 
     def submit_blocks(folder: WatchedFolder) -> None:
-        """Submit the blocks of a folder's new files until the service stops."""
         for block in folder.blocks():
             if service.stopping.is_set():
                 return
@@ -281,8 +274,5 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
 
 
 def _is_midnight_before(start: float, t: float) -> bool:
-    """Return True if `start` is the midnight (UTC) at which the day of `t` begins; both in seconds since 1970.
-
-    A recording without a time of day has such a start.
-    """
+    """Return True if `start`, as of a recording without a time of day, is the midnight (UTC) of the day of `t`."""
     return start % DAY == 0.0 and start <= t < start + DAY

@@ -56,7 +56,7 @@ class _Channel:
 
 
 class ValueGatherer:
-    """Gathers the values of one actuator's channels into blocks of `block_s` seconds at `rate` [Hz].
+    """Gathers the values of one actuator's `channels` into blocks of `block_s` seconds at `rate` [Hz].
 
     `count`: function called with the reason when values are dropped; `now`: returns a monotonic time [s].
     """
@@ -69,7 +69,6 @@ class ValueGatherer:
         count: Callable[[str], None],
         now: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin without values; `channels`: names of the channels of a block."""
         self.rate, self._length = rate, max(1, round(block_s * rate))
         self._max_lead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
         self._channels = {name: _Channel() for name in channels}
@@ -127,17 +126,13 @@ class ValueGatherer:
         self._start = self._newest = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the complete blocks, up to whose end every channel has values.
-
-        The first block begins where every channel has a value. A channel that has been silent for `SILENT_S` [s] counts
-        as constant; if all channels are silent, no block ends.
-        """
+        """Remove and return the complete blocks, up to whose end every channel has values or is silent."""
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)
             if not has_new_values or any(channel.last_value() is None for channel in channels):
                 return []
-            # start at the first index at which every channel has a value
+            # start at the first index at which every channel has a value from then on or from before
             first_indices = [min(channel.values) for channel in channels if channel.previous is None]
             if not first_indices:  # each channel has a value from before: start at the first new value
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]

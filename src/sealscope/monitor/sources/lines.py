@@ -18,7 +18,6 @@ def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
     """Build a source that submits the blocks in the lines of a stream until it ends; empty lines are skipped."""
 
     def submit_lines(service: BlockReceiver) -> None:
-        """Submit the block of each line, or the reason to refuse it, until the stream ends or the service stops."""
         units_of = {actuator.name: actuator.units for actuator in service.settings.actuator}
         while not service.stopping.is_set() and (line := stream.readline(MAX_MESSAGE_BYTES + 1)):
             if len(line) > MAX_MESSAGE_BYTES:

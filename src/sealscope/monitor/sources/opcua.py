@@ -51,7 +51,6 @@ class _OpcUaSession:
     """The connection of a service to an OPC UA server, with its subscriptions."""
 
     def __init__(self, settings: OpcUaSettings, password: str | None, service: BlockReceiver) -> None:
-        """Prepare gathering values and their conversion to SI units, for each actuator that has nodes."""
         self._settings, self._password, self._service = settings, password, service
         self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
@@ -73,15 +72,15 @@ class _OpcUaSession:
         stopping = self._service.stopping
         submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
-            self._server.attempt(lambda: asyncio.run(self._connect()))
+            self._server.attempt(self._connect)
             for gatherer in self._gatherers.values():  # values were lost with the connection
                 gatherer.discard_values()
         submitting.join()
 
-    async def _connect(self) -> None:
+    def _connect(self) -> None:
         """Connect, and stay connected until the service ends; raise PartAway if the connection fails or is lost."""
         try:
-            await self._run_connection()
+            asyncio.run(self._run_connection())
         except Exception as error:  # a lost connection raises errors of many types
             reason = " ".join(str(error).split()) or type(error).__name__
             raise PartAway(f"{self._settings.url}: {reason}") from None
@@ -144,7 +143,7 @@ class _OpcUaSession:
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
-        """Submit the queued blocks in a separate thread, as the service's `submit` waits while its queue is full."""
+        """Submit the queued blocks; in a thread, as `submit` of the service waits while its queue is full."""
         while not self._service.stopping.is_set():
             for block in self._waiting.pop(max_items=1, timeout=_POLL_S):
                 self._service.submit(block)

@@ -71,14 +71,13 @@ class BlockReceiver(Protocol):
 class RefusedMessage(InputError):  # noqa: N818 (says what happened)
     """Raised if a message or a file does not contain a valid block.
 
-    `reason`: one of `REASONS`; `size`: length of its `contents` [bytes]; `beginning`: its first bytes, which are
-    stored; `bytes`: number of these; `done`: function called when they are stored.
+    `reason`: one of `REASONS`; `message`: text of the error; `size`: length of its `contents` [bytes]; `beginning`: its
+    first bytes, which are stored; `bytes`: number of these; `done`: function called when they are stored.
     """
 
     def __init__(
         self, reason: str, message: object, contents: bytes = b"", done: Callable[[], None] = lambda: None
     ) -> None:
-        """Store the reason and the first bytes of the refused `contents`; `message`: text of the error."""
         super().__init__(message)
         self.reason, self.done = reason, done
         self.size, self.beginning = len(contents), contents[:_N_KEPT_BYTES]

@@ -138,7 +138,6 @@ class SparkplugHost:
         publish: Callable[[str, bytes], object],
         count_event: Callable[[str], None],
     ) -> None:
-        """Prepare the sessions of all nodes in the settings of the actuators; nothing is sent."""
         spb.payload_class()  # fails here rather than at the first message
         self._publish, self._count_event = publish, count_event
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
@@ -218,13 +217,12 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         A birth of a node (NBIRTH) begins its session, and a death (NDEATH) ends it; both discard the births of its
-        devices. After a gap in the sequence, which is counted, a birth is requested. Raises RefusedMessage for a
-        message without a sequence number or before the birth, and for the death of an earlier connection.
+        devices. After a gap in the sequence, which is counted, a birth is requested.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):
-            number = getattr(payload.find_metric(spb.BIRTH_SEQUENCE), "value", None)
-            number = number if isinstance(number, int) else None
+            metric = payload.find_metric(spb.BIRTH_SEQUENCE)
+            number = metric.value if metric is not None and isinstance(metric.value, int) else None
             if kind == "NDEATH" and state.birth_sequence not in (None, number):
                 raise RefusedMessage(blocks.STALE_DEATH, "a death must bear the bdSeq of the last birth")
             is_birth = kind == "NBIRTH"
@@ -281,24 +279,22 @@ class SparkplugHost:
         for name, channel in channel_of.items():
             if channel in SLOW and isinstance(last := birth.metrics[name].value, (int, float)):
                 values[channel] = np.full(n_samples, float(last))
-        units = {
-            channel: birth.metrics[name].unit or actuator.units.get(channel) for name, channel in channel_of.items()
-        }
-        si_values = {channel: convert_to_si(array, units.get(channel), channel) for channel, array in values.items()}
-        return Recording(t, si_values, {channel: CHANNEL_UNITS[channel] for channel in si_values}, rate)
+        for channel, array in values.items():
+            unit = birth.metrics[birth.names[channel]].unit or actuator.units.get(channel)
+            values[channel] = convert_to_si(array, unit, channel)
+        return Recording(t, values, {channel: CHANNEL_UNITS[channel] for channel in values}, rate)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
 
-        `t` is truncated or rounded to whole milliseconds. The expected start is one sampling interval after the
-        actuator's previous sample. The times begin at the expected start, if rounding explains the distance between the
-        expected start and `t`. For a larger distance they begin nearer to `t`, by at most `_MAX_SHIFT` samples. They
-        begin at `t` itself if the distance is three times `_LATE_S` or more, as after missing samples or a change of
-        the clock, and for the first samples of an actuator.
+        `t` is truncated or rounded to whole milliseconds. The times begin at the expected start, one sampling interval
+        after the actuator's previous sample, if rounding explains its distance to `t`. For a larger distance they begin
+        nearer to `t`, by at most `_MAX_SHIFT` samples. They begin at `t` itself if the distance is three times
+        `_LATE_S` or more, as after missing samples or a change of the clock, and for the first samples.
         """
         start, expected_start = t, self._next_starts.get(actuator, math.nan)
         if abs(expected_start - t) < 3.0 * _LATE_S:
-            # by rounding the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected
+            # the true start lies within [t - _EARLY_S, t + _LATE_S]: take the time nearest to the expected
             possible_start = min(max(expected_start, t - _EARLY_S), t + _LATE_S)
             shift, max_shift = possible_start - expected_start, _MAX_SHIFT / rate
             start = expected_start + min(max(shift, -max_shift), max_shift)
@@ -313,8 +309,7 @@ def _simultaneous_samples(
 
     `group`: these metrics by channel; `channel_of`: channel by name of its metric. If a value is an array, all must be
     arrays of the same length n, and channels without a value are left out. Otherwise n is 1: `birth` stores the values,
-    and a channel that is not in the group repeats the last single value stored there, unless it is slow (`SLOW`). None
-    becomes NaN. Raises RefusedMessage if the values are not numbers, or arrays of different lengths.
+    and a channel that is not in the group repeats the last single value stored there. None becomes NaN.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}
