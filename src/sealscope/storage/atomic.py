@@ -78,7 +78,6 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
-    """Force the system to write a file, or a folder's list of files, to the disk; `flags`: those of `os.open`."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)

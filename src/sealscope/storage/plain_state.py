@@ -97,7 +97,6 @@ def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _save_value(value: Any) -> Any:
-    """Convert the value of an attribute to a value that JSON can store, as `save_attributes` describes."""
     if callable(getattr(value, "state", None)):
         return value.state()
     if isinstance(value, np.ndarray):
@@ -139,10 +138,7 @@ def restore_attributes(
 
 
 def _restore_like(present: NDArray[Any], saved: Any, name: str) -> NDArray[Any]:
-    """Restore an array, saved as the entry `name` of a state, with the columns and the shape of the `present` one.
-
-    Where the present array has an axis of length 0, any length is accepted. Raises InputError for another shape.
-    """
+    """Restore an array, saved as the entry `name` of a state, as `restore_attributes` describes."""
     values, shape = restore_array(saved, name), _as_plain_array(present).shape
     if values.ndim != len(shape) or any(
         length not in (saved_length, 0) for saved_length, length in zip(values.shape, shape, strict=True)

@@ -27,7 +27,6 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _parse_finite(text: str) -> float:
-    """Parse a number; raise ValueError if it is not finite."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"a number must be finite, got {text[:40]}")
@@ -35,7 +34,6 @@ def _parse_finite(text: str) -> float:
 
 
 def _parse_whole(text: str) -> int:
-    """Parse a whole number; raise ValueError if its magnitude exceeds 2^53."""
     if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # `int` takes long for long texts
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)

@@ -17,7 +17,7 @@ from sealscope.storage.plain_values import MAX_WHOLE, convert_type
 
 _T = TypeVar("_T")
 #: Largest file that is read [bytes].
-MAX_SIZE = 1_000_000
+_MAX_SIZE = 1_000_000
 #: Most dots in a key, as tomllib's time grows with their square.
 _MAX_DOTS = 30
 #: A piece of text that may be a key.
@@ -30,31 +30,27 @@ _MAX_MEMORY, _MEMORY_RATIO = 2_000_000, 6
 _HEADER, _INNER_KEY = re.compile(r"\s*\[[^\[\],]*\]\s*(?:#.*)?\n?"), re.compile(r"[{,]([^{},=]*)=")
 
 
-def read_toml(path: Path, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
-    """Read the TOML file at `path`; `what` ("a rig file") and `place` name it in error messages.
-
-    Raises InputError if it cannot be read, is larger than `max_size` [bytes], is not UTF-8 or not TOML, has a whole
-    number over 2^53 or a key with more than 30 dots, or would take too much memory.
-    """
+def read_toml(path: Path, what: str, place: str) -> dict[str, Any]:
+    """Read the TOML file at `path`, as `parse_toml` does; raise InputError if it cannot be read."""
     try:
         with open_regular(path, what) as file:
-            data = file.read(max_size + 1)
+            data = file.read(_MAX_SIZE + 1)
     except InputError:  # is a ValueError, with a complete message
         raise
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise InputError(f"{what} must be readable, got: {reason} ({place})") from None
-    return parse_toml(data, what, place, max_size)
+    return parse_toml(data, what, place)
 
 
-def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> dict[str, Any]:
+def parse_toml(data: bytes, what: str, place: str) -> dict[str, Any]:
     """Parse the content `data` of a TOML file; `what` ("a rig file") and `place` name the file in error messages.
 
-    Raises InputError if the content is larger than `max_size` [bytes], is not UTF-8 or not TOML, has a whole number
-    over 2^53 or a key with more than 30 dots, or would take too much memory.
+    Raises InputError if the content is larger than `_MAX_SIZE`, is not UTF-8 or not TOML, has a whole number over 2^53
+    or a key with more than 30 dots, or would take too much memory.
     """
-    if len(data) > max_size:
-        raise InputError(f"{what} must be at most {max_size} bytes, got more ({place})")
+    if len(data) > _MAX_SIZE:
+        raise InputError(f"{what} must be at most {_MAX_SIZE} bytes, got more ({place})")
     try:
         text = data.decode("utf-8-sig")
         if any(key[0].count(".") > _MAX_DOTS for key in _KEY.finditer(text)):
@@ -74,11 +70,7 @@ def parse_toml(data: bytes, what: str, place: str, max_size: int = MAX_SIZE) -> 
 def read_model(
     tree: Mapping[str, Any], kind: type[_T], place: str, entry_name: Callable[[str], str] = str, context: Any = None
 ) -> _T:
-    """Convert the tables `tree` of a TOML file to the model or dataclass `kind`; raise InputError if they do not fit.
-
-    `place`: file, for the error; `entry_name`: function that converts the name of the wrong entry for the error;
-    `context`: data for the validators of `kind`.
-    """
+    """Convert the tables `tree` of the file `place` by `convert_type`; raise InputError if they do not fit."""
     try:
         return convert_type(kind, tree, entry_name, context)
     except ValueError as error:
@@ -94,11 +86,9 @@ class PriorTable:
     """
 
     def __init__(self, **values: Any) -> None:
-        """Set the keys of the table, directly in its `__dict__`, because `__setattr__` refuses all changes."""
-        vars(self).update(values)
+        vars(self).update(values)  # as `__setattr__` refuses all changes
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Refuse to change a key of the table."""
         raise AttributeError(f"a table of priors is frozen, got {name} = {value!r}")
 
 
@@ -117,10 +107,7 @@ def read_priors(package: str, kind: type[_T]) -> _T:
 
 
 def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
-    """Convert a table of priors, with {value, unit, source} by key, to the type `kind`, a `PriorTable` or a mapping.
-
-    `place`: file and name of the table, for errors. Raises InputError if a key or a value does not fit `kind`.
-    """
+    """Convert a table of priors, with {value, unit, source} by key, to the type `kind`, a `PriorTable` or a mapping."""
     is_mapping = get_origin(kind) is not None  # such as Mapping[str, float]
     optional: tuple[str, ...] = ()
     if is_mapping:
@@ -131,38 +118,29 @@ def _parse_table(rows: Mapping[str, Any], kind: Any, place: str) -> Any:
         kinds = get_type_hints(kind)
         optional = tuple(name for name in kinds if hasattr(kind, name))  # keys with a default
     _check_keys(rows, kinds, optional, f"keys of {place}")
-    values = {name: _parse_value(row, kinds[name], f"{place} {name}") for name, row in rows.items()}
+    values = {}
+    for name, row in rows.items():
+        if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
+            raise InputError(f"{place} {name} must have value, unit and source, got {row!r}")
+        values[name] = _parse_value(row["value"], kinds[name], f"{place} {name}")
     return MappingProxyType(values) if is_mapping else kind(**values)
 
 
-def _parse_value(row: Any, kind: Any, place: str) -> Any:
-    """Convert the value of a prior to `kind`: int, float, or a tuple of them.
-
-    `row`: the prior as {value, unit, source}; `place`: file, table and key, for the InputError if it does not fit.
-    """
-    if not isinstance(row, dict) or set(row) != {"value", "unit", "source"} or not (row["unit"] and row["source"]):
-        raise InputError(f"{place} must have value, unit and source, got {row!r}")
+def _parse_value(value: Any, kind: Any, place: str) -> Any:
+    """Convert the value of a prior to `kind`: int, float, or a tuple of them; raise InputError if it does not fit."""
     if get_origin(kind) is tuple:
         item_kind, *rest = get_args(kind)
         has_any_length = Ellipsis in rest  # tuple[float, ...]
-        if not isinstance(row["value"], list) or not (has_any_length or len(row["value"]) == 1 + len(rest)):
-            raise InputError(f"{place} must be a list that fits {kind}, got {row['value']!r}")
-        return tuple(_parse_number(value, item_kind, place) for value in row["value"])
-    return _parse_number(row["value"], int if kind is int else float, place)
-
-
-def _parse_number(value: Any, kind: type, place: str) -> Any:
-    """Convert a number of a file of priors to `kind`, int or float; raise InputError for any other value."""
+        if not isinstance(value, list) or not (has_any_length or len(value) == 1 + len(rest)):
+            raise InputError(f"{place} must be a list that fits {kind}, got {value!r}")
+        return tuple(_parse_value(item, item_kind, place) for item in value)
     if isinstance(value, bool) or not isinstance(value, int if kind is int else (int, float)):
         raise InputError(f"{place} must be {'a whole number' if kind is int else 'a number'}, got {value!r}")
-    return kind(value)
+    return int(value) if kind is int else float(value)  # a float also where `kind` is `float | None`
 
 
 def _check_keys(keys: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that a table has all keys in `names`, except `optional` ones, and no others; raise InputError otherwise.
-
-    `keys`: the keys of the table; `place`: subject of the error message, such as "keys of FILE [TABLE]".
-    """
+    """Check that the `keys` of a table are `names`, of which those in `optional` may be missing."""
     for name in keys:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")
@@ -174,8 +152,7 @@ def _check_keys(keys: Collection[str], names: Collection[str], optional: Collect
 def _estimate_memory(text: str) -> int:
     """Estimate an upper limit of the memory [bytes] that a TOML text will take once it is parsed.
 
-    Tables, elements of arrays of tables (`n_rows`), keys and values are counted by the punctuation of the text, without
-    parsing it, and multiplied by the memory that each takes (`_TABLE` to `_VALUE`).
+    Tables, elements of arrays of tables (`n_rows`), keys and values are counted by the punctuation of the text.
     """
     n_tables = n_rows = 0  # a dotted key makes a table for each dot
     for line in StringIO(text):
