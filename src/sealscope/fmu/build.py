@@ -75,7 +75,7 @@ def this_platform() -> str:
 
 
 class Compiler(NamedTuple):
-    """A C compiler: its command with the first arguments, and True if it also compiles for other systems."""
+    """A C compiler; `command` has the first arguments; `cross_compiles`: True if it compiles for other systems, too."""
 
     command: list[str]
     cross_compiles: bool
@@ -123,8 +123,7 @@ class MockUp(NamedTuple):
 
     `summary`: one line that describes the FMU; `modules`: LLVM code by name of the function; `values`: initial values
     of the parameters, in the order of the code; `n_states`: number of states, or of doubles in the memory of a soft
-    sensor; `step` [s]: longest step of the solver, or sampling interval of a soft sensor; `failures`: messages by the
-    code that a function returns.
+    sensor; `step` [s]: longest step of the solver, or sampling interval; `failures`: messages by a function's code.
     """
 
     summary: str
@@ -145,8 +144,7 @@ class MockUp(NamedTuple):
 
     def write(self, path: Path, version: Version, platforms: Sequence[str]) -> None:
         """Write the archive for FMI `version` with a library for each platform; raise InputError if compiling fails."""
-        name = re.sub(r"\W", "_", path.stem, flags=re.ASCII)
-        identifier = name if re.match(r"[A-Za-z_]", name) else f"_{name}"  # must be valid in C
+        identifier = re.sub(r"\W|^(?=\d)", "_", path.stem, flags=re.ASCII)  # must be valid in C
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
             source_folder = Path(folder)
             sources = self._write_sources(source_folder, version)

@@ -67,14 +67,14 @@ ARGUMENTS: Mapping[str, tuple[str, ...]] = {
 @law
 def _at_rk4_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float]:
     """Compute an input a + b s at the three times s [s] that a Runge-Kutta step from t to t + h needs."""
-    n = RK4_NODES  # the times after t as fractions of h
+    n = RK4_NODES  # fractions of h
     return a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
 
 
 @law
 def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float, float, float, float, float]:
     """Compute an input a + b s at the six times s [s] that an implicit-explicit step from t to t + h needs."""
-    n = IMEX_NODES  # the times after t as fractions of h
+    n = IMEX_NODES  # fractions of h
     at_0, at_1, at_2 = a + b * (t + n[0] * h), a + b * (t + n[1] * h), a + b * (t + n[2] * h)
     at_3, at_4, at_5 = a + b * (t + n[3] * h), a + b * (t + n[4] * h), a + b * (t + n[5] * h)
     return at_0, at_1, at_2, at_3, at_4, at_5
@@ -111,8 +111,8 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
 
     - ``start(values, inputs, x_0, y)`` sets `y` to standstill at x_0 [m] under the load among the inputs.
     - ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps` equal steps, while
-      the inputs change linearly by their `slopes` (per second).
-    - ``report(values, inputs, y, results)`` writes the outputs to `results`.
+      the inputs change linearly by their `slopes` (per second); `y` is replaced also after a failure.
+    - ``report(values, inputs, y, results)`` writes the outputs, then the electric, hydraulic and mechanical power [W].
 
     All arguments but x_0, span and steps are pointers to arrays of doubles, in the order of the module's docstring.
     """
@@ -129,14 +129,12 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         return RigNumbers(*(parameters + derived + laws))
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Set the state `y` to standstill at x_0 [m] under the load among `inputs`; return 0 or a failure's code."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         p = model_parameters(v, input_values)
         state[:] = 0.0
         return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the outputs for state `y`, and electric, hydraulic and mechanical power [W], to `results`; return 0."""
         v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
         out = carray(results, _N_RESULTS)
         p, z = model_parameters(v, input_values), state_of(state)
@@ -147,37 +145,21 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
         return 0
 
-    if implicit:
+    @law
+    def explicit_step(z: Any, h: float, u: Any, G: Any, C: Any, F: Any, p: Any) -> Any:
+        return rk4_step(z, h, u, G, C, F, p, euler)
 
-        @law
-        def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z from the time t to t + h [s] by the implicit-explicit method of Runge and Kutta.
+    at_nodes: Any = _at_imex_nodes if implicit else _at_rk4_nodes
+    solver_step: Any = imex_step if implicit else explicit_step
 
-            Each input is a + b tau at the time tau [s]: command u, conductances G and orifices C of leaks, load F. `p`:
-            parameters.
-            """
-            u, G = _at_imex_nodes(a[_U], b[_U], t, h), _at_imex_nodes(a[_G], b[_G], t, h)
-            C, F = _at_imex_nodes(a[_C], b[_C], t, h), _at_imex_nodes(a[_F], b[_F], t, h)
-            return imex_step(z, h, u, G, C, F, p)
-
-    else:
-
-        @law
-        def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
-            """Advance the state z from the time t to t + h [s] by the explicit method of Runge and Kutta.
-
-            Each input is a + b tau at the time tau [s]: command u, conductances G and orifices C of leaks, load F. `p`:
-            parameters.
-            """
-            u, G = _at_rk4_nodes(a[_U], b[_U], t, h), _at_rk4_nodes(a[_G], b[_G], t, h)
-            C, F = _at_rk4_nodes(a[_C], b[_C], t, h), _at_rk4_nodes(a[_F], b[_F], t, h)
-            return rk4_step(z, h, u, G, C, F, p, euler)
+    @law
+    def step(z: Any, h: float, t: float, a: Any, b: Any, p: Any) -> Any:
+        """Advance the state z from the time t to t + h [s], while each input is a + b tau at the time tau [s]."""
+        u, G = at_nodes(a[_U], b[_U], t, h), at_nodes(a[_G], b[_G], t, h)
+        C, F = at_nodes(a[_C], b[_C], t, h), at_nodes(a[_F], b[_F], t, h)
+        return solver_step(z, h, u, G, C, F, p)
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Integrate the state `y` over `span` [s] in equal steps, while the inputs change by `slopes` per second.
-
-        `y` is replaced also after a failure. Returns 0, or a code of `FAILURES`.
-        """
         v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
         a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)  # the inputs at the time t are a + b t
         p, z, h = model_parameters(v, a), state_of(state), span / steps
@@ -211,14 +193,14 @@ def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
     return MappingProxyType(modules)
 
 
-def object_code(module: str, triple: str | None = None) -> bytes:
+def object_code(module: str, triple: str) -> bytes:
     """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
 
-    `module`: text of the code; `triple`: LLVM's target, such as "x86_64-pc-windows-gnu", None for the present one.
+    `module`: text of the code; `triple`: LLVM's target, such as "x86_64-pc-windows-gnu".
     """
     llvm.initialize_all_targets()
     llvm.initialize_all_asmprinters()
-    target = llvm.Target.from_triple(triple or llvm.get_process_triple())
+    target = llvm.Target.from_triple(triple)
     machine = target.create_target_machine(opt=3, reloc="pic", codemodel="default")
     parsed = llvm.parse_assembly(module)
     parsed.triple, parsed.data_layout = machine.triple, str(machine.target_data)

@@ -94,9 +94,8 @@ def record_fmu(
             f"an FMU must have the outputs p_A and p_B, got {', '.join(sorted(variables)[:12])} ({path}); name them "
             "with --map p_A=NAME"
         )
-    rate = experiment.rate
+    rate, n = experiment.rate, round(experiment.duration * experiment.rate)  # n: samples of the recording
     factor = steps_per_output(rate, min(_MAX_STEP, _MAX_STEP_FRACTION / rate))  # communication steps per sample
-    n = round(experiment.duration * rate)  # samples of the recording
     # communication points, with those that the anti-alias filter needs after the last sample
     t = np.arange((n + FILTER_REACH) * factor + 1) / (rate * factor)
     input_table = _build_input_table(path, experiment, names, variables, t)
@@ -124,10 +123,7 @@ def record_fmu(
 
 
 def _check_experiment(experiment: Experiment) -> None:
-    """Raise InputError for an experiment that an FMU cannot run.
-
-    Such an experiment has a position target, a fault or drift of the machine, or a leak that is stated as a flow.
-    """
+    """Raise InputError for an experiment that an FMU cannot run."""
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
     if experiment.effects():
@@ -156,11 +152,10 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Find the FMU's variable for each channel and input; return the variables' names by channel or input.
+    """Find the FMU's variable for each channel and input that it has; return the variables' names.
 
     `path`: the FMU's file, for messages; `variables`: all its variables by name; `names`: variables of those channels
-    and inputs that have another name in the FMU. Channels and inputs without a variable are left out. Raises InputError
-    if `names` has an unknown channel or variable.
+    and inputs that have another name in the FMU. Raises InputError if `names` has an unknown channel or variable.
     """
     valid_names = {*_INPUT_NAMES, *_MEASURED_NAMES}
     for channel, variable in names.items():
@@ -180,8 +175,7 @@ def _build_input_table(
 
     FMPy keeps an input constant during a step, so each row has the value in the middle of the step, for second-order
     accuracy. `path`: the FMU's file, for messages; `names`: name of the FMU's variable for each channel and input;
-    `variables`: FMPy's description of each variable, by name. Raises InputError if the FMU lacks an input that the
-    experiment needs, or if the load is a function of position or velocity.
+    `variables`: FMPy's description of each variable, by name.
     """
     half_step = 0.5 * (t[1] - t[0])
     # in each step, the inputs are needed at one time only, its middle
@@ -189,18 +183,16 @@ def _build_input_table(
     if experiment.load is not None and experiment.load.tables() is not None:
         raise InputError(f"an FMU needs a load over time, got one over position or velocity ({experiment.load})")
     load = np.zeros(t.size) if experiment.load is None else np.asarray(experiment.load.value_at(t + half_step))
-    inputs = {"u": u, "G": G, "C": C, "F": load}
-    columns: dict[str, Array] = {}
-    for name, values in inputs.items():
+    columns: dict[str, Array] = {"time": t}
+    for name, values in {"u": u, "G": G, "C": C, "F": load}.items():
+        si_unit, meaning = INPUTS[name]
         if name in names:
-            variable = variables[names[name]]
-            si_unit, _ = INPUTS[name]
-            columns[names[name]] = from_si(values, variable.unit, si_unit, name=name) if variable.unit else values
+            unit = variables[names[name]].unit
+            columns[names[name]] = from_si(values, unit, si_unit, name=name) if unit else values
         elif name == "u" or np.any(values):
-            _, meaning = INPUTS[name]
             raise InputError(f"the experiment needs the input {name} ({meaning}), which {path} does not have")
-    rows = np.empty(t.size, dtype=[(name, float) for name in ("time", *columns)])
-    for name, values in {"time": t, **columns}.items():
+    rows = np.empty(t.size, dtype=[(name, float) for name in columns])
+    for name, values in columns.items():
         rows[name] = values
     return rows
 
@@ -208,18 +200,17 @@ def _build_input_table(
 def _run_unit(
     path: Path, t: Array, input_table: Array, outputs: list[str], duration: float, progress: Progress | None
 ) -> Any:
-    """Run the FMU with a table of inputs; return "time" and each of `outputs` at the communication points `t` [s].
+    """Run the FMU with a table of inputs; return a structured array of `outputs` at the communication points `t` [s].
 
-    The result is a structured array. `duration` [s]: length of the recording. Raises SimulationFailed if the FMU fails,
-    ends early, or ends with an output that is not finite.
+    `duration` [s]: length of the recording. Raises SimulationFailed if the FMU fails, ends early, or ends with an
+    output that is not finite.
     """
     import fmpy
 
     def report_step(time: float, _recorder: Any) -> bool:
-        """Report the progress at `time` [s] after a step; return True, which tells FMPy to continue."""
         if progress is not None:
             progress("running the unit", min(1.0, time / duration))
-        return True
+        return True  # tells FMPy to continue
 
     communication_step = float(t[1] - t[0])
     log = io.StringIO()

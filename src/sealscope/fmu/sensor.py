@@ -103,13 +103,13 @@ _G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
 _SUM, _NUMBER = 0, 1
 #: Columns of `waiting_sizes`: number of rows, and mean abs(p_A - p_B) [Pa], of a block.
 _BLOCK_ROWS, _BLOCK_PRESSURE = 0, 1
-#: Scalars of a soft sensor's memory: time to the next sample [s]; number of samples; sign of the angle, 1 or -1;
-#: number of blocks weighted, of open blocks and of their rows, and of blocks that wait for the first fit; median
-#: precision of a block; number of successive blocks of larger motion, and of blocks estimated; sums over the baseline
-#: of g, of g^2 and of its variance.
+#: Scalars of a soft sensor's memory: `size_error` of its `SensorChoice`; time to the next sample [s]; number of
+#: samples; sign of the angle, 1 or -1; number of blocks weighted, of open blocks and of their rows, and of blocks that
+#: wait for the first fit; median precision of a block; number of successive blocks of larger motion, and of blocks
+#: estimated; sums over the baseline of g, of g^2 and of its variance.
 _SCALARS = (
-    "clock", "sample_count", "angle_sign", "n_weighted", "n_open", "n_rows", "n_waiting", "usual_precision", "n_moving",
-    "n_estimated", "base_sum", "base_square_sum", "base_variance_sum",
+    "size_error", "clock", "sample_count", "angle_sign", "n_weighted", "n_open", "n_rows", "n_waiting",
+    "usual_precision", "n_moving", "n_estimated", "base_sum", "base_square_sum", "base_variance_sum",
 )  # fmt: skip
 
 
@@ -199,13 +199,14 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     """Build the functions ``start``, ``advance`` and ``report`` of a soft sensor's FMU; return them by name.
 
     ``start`` clears the sensor's memory `y`, ``advance`` adds the samples of a communication step to it, and ``report``
-    writes the outputs to `results`. Their arguments are those of `fmu.machine.build_functions`.
+    writes the outputs to `results`. Their arguments, some of them unused here, are those of
+    `fmu.machine.build_functions`.
     """
     from scipy.special import stdtrit
 
     layout = memory_layout(choice)
     interval = 1.0 / choice.rate  # [s] between samples
-    add_sample, memory = _build_add_sample(choice), record_view(layout)
+    add_sample, memory = _build_add_sample(choice), record_view(layout)  # `memory` views `y` as a record
     n_memory = layout.itemsize // 8  # doubles
     n_inputs, n_results, n_values = len(INPUTS), len(SENSOR_RESULTS), len(VALUES)
     size_error = choice.size_error
@@ -213,18 +214,11 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
     quantiles = tuple(float(stdtrit(freedom, quantile_order)) for freedom in range(1, WINDOW))  # Student's t
 
     def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        """Clear the memory `y`; return 0, or a code of `FAILURES` if the displacement in `values` is not > 0.
-
-        `inputs`, `x_0`: ignored.
-        """
         carray(y, n_memory)[:] = 0.0
+        memory(y).size_error = size_error
         return _SUCCESS if carray(values, n_values)[_DISPLACEMENT_INDEX] > 0.0 else _NO_DISPLACEMENT
 
     def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        """Add the samples of the next `span` [s] to the memory `y`; estimate the leakage of complete blocks; return 0.
-
-        `inputs`: measurements at the start of the span; `slopes`: their change per second, constant; `steps`: ignored.
-        """
         m, displacement = memory(y), carray(values, n_values)[_DISPLACEMENT_INDEX] / (2.0 * math.pi)  # [m^3/rad]
         first, slope = carray(inputs, n_inputs), carray(slopes, n_inputs)
         t = m.clock
@@ -242,8 +236,7 @@ def build_functions(choice: SensorChoice) -> dict[str, Callable[..., Any]]:
         return _SUCCESS
 
     def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        """Write the sensor's outputs from its memory `y` to `results`; return 0. `values`, `inputs`: ignored."""
-        _write_results(memory(y), size_error, quantiles, carray(results, n_results))
+        _write_results(memory(y), quantiles, carray(results, n_results))
         return _SUCCESS
 
     return {"start": start, "advance": advance, "report": report}
@@ -300,15 +293,12 @@ def _build_add_sample(choice: SensorChoice) -> Callable[..., Any]:
 
 @law
 def _add_pressure_difference(m: Any, k: int, n_block: int, rate: float) -> None:
-    """Add abs(p_A - p_B) [Pa] of sample interval k to the sums of its block in the sensor's memory m.
-
-    `n_block`: samples in a block; `rate` [Hz]: sampling rate. An interval with a missing measurement is left out.
-    """
+    """Add abs(p_A - p_B) [Pa] of sample interval k to the sums of its block of `n_block` samples at `rate` [Hz]."""
     slot = (k // n_block) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
     if k % n_block == 0:
         m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
-    # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate. An interval without the pump's
-    # angle is left out here because the volume balance leaves it out, too
+    # increments[_LEAK]: mean of p_A - p_B over the interval, times its duration 1/rate. An interval with a missing
+    # measurement, also of the pump's angle, is left out, as by the volume balance
     if not math.isnan(m.increments[_LEAK] + m.increments[_RESPONSE]):
         m.pressure_sums[slot, _SUM] += abs(m.increments[_LEAK]) * rate
         m.pressure_sums[slot, _NUMBER] += 1.0
@@ -321,7 +311,7 @@ def _compute_increments(ring: Any, k: int, half: int, rate: float, displacement:
     They are written to `out` (n,) in the order of `COLUMNS`: for example, that of the response is the volume that the
     pump displaces [m^3], and that of the leak the time integral of p_A - p_B [Pa s]. `ring`: the last samples, where
     sample k has the column k modulo the width of `ring`; `half`: samples on either side of the central difference that
-    shows the direction of motion; `rate` [Hz]: sampling rate; `displacement` [m^3/rad] of the pump.
+    shows the direction of motion; `displacement` [m^3/rad] of the pump.
     """
     width = ring.shape[1]
     slot, next_slot = k % width, (k + 1) % width
@@ -378,14 +368,13 @@ def _load_block(m: Any, gram: Any) -> None:
 
 
 @large_law
-def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: float, is_learned: bool) -> None:
+def _append_conductance(m: Any, n_rows: float, pressure: float, is_learned: bool) -> None:
     """Estimate the leakage conductance of the block of samples loaded in `m.model`, and append it to the history.
 
     An estimate is left out if its precision (1/variance) is not positive or, at standstill, at most
     `MIN_REST_PRECISION` times the usual one. The first `WINDOW` estimates are also added to the sums of the baseline.
-    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
-    `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B); `is_learned`: True
-    if the balance's other coefficients are updated with the block.
+    `n_rows`, `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B);
+    `is_learned`: True if the balance's other coefficients are updated with the block.
     """
     model = m.model
     motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
@@ -396,7 +385,7 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
     G, history, k = weighted_G / precision, m.history, int(m.n_estimated) % WINDOW
     comparable_G = G - weighted_shift / precision  # without jumps where the other coefficients improve
     history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
-    history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (size_error * G) ** 2
+    history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (m.size_error * G) ** 2
     history[k, _PRESSURE] = pressure
     m.n_estimated += 1.0
     if m.n_estimated <= WINDOW:
@@ -406,12 +395,11 @@ def _append_conductance(m: Any, size_error: float, n_rows: float, pressure: floa
 
 
 @large_law
-def _fit_to_waiting(m: Any, size_error: float) -> None:
+def _fit_to_waiting(m: Any) -> None:
     """Fit the volume balance to the first `LEARNED` blocks of samples, and append their leakage to the history.
 
-    `m`: the sensor's memory, in which these blocks wait for the fit; afterwards no block waits. The median precision of
-    their estimates is stored as `usual_precision`, with which each precision at standstill is compared. `size_error`:
-    relative standard error of the leakage due to the machine's sizes (displacement, piston area).
+    These blocks wait in the sensor's memory m for the fit; afterwards no block waits. The median precision of their
+    estimates is stored as `usual_precision`, with which each precision at standstill is compared.
     """
     model = m.model
     _find_angle_sign(m)
@@ -426,7 +414,7 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
     for k in range(LEARNED):
         _load_block(m, m.waiting_grams[k])
         n_rows, pressure = m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE]
-        _append_conductance(m, size_error, n_rows, pressure, is_learned=False)
+        _append_conductance(m, n_rows, pressure, is_learned=False)
     m.n_waiting = 0.0
 
 
@@ -434,9 +422,8 @@ def _fit_to_waiting(m: Any, size_error: float) -> None:
 def _forget_standstill(m: Any) -> None:
     """Discard the coefficients and estimates of a standstill in the sensor's memory m: they do not hold in motion.
 
-    The weighting of the rows (`slow_sums`) remains, as after `LiveBalance.relearn`. No block waits. What else remains
-    is not read again: the history counts only up to `n_estimated`, and the next fit overwrites the coefficients' values
-    and the sign of the angle.
+    The weighting of the rows (`slow_sums`) remains, as after `LiveBalance.relearn`. What else remains is not read
+    again: the history counts only up to `n_estimated`, and the next fit sets the coefficients and the angle's sign.
     """
     model = m.model
     model.sums[:, :] = 0.0
@@ -446,16 +433,13 @@ def _forget_standstill(m: Any) -> None:
 
 
 @large_law
-def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressure: float) -> None:
+def _update_with_block(m: Any, b: int, n_rows: float, pressure: float) -> None:
     """Estimate the leakage of block b from its Gram matrix `m.gram[b]`, and append it to the history.
 
     Before the first fit, blocks are only stored, beginning with the first that has motion; the coefficients are fitted
     to the first `LEARNED` blocks together. After `N_WAKING` successive blocks whose mean square motion is more than
     1/`STANDSTILL` times that of earlier blocks, the machine is taken to have stood still before: all estimates are
-    discarded, and the first fit is repeated.
-
-    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes; `n_rows`,
-    `pressure` [Pa]: number of rows of the volume balance in the block, and its mean abs(p_A - p_B).
+    discarded, and the first fit is repeated. `n_rows`, `pressure`: as in `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
     if m.usual_precision > 0.0:
@@ -465,7 +449,7 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
             _forget_standstill(m)
             return
         _load_block(m, m.gram[b])
-        _append_conductance(m, size_error, n_rows, pressure, is_learned=True)
+        _append_conductance(m, n_rows, pressure, is_learned=True)
         return
     k = int(m.n_waiting)
     if k == 0 and not motion_square > 0.0:  # blocks before the first motion are left out
@@ -476,22 +460,20 @@ def _update_with_block(m: Any, size_error: float, b: int, n_rows: float, pressur
             m.waiting_grams[k, i, j] = m.gram[b, i, j]
     m.n_waiting += 1.0
     if k + 1 == LEARNED:
-        _fit_to_waiting(m, size_error)
+        _fit_to_waiting(m)
 
 
 def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
     """Build the compiled function of a soft sensor that is called when a block's last row is complete."""
-    column_order, n_fast, size_error = choice.column_order, choice.n_fast, choice.size_error
+    column_order, n_fast = choice.column_order, choice.n_fast
 
     @large_law
     def finish_block(m: Any, rows: Any, ends: Any, block: int) -> None:
         """Finish the newest block: weight the rows of all open blocks, and use each in the estimate of the leakage.
 
-        A block is open until its rows are weighted. The first `SUPPORT` blocks stay open until the last of them ends,
-        so the calls for the earlier ones only store the block's end. Each later block is weighted when it ends.
-
-        `m`: the sensor's memory; `rows`: rows of the volume balance in the open blocks; `ends`: index past the last row
-        of each open block, the last to be set here; `block`: number of the newest block in the run, from 0.
+        A block is open until its rows are weighted. The first `SUPPORT` blocks stay open until the last of them ends.
+        `rows`: rows of the volume balance in the open blocks; `ends`: index past the last row of each open block, the
+        last to be set here; `block`: number of the newest block in the run, from 0.
         """
         n_rows, n_open, is_first = len(rows), len(ends), m.n_weighted == 0.0
         ends[n_open - 1] = n_rows
@@ -515,7 +497,7 @@ def _build_finish_block(choice: SensorChoice) -> Callable[..., Any]:
             slot = (block - n_open + 1 + b) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
             pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
             if block_rows > 0.0:
-                _update_with_block(m, size_error, b, block_rows, pressure)
+                _update_with_block(m, b, block_rows, pressure)
 
     return finish_block  # type: ignore[no-any-return]
 
@@ -543,7 +525,7 @@ def _variance_of_mean(history: Any, newest: int, n: int) -> float:
 
 
 @law
-def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
+def _write_results(m: Any, quantiles: Any, out: Any) -> None:
     """Compute the outputs of the soft sensor by the formulas of the module's docstring, and write them to `out`.
 
     With means over the last blocks, and p = abs(p_A - p_B),
@@ -554,10 +536,7 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     where G is a block's conductance, and g the one that can be compared between blocks (`_COMPARABLE_G`), whose scatter
     gives both intervals. At most the last `WINDOW` blocks count, for the rise without those of the baseline. The
     leakage needs two blocks, the rise and the flag `settled` need two blocks after the baseline; without them these
-    outputs are 0.
-
-    `m`: the sensor's memory; `size_error`: relative standard error of the leakage due to the machine's sizes;
-    `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: outputs in the order of `SENSOR_RESULTS`.
+    outputs are 0. `quantiles`: Student's t for 1, 2, ... degrees of freedom; `out`: in the order of `SENSOR_RESULTS`.
     """
     out[:] = 0.0
     history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1
@@ -584,7 +563,7 @@ def _write_results(m: Any, size_error: float, quantiles: Any, out: Any) -> None:
     # each block; `base_variance` is 1 for the noise plus WALK (WINDOW + 1)/6 for the walk within the baseline
     walk = WALK * (n_estimated - 0.5 * (n + WINDOW)) / (1.0 + WALK * (WINDOW + 1.0) / 6.0)
     variance = _variance_of_mean(history, newest, n) + base_variance * (1.0 / WINDOW + walk)
-    half_width = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * size_error * rise)
+    half_width = math.hypot(quantiles[n - 2] * math.sqrt(variance), WITHIN_95 * m.size_error * rise)
     out[_OUT_SETTLED], out[_OUT_RISE] = 1.0, pressure * rise
     out[_OUT_RISE_LOW], out[_OUT_RISE_HIGH] = pressure * (rise - half_width), pressure * (rise + half_width)
 
