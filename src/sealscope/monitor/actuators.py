@@ -176,10 +176,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", *_RESULT_TYPES, "n_stored", "recorder"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore detector, recorder and last results from `state`, plain values of a checkpoint.
-
-        `_load_checkpoint` restores the alarm, even if the detector starts anew.
-        """
+        """Restore detector, recorder and last results, but not the alarm, from the `state` of a checkpoint."""
         self.watch = Watch.from_state(state["watch"])
         restore_attributes(self, _RESULT_TYPES, state, _RESULT_TYPES)
         if self.recorder is not None and state["recorder"] is not None:
@@ -344,8 +341,7 @@ class WatchedActuators:
     def process_blocks(self, blocks: Sequence[SourceBlock]) -> None:
         """Judge blocks of samples, and store them with their estimates and alarms in one transaction.
 
-        Blocks of actuators not in the settings are only counted. After an error of the database nothing is stored, and
-        the call can be repeated.
+        Blocks of actuators not in the settings are only counted. After an error nothing is stored: repeat the call.
         """
         with self._lock:
             known_blocks = [block for block in blocks if block.actuator in self.settings]

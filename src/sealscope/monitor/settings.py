@@ -27,10 +27,9 @@ _LongText = Annotated[str, Field(min_length=1, max_length=1000)]
 
 
 def _resolve_in_folder(place: _PathLike, info: ValidationInfo) -> _PathLike:
-    """Resolve `place`, a path in the settings, relative to the folder of the settings file.
+    """Resolve `place`, a path in the settings, relative to the folder of the settings file in the `context`, if any.
 
-    `info`: its `context` has this folder. URLs and names of packaged rigs are returned unchanged, and so are all paths
-    if the settings do not come from a file (no `context`).
+    URLs and names of packaged rigs are returned unchanged.
     """
     is_name = isinstance(place, str) and ("://" in place or (info.field_name == "rig" and not place.endswith(".toml")))
     return place if is_name or not info.context else type(place)(Path(info.context["folder"]) / place)
@@ -40,10 +39,7 @@ _File = Annotated[Path, AfterValidator(_resolve_in_folder)]
 
 
 def _check_recording_length(seconds: float) -> float:
-    """Return the length of a stream's recordings [s]; raise ValueError unless it is 0 or within the allowed range.
-
-    The range is `recording.lengths` of the live watch's `priors.toml`.
-    """
+    """Return the length of a stream's recordings [s]; raise ValueError unless it is 0 or within the allowed range."""
     shortest, longest = LIVE.recording.lengths
     if seconds != 0.0 and not shortest <= seconds <= longest:
         raise ValueError(f"must be 0 or {shortest:g} to {longest:g} s, got {seconds:g}")
@@ -124,10 +120,9 @@ class ActuatorSettings(WatchSettings):
     def _fill_from_machine(cls, values: Any, info: ValidationInfo) -> Any:
         """Complete the table of an actuator with the rate, columns, units and repair limit in its machine's file.
 
-        `values`: the table, whose entries take precedence; `info`: its `context` has the folder of the settings. The
-        key `machine` is another name of `rig`, but must name a file written by `sealscope commission`. The limit
-        becomes `error_lpm` [L/min]. The units in the column headings of the machine's logs are used only for Sparkplug
-        and OPC UA, whose values need not state units.
+        `values`: the table, whose entries take precedence. The key `machine` is another name of `rig`, but must name a
+        file written by `sealscope commission`. The units in the column headings of the machine's logs are used only for
+        Sparkplug and OPC UA, whose values need not state units.
         """
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
@@ -145,10 +140,10 @@ class ActuatorSettings(WatchSettings):
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         # a text is "auto": the columns are then found only when a file is read
         columns = {} if isinstance(watched.channel_map, str) else dict(watched.channel_map)
-        units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
-        needs_units = units and (values.get("nodes") or values.get("sparkplug"))
         machine_values = {"map": columns or None, "rate": watched.rate, "error_lpm": watched.limit_lpm}
-        machine_values["units"] = units if needs_units else None
+        if values.get("nodes") or values.get("sparkplug"):
+            units = {name: unit for name, column in columns.items() if (unit := _column_unit(name, column))}
+            machine_values["units"] = units or None
         known_values = {name: value for name, value in machine_values.items() if value is not None}
         return {**known_values, **values}
 
@@ -240,10 +235,7 @@ class MonitorSettings(_Table):
     @model_validator(mode="before")
     @classmethod
     def _apply_defaults(cls, values: Any) -> Any:
-        """Fill the defaults into the table of each actuator, with an equal part of the fleet's false-alarm rate.
-
-        `values`: the tables of all settings. Raises ValueError if an actuator or the defaults state a rate, too.
-        """
+        """Fill the defaults into the table of each actuator, with an equal part of the fleet's false-alarm rate."""
         if not isinstance(values, dict):  # refused later, by the check of the types
             return values
         defaults, actuators = values.get("defaults", {}), values.get("actuator")
@@ -288,10 +280,7 @@ class MonitorSettings(_Table):
 
 
 def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
-    """Check the OPC UA nodes and units of an actuator's channels; raise ValueError or InputError for a wrong entry.
-
-    `has_opcua`: True if the settings have a table [opcua], which nodes need.
-    """
+    """Check the OPC UA nodes and units of an actuator's channels; raise ValueError or InputError for a wrong entry."""
     if actuator.nodes and (not has_opcua or actuator.rate is None):
         raise ValueError(f"an actuator with nodes needs the table [opcua] and a rate, got {actuator.name!r}")
     for table, channels in (("nodes", actuator.nodes), ("units", actuator.units)):
@@ -313,10 +302,7 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
 
 
 def _column_unit(channel: str, column: str) -> str | None:
-    """Find the unit in the heading of a channel's column; return None if it has no unit of the right dimension.
-
-    The result is also None for a channel that is not watched in live samples.
-    """
+    """Find the unit in the heading of a watched channel's column; return None if none has the right dimension."""
     label = Label.parse(column)
     _, unit_in_name = split_unit(label.name)
     unit = label.unit or unit_in_name
@@ -329,10 +315,7 @@ def topic_level(name: str) -> str:
 
 
 def read_settings(path: Path) -> MonitorSettings:
-    """Read the settings of a monitor from a TOML file; the paths in this file are relative to its folder.
-
-    Raises InputError, with a message of one line, if the file cannot be read or breaks a rule.
-    """
+    """Read the settings of a monitor from a TOML file; raise InputError if it cannot be read or breaks a rule."""
     values = read_toml(path, "the monitor's settings", os.fspath(path))
     context = {"folder": path.resolve().parent}
     # an error that concerns all settings has no entry: its message names the "settings"

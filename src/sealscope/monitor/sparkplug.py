@@ -57,8 +57,8 @@ class SparkplugMetric:
     def with_datatype(self, datatype: int) -> SparkplugMetric:
         """Convert the value from its transmitted form to a Sparkplug data type; return the changed metric.
 
-        The bytes of an array become numbers (n,), or None if the type is not supported. Integers of a signed type are
-        converted from two's complement. Raises ValueError if the bytes are not a whole number of values.
+        The bytes of an array become numbers (n,), or None if the type is not supported. Raises ValueError if the bytes
+        are not a whole number of values.
         """
         value = self.value
         if isinstance(value, bytes):

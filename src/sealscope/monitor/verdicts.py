@@ -110,18 +110,13 @@ class RecordingVerdict:
         return bool(self.verdict == NO_LEAK)
 
     def excludes(self, leak_lpm: float | None) -> bool:
-        """Return True if a leak of this flow [L/min] is above `bound_lpm`, the upper bound of an undetected leak.
-
-        The result is also True if the flow or the bound is not known: the verdict "no leak" then holds as it is.
-        """
+        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if one of them is unknown."""
         return self.bound_lpm is None or leak_lpm is None or self.bound_lpm < leak_lpm
 
     @property
     def decides(self) -> bool:
-        """True if the condition of the machine follows from this verdict, not from the estimates of single blocks.
-
-        The verdicts `leak` and `no leak` decide, and so does `cannot tell` after a person has marked the alarm.
-        """
+        """True if the machine's condition follows from this verdict, not from the estimates of single blocks."""
+        # "cannot tell" decides after a person has marked the alarm
         return self.leaks or self.excludes_leak or self.mark != ""
 
     def allowed_chance(self, false_alarms_per_1000_h: float) -> float:
@@ -131,12 +126,11 @@ class RecordingVerdict:
     def is_rare(self, false_alarms_per_1000_h: float) -> bool:
         """Return True if so few leak-free recordings get such a verdict that it may raise an alarm by itself.
 
-        `chance` must be at most `allowed_chance`. The smallest `chance` that a diagnosis states, `rarest` of
-        `diagnosis/decision/priors.toml`, is always rare enough: otherwise a short recording could never raise an alarm.
-        An unknown `chance` (None) counts as rare, so that no leak is missed.
+        An unknown `chance` counts as rare, so that no leak is missed.
         """
-        allowed_chance = self.allowed_chance(false_alarms_per_1000_h)
-        return self.chance is None or self.chance <= max(_FALSE_ALARM.rarest, allowed_chance)
+        # `rarest`, the smallest chance that a diagnosis states: a short recording, too, must be able to raise an alarm
+        max_chance = max(_FALSE_ALARM.rarest, self.allowed_chance(false_alarms_per_1000_h))
+        return self.chance is None or self.chance <= max_chance
 
     @property
     def e_value(self) -> float:
@@ -161,16 +155,21 @@ class RecordingVerdict:
 
     def neutral_after_mark(self, mark: str) -> RecordingVerdict:
         """Build the verdict `cannot tell`, shown after the `mark` "invalid" or "repaired" until the next recording."""
-        texts = {"summary": f"marked {mark}", "reason": "the next recording is judged anew", "size": "", "cause": ""}
-        values: dict[str, Any] = {**texts, "mark": mark, "start_s": self.start_s, "end_s": self.end_s}
-        return RecordingVerdict(self.file, CANNOT_TELL, state=state_of("watched").as_dict(), **values)
+        return RecordingVerdict(
+            self.file,
+            CANNOT_TELL,
+            summary=f"marked {mark}",
+            size="",
+            reason="the next recording is judged anew",
+            cause="",
+            state=state_of("watched").as_dict(),
+            start_s=self.start_s,
+            end_s=self.end_s,
+            mark=mark,
+        )
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Replace the leak in the estimate of a block by the leak of the whole recording.
-
-        Before the onset, or without a leak, the block gets no leak: `leak_lpm` is None, and its interval is 0 to
-        `bound_lpm`, or None if the bound is unknown.
-        """
+        """Replace the leak in the estimate of a block by the leak of the whole recording, none before its onset."""
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:
             return replace(block, leak_lpm=self.leak_lpm, leak_interval_lpm=self.leak_interval_lpm)
@@ -179,7 +178,6 @@ class RecordingVerdict:
 
 
 def _parse_interval(ends: Any) -> Interval | None:
-    """Convert the two ends of an interval to a pair of numbers; return None if there is none or an end is unknown."""
     return None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
 
 
@@ -204,11 +202,7 @@ def judge_recording(
 
 
 def judge_stream(rig: str, recording: Recording, *, limit_lpm: float | None = None) -> RecordingVerdict | None:
-    """Judge a recording of an actuator's stream by comparison with its machine's healthy recordings.
-
-    `rig`: the machine's file; `limit_lpm` [L/min]: leak that calls for a repair, None for the limit in this file.
-    Returns None if the file has no healthy recordings; raises InputError if it cannot be read.
-    """
+    """Judge a recording of an actuator's stream by `judge_recording`; raise InputError if `rig` cannot be read."""
     watched = load_watched(rig)  # read anew, as the file may have changed
     start, end = (float(recording.t[k]) for k in (0, -1))
     name = f"stream from {clock_text(start)} to {clock_text(end)}"

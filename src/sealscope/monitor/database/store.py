@@ -205,7 +205,7 @@ class MonitorStore:
     def insert_blocks(self, connection: sa.Connection, blocks: Iterable[tuple[str, str, int]]) -> None:
         """Store the identities of blocks, each given as (actuator, identity, running number for this actuator).
 
-        Raises IntegrityError, which ends the open transaction of `connection`, if one of the blocks is stored already.
+        Raises IntegrityError if one of the blocks is stored already.
         """
         names = ("actuator", "identity", "number")
         connection.execute(tables.blocks.insert(), [dict(zip(names, block, strict=True)) for block in blocks])
@@ -268,8 +268,7 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        `digest`: hash of the message. An attempt that ends is not counted (`end_decoding`): the earlier ones crashed
-        the process, so the caller can refuse the message.
+        An attempt that ends is not counted (`end_decoding`): the earlier ones crashed the process.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)
@@ -341,9 +340,8 @@ class MonitorStore:
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        Each row has the mean time `t` [s], flows and interval ends [L/min], and oil temperature [deg C] of a group of
-        successive estimates, with None for unknown values. `seconds` [s]: length of the history up to the last
-        estimate, None for all.
+        Each row has the mean time `t` [s] and `FIGURES` of a group of successive estimates. `seconds` [s]: length of
+        the history up to the last estimate, None for all.
         """
         columns = tables.estimates.c
         is_chosen = columns.actuator == actuator
@@ -373,9 +371,9 @@ class MonitorStore:
             self.upsert(connection, tables.facts, [{"name": name, "value": str(number)}])
 
     def deliver(self, output: str, send: Callable[[dict[str, Any]], bool]) -> None:
-        """Send up to 1000 events that an output has not sent yet, in order, and store the number of the last one sent.
+        """Send the events that an output has not sent yet, in order, by `send`; store the number of the last one sent.
 
-        `send`: function that sends an event, and returns False if the next call must try this event again.
+        If `send` returns False, the next call tries this event again.
         """
         for number, event in self.events_since(self.position(output)):
             if not send(event):
@@ -384,13 +382,10 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe in one line the database outage that an error reports; return None for an error of another kind.
-
-    A value that the database cannot store (DataError) is not an outage: waiting would not help.
-    """
+    """Describe in one line the database outage that an error reports; return None for an error of another kind."""
     if isinstance(error, PoolTimeout):
         return "every connection to the database is in use"
-    if not isinstance(error, DBAPIError) or isinstance(error, DataError):
+    if not isinstance(error, DBAPIError) or isinstance(error, DataError):  # DataError: waiting would not help
         return None
     return " ".join(str(error.orig).split())[:200]
 

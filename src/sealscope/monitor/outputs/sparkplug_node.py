@@ -101,8 +101,7 @@ class SparkplugNode:
     def _death_message(self) -> tuple[str, bytes]:
         """Build topic and payload of the death message, which the broker publishes when the next connection is lost.
 
-        Death and birth of a connection have the same number bdSeq (0 to 255), one more than that of the last birth sent
-        before. It becomes `_connection_birth_number`.
+        Death and birth of a connection have the same bdSeq (0 to 255), one more than that of the last birth sent.
         """
         self._connection_birth_number = (self._sent_birth_number + 1) % 256
         payload = spb.SparkplugPayload(_milliseconds(None), (self._birth_number_metric(),))
@@ -133,12 +132,9 @@ class SparkplugNode:
             self._birth_due.set()
 
     def _send_event(self, event: dict[str, Any]) -> bool:
-        """Send an event and its alarm as a data message of the actuator's device; return False if that fails.
-
-        The event of an actuator without a birth, which is not in the settings, is skipped, and True is returned.
-        """
+        """Send an event and its alarm as a data message of the actuator's device; return False if that fails."""
         alarm, timestamp = event["alarm"], _milliseconds(event["t"])
-        if alarm["actuator"] not in self._sent_values:
+        if alarm["actuator"] not in self._sent_values:  # without a birth, as it is not in the settings
             return True
         metrics = _build_metrics("alarm", _metric_values("alarm", alarm), timestamp)
         metrics += _build_metrics("event", _metric_values("event", event), timestamp)

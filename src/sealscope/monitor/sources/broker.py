@@ -182,11 +182,7 @@ class _Connection:
             self._received.put(queue_entry, size, always=True)
 
     def _submit_received(self) -> None:
-        """Decode and submit the queued messages in their order until the service stops.
-
-        A connection whose messages were left unacknowledged because the queue was full (`_on_message`) is closed once
-        the queue is empty, since the broker sends them again only on a new connection.
-        """
+        """Decode and submit the queued messages in their order until the service stops."""
         while not (self._service.stopping.is_set() or self._ended.is_set()):
             queue_entries = self._received.pop(max_items=1, timeout=0.5)
             for connection, message in queue_entries:
@@ -194,6 +190,7 @@ class _Connection:
                     self._submit(connection, message)
                 elif self._host is not None:  # a connection was made
                     self._host.request_all_births()
+            # the broker sends messages that were left unacknowledged (`_on_message`) only on a new connection
             if not queue_entries and (overfull_socket := self._overfull_socket) is not None:
                 self._overfull_socket = None
                 with suppress(OSError):  # paho reconnects

@@ -122,10 +122,7 @@ class WatchedFolder:
         return max(time.time() - file.modified_s, time.monotonic() - self._first_found[file.identity])
 
     def _is_due(self, file: _FoundFile) -> bool:
-        """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted.
-
-        A file that could not be read before is due only when it can no longer be unfinished (`_may_be_incomplete`).
-        """
+        """Return True if a file has not changed for `settle_s` and is not stored; mark a stored file as submitted."""
         is_incomplete = file.identity in self._unreadable and self._may_be_incomplete(file)
         if is_incomplete or self._unchanged_s(file) < self.settle_s:
             return False
@@ -170,9 +167,8 @@ class WatchedFolder:
     def _find_refusal_reason(self, samples: Recording, file: _FoundFile) -> str:
         """Return the reason to refuse a recording that starts before the newest recording so far, or "" to accept it.
 
-        After a restart, the time of the last stored sample replaces the start of the newest recording. An earlier
-        recording is accepted if it states only the day of the newest one, by a start at midnight, or if the newest one
-        is dated in the future. A new recording that is dated in the future is logged.
+        An earlier recording is accepted if it states only the day of the newest one, by a start at midnight, or if the
+        newest one is dated in the future. A new recording that is dated in the future is logged.
         """
         path, now = file.path, time.time()
         start = file_seconds(samples, path)

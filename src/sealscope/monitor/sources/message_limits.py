@@ -52,10 +52,7 @@ class MessageLimit(ValueError):  # noqa: N818 (names what is exceeded)
 
 
 def check_cbor(payload: bytes) -> int:
-    """Check number and depth of the items of a CBOR message; return the number of key-value pairs.
-
-    Raises MessageLimit above a limit, for an item of a type that is not allowed, or for an incomplete message.
-    """
+    """Check the items of a CBOR message; return the number of key-value pairs, or raise MessageLimit."""
     code, position, n_pairs = _scan_items(np.frombuffer(payload, dtype=np.uint8))
     if code != _NO_FAULT:
         raise MessageLimit(f"{_RULES[code]} (byte {position})", oversized=code == _LONG_LIST)
@@ -63,10 +60,7 @@ def check_cbor(payload: bytes) -> int:
 
 
 def check_json(payload: bytes) -> int:
-    """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons.
-
-    The number includes colons within texts; `check_json_keys` needs it. Raises MessageLimit above a limit.
-    """
+    """Check that a JSON message does not have too many quotation marks or brackets; return the number of colons."""
     n_quotes, n_brackets, n_colons = _count_marks(np.frombuffer(payload, dtype=np.uint8))
     if n_quotes > _MAX_QUOTES:
         raise MessageLimit(f"there must be at most {_MAX_QUOTES} quotation marks, got {n_quotes}")
@@ -78,8 +72,7 @@ def check_json(payload: bytes) -> int:
 def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
     """Check that no mapping of a JSON message repeats a key; raise MessageLimit otherwise.
 
-    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons in the payload (`check_json`). A
-    decoder keeps only the last value of a repeated key: there are then fewer pairs than colons outside texts.
+    `values`: the decoded message; `payload`: its bytes; `n_colons`: number of colons in the payload, also within texts.
     """
     if _count_shallow_pairs(values) != n_colons:  # a quick test, which a colon within a text also fails
         unquoted = payload.replace(b"\\\\", b"").replace(b'\\"', b"").split(b'"')[::2]  # the parts outside texts
@@ -87,10 +80,9 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that the decoded message `values` has `n_pairs` key-value pairs; raise MessageLimit otherwise.
+    """Check that a decoded message has as many key-value pairs as its bytes, `n_pairs`; raise MessageLimit otherwise.
 
-    `n_pairs`: number of pairs in the bytes of the message. The decoded message has fewer if a key is repeated, as a
-    decoder keeps only the last value of the key.
+    It has fewer if a key is repeated, as a decoder keeps only the last value of the key.
     """
     if _count_shallow_pairs(values) == n_pairs:  # a quick test
         return
@@ -107,7 +99,6 @@ def _count_shallow_pairs(values: Any) -> int:
 
 
 def _count_pairs(values: Any) -> int:
-    """Count the pairs of all mappings in `values`, at any depth."""
     if isinstance(values, dict):
         return len(values) + sum(map(_count_pairs, values.values()))
     return sum(map(_count_pairs, values)) if isinstance(values, list) else 0
@@ -126,11 +117,10 @@ def _count_marks(data: Any) -> tuple[int, int, int]:
 
 @law
 def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
-    """Read the argument of a CBOR item, a number; return the number and the position after it.
+    """Read the argument of a CBOR item, a number; return it and the position after it, -1 if the data end before.
 
-    `data` (n,): bytes of the message; `position`: index after the item's initial byte; `info`: low 5 bits of that byte.
-    An `info` below 24 is the argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain the argument.
-    Returns 0 and the position -1 if the data end before.
+    `position`: index in `data` (n,) after the item's initial byte; `info`: low 5 bits of that byte. An `info` below 24
+    is the argument itself; 24 to 27 mean that the next 1, 2, 4 or 8 bytes contain the argument.
     """
     if info < 24:
         return info, position
@@ -147,9 +137,9 @@ def _read_argument(data: Any, position: int, info: int) -> tuple[int, int]:
 def _skip_pieces(data: Any, start: int, position: int, major: int, n_texts: int) -> tuple[int, int, int]:
     """Skip a CBOR text or byte string of unknown length, which consists of pieces with the same major type `major`.
 
-    `data` (n,): bytes of the message; `start`, `position`: index of the item's first byte, and of its first piece;
-    `n_texts`: number of texts, byte strings, and their pieces and ends in the message so far. Returns the code of the
-    broken rule (0 for none), the position of the fault or, without a fault, after the item, and the new `n_texts`.
+    `start`, `position`: index in `data` (n,) of the item's first byte, and of its first piece; `n_texts`: number of
+    texts, byte strings, and their pieces and ends in the message so far. Returns the code of the broken rule (0 for
+    none), the position of the fault or, without a fault, after the item, and the new `n_texts`.
     """
     while True:
         n_texts += 1

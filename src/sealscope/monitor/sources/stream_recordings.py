@@ -49,11 +49,10 @@ class StreamRecorder(SavedAttributes):
     blocks: list[Recording] = field(default_factory=list)
 
     def take(self, number: int, samples: Recording) -> Recording | None:
-        """Collect the block of samples with the running `number`; return the recording that ends, if it is long enough.
+        """Collect the block of samples with the running `number`; return the recording that ends, None for a short one.
 
         A recording that reaches its full length or `_MAX_BYTES` contains `samples`; one that ends for another reason
-        does not. The times of the result are those of the blocks. Returns None if no recording ends, or a too short
-        one.
+        does not.
         """
         if not len(samples):
             return None
@@ -70,7 +69,7 @@ class StreamRecorder(SavedAttributes):
     def _end(self, *, follows: bool) -> Recording | None:
         """Join the collected blocks to a recording, and forget them; return None if it is too short.
 
-        The shortest recording has `_MIN_DURATION_S`. `follows`: True if the next block continues the stream.
+        `follows`: True if the next block continues the stream.
         """
         blocks, duration = self.blocks, self._duration()
         self.clear()
@@ -86,11 +85,7 @@ class StreamRecorder(SavedAttributes):
         return float(np.nanmax(self.blocks[-1].t) - np.nanmin(self.blocks[0].t)) if self.blocks else 0.0
 
     def _full_duration(self) -> float:
-        """Compute the length at which the present recording ends [s].
-
-        It is `duration_s`, times 1/2 to 1 (by a hash of the actuator's name) for the first recording of all or after a
-        gap; at least `_MIN_DURATION_S`.
-        """
+        """Compute the length at which the present recording ends [s]."""
         digest = blake2b(self.actuator.encode(), digest_size=4).digest()
         fraction = 1.0 if self.follows else 0.5 + 0.5 * int.from_bytes(digest) / 2**32
         return max(_MIN_DURATION_S, fraction * self.duration_s)
@@ -106,11 +101,7 @@ class StreamRecorder(SavedAttributes):
 
 
 def _continues(earlier: Recording, samples: Recording) -> bool:
-    """Return True if `samples` continue the block `earlier`: the same channels, units and rate, after a short time.
-
-    The time from the last sample of `earlier` to the first new one must be finite, above 0, and at most `recording.gap`
-    of `priors.toml` [s].
-    """
+    """Return True if `samples` continue the block `earlier`: the same channels, units and rate, after a short time."""
     has_same_format = (samples.units, samples.rate) == (earlier.units, earlier.rate)
     gap = float(samples.t[0] - earlier.t[-1])
     return has_same_format and 0.0 < gap <= _PRIORS.gap
