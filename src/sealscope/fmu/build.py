@@ -343,7 +343,6 @@ def write_sensor_fmu(
 
 
 def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
-    """Load the rig for an FMU; raise InputError if it is not pump-controlled."""
     machine = load_rig(rig)
     check_circuit_property("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
     return machine

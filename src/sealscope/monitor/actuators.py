@@ -435,8 +435,8 @@ class WatchedActuators:
         rows.add_checkpoint(settings.name, settings.watched_with.model_dump_json(), actuator.state(), first_kept)
         self._add_summary(actuator, rows)
         n_kept_estimates = self._keep_s / actuator.watch.block_seconds
-        rows.old_blocks[settings.name] = actuator.n_stored - MAX_IDENTITIES
-        rows.old_estimates[settings.name] = math.floor(actuator.watch.blocks - n_kept_estimates)
+        rows.old[tables.blocks][settings.name] = actuator.n_stored - MAX_IDENTITIES
+        rows.old[tables.estimates][settings.name] = math.floor(actuator.watch.blocks - n_kept_estimates)
         actuator.bytes = 0
 
     @staticmethod
@@ -493,7 +493,7 @@ class WatchedActuators:
         if outcome := record_mark(self.settings[name].rig, alarm, mark, alarm_samples):
             rows = StoredRows()
             rows.add_alarm(alarm, "comment", t, "Sealscope", outcome)
-            rows.alarms.clear()  # the alarm may have changed meanwhile: store the event only
+            del rows.current[tables.alarms]  # the alarm may have changed meanwhile: store the event only
             self.store.commit_rows(rows)
         self._notify_change()
         return alarm

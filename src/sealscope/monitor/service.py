@@ -177,10 +177,9 @@ class Service:
         return sources
 
     def _outputs(self) -> Iterator[Webhook | SparkplugNode]:
-        """Build and yield the outputs of alarms in the settings; raise InputError if a secret cannot be read.
+        """Yield the outputs of alarms in the settings; raise InputError if a secret cannot be read.
 
-        `deliver` of an output sends the new events, again and again, and `end` once the remaining ones; `part` is the
-        name under which its outages are shown.
+        `deliver` of an output is called again and again, and `end` once; `part` is the name for its outages.
         """
         webhook, node, broker = self.settings.webhook, self.settings.sparkplug, self.settings.mqtt
         if webhook is not None:
@@ -208,7 +207,7 @@ class Service:
         self.stopping.set()
 
     def close(self) -> None:
-        """Release the lock of the database, which another monitor can then open, and the limit of `run` on threads."""
+        """Release the lock of the database, which another monitor can then open."""
         self._resources.close()
 
     def _store(self, blocks: list[_Storable], write: Callable[[list[_Storable]], object]) -> None:
@@ -242,12 +241,9 @@ class Service:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 
     def _write_events(self) -> None:
-        """Write new events of alarms to the output stream.
-
-        If they could be read from the database, its outage ends, unless blocks cannot be written yet.
-        """
+        """Write new events of alarms to the output stream."""
         self._lines.deliver()
-        if not self._is_database_blocked:
+        if not self._is_database_blocked:  # the events were read, and nothing waits to be written
             self._database.end_outage()
 
 

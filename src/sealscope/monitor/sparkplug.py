@@ -157,7 +157,6 @@ def decode_payload(data: bytes) -> SparkplugPayload:
 
 
 def _get_fields(message: Any, *names: str) -> list[Any]:
-    """Return the values of fields of a protobuf message, with None for a missing field."""
     return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 

@@ -29,16 +29,20 @@ def guard_cell(value: Any) -> Any:
     return f"'{text}" if value.startswith(_FORMULA_BEGINNINGS) and not _NUMBER.fullmatch(value) else text
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write rows, mappings from column to value, as a CSV file with these `columns`; `guard_cell` escapes the texts.
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> int:
+    """Write rows, mappings from column to value, as a CSV file with these `columns`; return the number of rows.
 
-    A missing value gives an empty cell. Raises ValueError if a row has another column, and InputError if the file
-    cannot be written.
+    `guard_cell` escapes the texts. A missing value gives an empty cell. Raises ValueError if a row has another column,
+    and InputError if the file cannot be written.
     """
+    n_rows = 0
     with (
         atomic_write(path) as temporary,
         temporary.open("w", encoding="utf-8", errors="backslashreplace", newline="") as file,
     ):
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
-        writer.writerows({name: guard_cell(value) for name, value in row.items()} for row in rows)
+        for row in rows:
+            writer.writerow({name: guard_cell(value) for name, value in row.items()})
+            n_rows += 1
+    return n_rows

@@ -41,7 +41,6 @@ def _parse_whole(text: str) -> int:
 
 @cache
 def _type_adapter(kind: Any) -> Any:
-    """Build the pydantic validator of a type; the result is cached, because building it takes long."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)

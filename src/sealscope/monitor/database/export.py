@@ -28,7 +28,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
     mark is `repaired` or `valid`, `healthy` if it is `invalid`. Other estimates have no label.
     """
     events = _events_by_alarm(store)
-    rows = []
+    alarms = []
     # by actuator: start and stop [s] of an interval, and the columns `label` and `alarm` of the estimates in it
     intervals = defaultdict[str, list[tuple[float, float, dict[str, str]]]](list)
     # `alarms` lists the latest first: reversed and sorted by time, the labels of the latest alarm come last
@@ -38,7 +38,7 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
         onset_low, onset_high = alarm["onset_interval_s"] or (None, None)
         leak_low, leak_high = alarm["leak_interval_lpm"] or (None, None)
         comments = (f"{event['by']}: {event['text']}" for event in history if event["by"] and event["text"])
-        row = {
+        alarm |= {
             "marked_by": last_mark.get("by"),
             "marked_s": last_mark.get("t"),
             "comments": "; ".join(comments),
@@ -47,25 +47,21 @@ def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:
             "leak_low_lpm": leak_low,
             "leak_high_lpm": leak_high,
         }
-        rows.append({**alarm, **row})
+        alarms.append(_select_columns(alarm, ALARM_COLUMNS))
         if last_mark:
             start = alarm["onset_s"] if onset_low is None else onset_low
             labels = {"label": _LABELS[last_mark["event"]], "alarm": alarm["id"]}
             intervals[alarm["actuator"]].append((start, last_mark["t"], labels))
 
-    n_estimates = 0
-
-    def estimates() -> Iterator[dict[str, Any]]:
-        """Yield and count the rows of `estimates.csv`, with label and id of the marked alarm in which they lie."""
-        nonlocal n_estimates
+    def label_estimates() -> Iterator[dict[str, Any]]:
         for row in store.estimates():
-            n_estimates += 1
-            labels = [labels for start, stop, labels in intervals[row["actuator"]] if start <= row["t"] <= stop]
-            yield _select_columns({**row, **(labels[-1] if labels else {})}, ESTIMATE_COLUMNS)
+            for start, stop, labels in intervals[row["actuator"]]:
+                if start <= row["t"] <= stop:
+                    row.update(labels)
+            yield _select_columns(row, ESTIMATE_COLUMNS)
 
-    write_csv(folder / "alarms.csv", ALARM_COLUMNS, [_select_columns(row, ALARM_COLUMNS) for row in rows])
-    write_csv(folder / "estimates.csv", ESTIMATE_COLUMNS, estimates())
-    return len(rows), n_estimates
+    n_alarms = write_csv(folder / "alarms.csv", ALARM_COLUMNS, alarms)
+    return n_alarms, write_csv(folder / "estimates.csv", ESTIMATE_COLUMNS, label_estimates())
 
 
 def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any]]]:
@@ -80,5 +76,4 @@ def _events_by_alarm(store: MonitorStore) -> defaultdict[str, list[dict[str, Any
 
 
 def _select_columns(row: dict[str, Any], columns: Sequence[str]) -> dict[str, Any]:
-    """Select the values of `columns` from a row, with None for a missing value."""
     return {name: row.get(name) for name in columns}

@@ -21,10 +21,9 @@ from sealscope.storage.toml_file import read_toml
 def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording]) -> str:
     """Write the mark that a person gave an alarm into the machine's file, and return one line that states the result.
 
-    `rig`: path of the file; `mark`: "valid", "invalid" or "repaired"; `samples`: the last samples before the mark. With
-    the mark `invalid` these samples are added as a healthy recording, unless `with_healthy` of the machine refuses
-    them, for example because they leak. After the mark `valid` no recording from the onset on becomes healthy until a
-    repair. Returns "" for any other mark, or if `rig` is not a machine's file.
+    `rig`: path of the file; `samples`: the last samples before the mark. With the mark `invalid` they are added as a
+    healthy recording, unless `with_healthy` of the machine refuses them, for example because they leak. Returns "" for
+    a mark that is not in `JUDGEMENTS`, or if `rig` is not a machine's file.
     """
     path = Path(rig)
     if mark not in JUDGEMENTS or path.suffix.lower() != ".toml":
@@ -42,7 +41,6 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
         outcome = "mark stored"
 
         def add_mark(machine: CommissionedMachine) -> CommissionedMachine:
-            """Add the marked alarm to a machine, with its samples as a healthy recording if invalid; set `outcome`."""
             nonlocal outcome
             machine = replace(machine, alarms=(*machine.alarms, judgement))
             if mark == "invalid":
@@ -62,7 +60,7 @@ def record_mark(rig: str, alarm: Alarm, mark: str, samples: Sequence[Recording])
 def _combine_samples(samples: Sequence[Recording], shift: float) -> Recording:
     """Join the samples of an alarm to one recording whose times start at 0 s; raise SealscopeError if there are none.
 
-    `shift` [s]: added to the first time to give the date of the recording, in seconds since 1970.
+    `shift` [s]: added to their times to give seconds since 1970.
     """
     if not samples:
         raise SealscopeError("no samples of the alarm are kept: add its recording by sealscope commission --add")

@@ -9,6 +9,7 @@ import itertools
 import json
 import threading
 import time
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
@@ -54,21 +55,13 @@ class StoredSamples(NamedTuple):
 class StoredRows:
     """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
 
-    - `estimates`, `pending` (samples that a restart needs), `events`: new rows.
-    - `alarms` by id, `actuators` (checkpoints) and `summaries` by actuator: rows that are new or replace stored ones.
-    - `first_kept`: by actuator with a new checkpoint, the running number before which pending samples are deleted.
-    - `old_blocks`, `old_estimates`: by actuator, the running number up to which old rows are deleted.
+    `new`: by table, rows to insert; `current`: by table and primary key, rows that are new or replace stored ones;
+    `old`: by table and actuator, the running number up to which rows are deleted.
     """
 
-    estimates: list[dict[str, Any]] = field(default_factory=list)
-    pending: list[dict[str, Any]] = field(default_factory=list)
-    events: list[dict[str, Any]] = field(default_factory=list)
-    alarms: dict[str, dict[str, Any]] = field(default_factory=dict)
-    actuators: dict[str, dict[str, Any]] = field(default_factory=dict)
-    summaries: dict[str, dict[str, Any]] = field(default_factory=dict)
-    first_kept: dict[str, int] = field(default_factory=dict)
-    old_blocks: dict[str, int] = field(default_factory=dict)
-    old_estimates: dict[str, int] = field(default_factory=dict)
+    new: dict[sa.Table, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
+    current: dict[sa.Table, dict[str, dict[str, Any]]] = field(default_factory=lambda: defaultdict(dict))
+    old: dict[sa.Table, dict[str, int]] = field(default_factory=lambda: defaultdict(dict))
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:
         """Add the leakage estimates of an actuator's blocks, with the oil temperature [deg C], None if unknown."""
@@ -78,11 +71,12 @@ class StoredRows:
             figures = (estimate.total_lpm, *total_ends, estimate.leak_lpm, *leak_ends, oil_celsius)
             status = estimate.status[:160]  # the length of the column
             row = {"actuator": actuator, "number": estimate.number, "t": estimate.t, "status": status}
-            self.estimates.append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
+            self.new[tables.estimates].append({**row, **dict(zip(tables.FIGURES, figures, strict=True))})
 
     def add_pending(self, actuator: str, block: StoredSamples) -> None:
         """Add samples that a restart must judge again, or collect again for a recording that has not ended."""
-        self.pending.append({"actuator": actuator, "number": block.number, "samples": _pack_samples(block)})
+        row = {"actuator": actuator, "number": block.number, "samples": _pack_samples(block)}
+        self.new[tables.pending].append(row)
 
     def add_alarm(self, alarm: Alarm, kind: str, t: float, by_whom: str = "", text: str = "") -> None:
         """Add the row of an alarm in its present state, and that of the event that changed it at the time `t` [s].
@@ -90,10 +84,11 @@ class StoredRows:
         `kind`: kind of event, "" to store none; `by_whom`, `text`: person who caused the event, and comment, or "".
         """
         plain = json.dumps(alarm.as_dict())
-        self.alarms[alarm.id] = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
+        row = {"actuator": alarm.actuator, "id": alarm.id, "state": alarm.state, "alarm": plain}
+        self.current[tables.alarms][alarm.id] = row
         if kind:
             event = {"actuator": alarm.actuator, "kind": kind, "by_whom": by_whom, "text": text}
-            self.events.append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
+            self.new[tables.events].append({**event, "t": t, "alarm_id": alarm.id, "alarm": plain})
 
     def add_checkpoint(self, actuator: str, settings: str, state: dict[str, Any], first_kept: int) -> None:
         """Add settings (JSON) and state of an actuator; drop its pending samples before block number `first_kept`.
@@ -101,17 +96,18 @@ class StoredRows:
         The state includes the effect of all pending samples. Those kept belong to a recording that has not ended: a
         restart collects them again for it, but does not judge them again (`n_stored` of the state).
         """
-        self.pending = [row for row in self.pending if row["actuator"] != actuator or row["number"] >= first_kept]
-        self.first_kept[actuator] = first_kept
+        pending = self.new[tables.pending]
+        pending[:] = [row for row in pending if row["actuator"] != actuator or row["number"] >= first_kept]
+        self.old[tables.pending][actuator] = first_kept - 1
         plain = json.dumps(state, allow_nan=False)
-        self.actuators[actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
+        self.current[tables.actuators][actuator] = {"actuator": actuator, "settings": settings, "checkpoint": plain}
 
     def add_summary(self, actuator: str, summary: dict[str, Any]) -> None:
         """Add the summary of an actuator, which the page and other outputs show."""
         import orjson
 
         plain = orjson.dumps(summary, option=orjson.OPT_SERIALIZE_NUMPY).decode()
-        self.summaries[actuator] = {"actuator": actuator, "summary": plain}
+        self.current[tables.summaries][actuator] = {"actuator": actuator, "summary": plain}
 
 
 class MonitorStore:
@@ -154,7 +150,7 @@ class MonitorStore:
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Open a transaction, which is committed if the context ends without an error, else rolled back."""
+        """Open a transaction for changes, one at a time."""
         with self._writing_lock, self.engine.begin() as connection:
             yield connection
 
@@ -181,7 +177,7 @@ class MonitorStore:
             return connection.execute(query).all()
 
     def _value(self, query: Any) -> int:
-        """Execute a query for a single number, and return it as an integer; return 0 if the query gives none."""
+        """Execute a query for a single number; return 0 if it gives none."""
         with self.engine.connect() as connection:
             return int(connection.execute(query).scalar() or 0)
 
@@ -212,25 +208,18 @@ class MonitorStore:
 
     def write_rows(self, connection: sa.Connection, rows: StoredRows) -> None:
         """Write rows to their tables within the transaction of `connection`, and delete old ones (`StoredRows`)."""
-        actuator = bindparam("name", type_=sa.String)
-        if rows.first_kept:  # a checkpoint replaces the samples before it
-            pending = tables.pending.c
-            is_replaced = (pending.actuator == actuator) & (pending.number < bindparam("first"))
-            parameters = [{"name": name, "first": first} for name, first in rows.first_kept.items()]
-            connection.execute(tables.pending.delete().where(is_replaced), parameters)
-        if rows.events and self.engine.dialect.name == "postgresql":
+        if tables.events in rows.new and self.engine.dialect.name == "postgresql":
             # events are committed in the order of their numbers: otherwise an output could miss a smaller number
             connection.execute(sa.text("lock table events in exclusive mode"))
-        for table in (tables.estimates, tables.pending, tables.events):
-            if new_rows := getattr(rows, table.name):
+        for table, new_rows in rows.new.items():
+            if new_rows:
                 connection.execute(table.insert(), new_rows)
-        for table in (tables.actuators, tables.summaries, tables.alarms):
-            self.upsert(connection, table, [*getattr(rows, table.name).values()])
-        for table, last_numbers in ((tables.blocks, rows.old_blocks), (tables.estimates, rows.old_estimates)):
-            parameters = [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]
-            if parameters:
-                is_old = (table.c.actuator == actuator) & (table.c.number <= bindparam("last"))
-                connection.execute(table.delete().where(is_old), parameters)
+        for table, rows_by_key in rows.current.items():
+            self.upsert(connection, table, [*rows_by_key.values()])
+        for table, last_numbers in rows.old.items():
+            if parameters := [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]:
+                is_actuator = table.c.actuator == bindparam("name", type_=sa.String)
+                connection.execute(table.delete().where(is_actuator, table.c.number <= bindparam("last")), parameters)
 
     def commit_rows(self, rows: StoredRows) -> None:
         """Write rows in a separate transaction (`write_rows`)."""
@@ -260,9 +249,9 @@ class MonitorStore:
             last = int(connection.execute(select(func.max(columns.number))).scalar() or 0)
             connection.execute(table.delete().where(columns.number <= last - MAX_REFUSED))
 
-    def refused(self, max_rows: int = MAX_REFUSED) -> list[dict[str, Any]]:
-        """Read the last refused messages and files, newest first."""
-        rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()).limit(max_rows))
+    def refused(self) -> list[dict[str, Any]]:
+        """Read the refused messages and files, newest first."""
+        rows = self._rows(select(tables.refused).order_by(tables.refused.c.number.desc()))
         return [dict(row._mapping) for row in rows]
 
     def begin_decoding(self, reader: str, digest: str) -> int:
@@ -324,17 +313,16 @@ class MonitorStore:
         # an alarm's id ends in "-" and a running number
         return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
 
-    def events_since(self, number: int, max_events: int = 1000) -> list[tuple[int, dict[str, Any]]]:
-        """Read up to `max_events` events with a running number above `number`, as pairs (number, event) in order."""
+    def events_since(self, number: int) -> list[tuple[int, dict[str, Any]]]:
+        """Read up to 1000 events with a running number above `number`, as pairs (number, event) in order."""
         columns = tables.events.c
-        query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(max_events)
+        query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(1000)
         return [(row.number, _event_from_row(row)) for row in self._rows(query)]
 
-    def last_events(self, actuator: str, max_events: int = 200) -> list[dict[str, Any]]:
-        """Read the latest events of an actuator, newest first."""
+    def last_events(self, actuator: str) -> list[dict[str, Any]]:
+        """Read the latest 200 events of an actuator, newest first."""
         columns = tables.events.c
-        query = select(tables.events).where(columns.actuator == actuator)
-        query = query.order_by(columns.number.desc()).limit(max_events)
+        query = select(tables.events).where(columns.actuator == actuator).order_by(columns.number.desc()).limit(200)
         return [_event_from_row(row) for row in self._rows(query)]
 
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
@@ -402,7 +390,7 @@ def _pack_samples(block: StoredSamples) -> bytes:
 
 
 def _unpack_samples(number: int, data: bytes) -> StoredSamples:
-    """Unpack the block of samples with a running `number` from the bytes that `_pack_samples` made."""
+    """Unpack the bytes that `_pack_samples` made; `number`: running number of the block."""
     line, _, numbers = data.partition(b"\n")
     header = json.loads(line)
     t, *channels = np.frombuffer(numbers, dtype="<f8").reshape(1 + len(header["units"]), -1)

@@ -10,7 +10,7 @@ import asyncio
 import json
 import logging
 import os
-from collections.abc import Mapping
+from collections.abc import Callable
 from typing import Any, TextIO
 
 import httpx
@@ -23,9 +23,15 @@ logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
 _DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
 
 
-def _is_announced(event: Mapping[str, Any]) -> bool:
-    """Return True if an event is to be sent; for a shelved alarm, only the marks and comments of persons are sent."""
-    return event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]
+def _deliver(store: MonitorStore, output: str, send: Callable[[dict[str, Any]], None]) -> None:
+    """Send the events that an `output` has not sent yet, but of a shelved alarm only those that persons cause."""
+
+    def send_announced(event: dict[str, Any]) -> bool:
+        if event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]:
+            send(event)
+        return True
+
+    store.deliver(output, send_announced)
 
 
 class EventLines:
@@ -40,16 +46,14 @@ class EventLines:
 
     def deliver(self) -> None:
         """Write the new alarm events as lines of JSON; raise PartAway if the stream is closed or refuses them."""
-        self._store.deliver("lines", self._write_line)
+        _deliver(self._store, "lines", self._write_line)
 
-    def _write_line(self, event: dict[str, Any]) -> bool:
-        """Write an event as one line of JSON if it is to be announced, and return True.
+    def _write_line(self, event: dict[str, Any]) -> None:
+        """Write an event as one line of JSON; raise PartAway if the stream refuses the line or a part of it.
 
-        Raises PartAway if the stream refuses the line or a part of it; the next call, for the same event, writes the
-        rest. The line is not buffered, because a buffer would keep lines that a full disk refuses.
+        The next call, for the same event, writes the rest. The line is not buffered, because a buffer would keep lines
+        that a full disk refuses.
         """
-        if not _is_announced(event):
-            return True
         if event["number"] != self._number:
             self._unwritten, self._number = (json.dumps(event) + "\n").encode(), event["number"]
         try:
@@ -60,13 +64,12 @@ class EventLines:
             except (OSError, ValueError):  # a stream in memory
                 self._stream.write(self._unwritten.decode())
                 self._unwritten = b""
-                return True
+                return
             self._stream.flush()
             while self._unwritten:  # `os.write` returns how many bytes it has written
                 self._unwritten = self._unwritten[os.write(file, self._unwritten) :]
         except (OSError, ValueError) as error:
             raise PartAway(getattr(error, "strerror", None) or error) from None
-        return True
 
 
 class Webhook:
@@ -86,14 +89,12 @@ class Webhook:
 
     def deliver(self) -> None:
         """Post the new alarm events to the web address; raise PartAway if one is not confirmed."""
-        self._store.deliver("webhook", self._send_post)
+        _deliver(self._store, "webhook", self._send_post)
 
     end = deliver
 
-    def _send_post(self, event: dict[str, Any]) -> bool:
-        """Post an event, if it is to be announced, and return True; raise PartAway if the server does not confirm."""
-        if not _is_announced(event):
-            return True
+    def _send_post(self, event: dict[str, Any]) -> None:
+        """Post an event; raise PartAway if the server does not confirm it."""
         try:
             asyncio.run(self._post(event))
         except TimeoutError:
@@ -102,7 +103,6 @@ class Webhook:
             raise PartAway("the answer is not valid HTTP") from None
         except (httpx.HTTPError, httpx.InvalidURL, OSError, ValueError) as error:
             raise PartAway((str(error).splitlines() or [""])[0][:200] or type(error).__name__) from None
-        return True
 
     async def _post(self, event: dict[str, Any]) -> None:
         """Send one event in a request; raise OSError if the status of the answer is not 200 to 299."""

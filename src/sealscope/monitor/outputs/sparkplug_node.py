@@ -91,7 +91,6 @@ class SparkplugNode:
             self._link.close()
 
     def _topic(self, kind: str, device: str | None = None) -> str:
-        """Build the topic of a message of this node, or of one of its devices; `kind`: type, such as "DDATA"."""
         return spb.topic_of(self._settings.group, kind, self._settings.node, device)
 
     def _birth_number_metric(self) -> spb.SparkplugMetric:

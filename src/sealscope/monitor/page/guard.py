@@ -78,15 +78,13 @@ def _network(address: str) -> str:
 
 
 def connection_limit() -> int:
-    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if the system permits few open files.
-
-    It is at least 8, as one browser alone opens up to 6.
-    """
+    """Compute the largest number of connections: `_MAX_CONNECTIONS`, or fewer if the system permits few open files."""
     with suppress(ImportError, OSError, ValueError):
         import resource
 
         max_descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
         if max_descriptors != resource.RLIM_INFINITY:
+            # at least 8, as one browser alone opens up to 6
             return max(8, min(_MAX_CONNECTIONS, round(_DESCRIPTOR_FRACTION * max_descriptors)))
     return _MAX_CONNECTIONS
 

@@ -111,7 +111,6 @@ class _Pages:
         self._admission = None if token is None else Admission(token)
 
     def file(self, request: Request) -> Response:
-        """Answer with the static file of the request's URL path."""
         name, media_type = _FILES[request.url.path]
         return Response(read_package_file(name, _PACKAGE), media_type=media_type)
 
@@ -154,7 +153,7 @@ class _Pages:
         """Apply the mark in the request's body to the alarm of an actuator, and answer with the alarm as JSON.
 
         Query: `name` of the actuator. The body is a JSON mapping of texts: `mark`, such as "acknowledged", and
-        optionally `by`, the name of the person, and `text`, a comment. An invalid request is refused with its reason.
+        optionally `by`, the name of the person, and `text`, a comment.
         """
         # against forged requests: a form of another site cannot send this header
         if request.headers.get("x-sealscope") != "mark":
@@ -179,7 +178,7 @@ class _Pages:
         changes so far; it is sent after each change, and after `_KEEP_ALIVE_S` [s] without a change. An event "live"
         has the curves of the last samples of an actuator (`LiveSamples.curves`). Query: `actuator`, the name of this
         actuator; `pressure`, "p_A" or "p_B", whose wavelet details are drawn; `drawn`, "details", or "rms" for their
-        RMS. A wrong query is refused, and so is any request if there are too many listeners.
+        RMS.
         """
         if self._n_listeners >= self._max_listeners:
             return _make_refusal("too many listeners", 503)
@@ -205,7 +204,7 @@ class _Pages:
         with ExitStack() as contexts:
             is_viewing = bool(name) and await asyncio.to_thread(contexts.enter_context, live.viewing(name))
             if name and not is_viewing:
-                yield _format_event("live", {"name": name, "t": None, "error": "too many actuators are viewed"})
+                yield _format_live({"name": name, "t": None, "error": "too many actuators are viewed"})
             sent_change_number = sent_version = -1  # nothing is sent yet
             silence_s = 0.0  # since the last event without a name
             while not await request.is_disconnected() and not actuators.closed:
@@ -214,13 +213,11 @@ class _Pages:
                     yield f"data: {sent_change_number}\n\n"
                 if is_viewing and live.version(name) != sent_version:
                     sent_version = live.version(name)
-                    curves = await asyncio.to_thread(live.curves, name, pressure, detail_form)
-                    yield _format_event("live", curves)
+                    yield _format_live(await asyncio.to_thread(live.curves, name, pressure, detail_form))
                 await asyncio.sleep(_POLL_S)
                 silence_s += _POLL_S
 
     def metrics(self, request: Request) -> Response:
-        """Answer with the metrics of the monitor in the text format of Prometheus."""
         return Response(self._render_metrics(self._actuators.summaries()), media_type=CONTENT_TYPE)
 
     def _render_metrics(self, summaries: Mapping[str, Mapping[str, Any]]) -> str:
@@ -307,22 +304,19 @@ def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None
 
 
 def _refuse_for_now(wait: float) -> Response:
-    """Build the answer (status 429) to a client that must wait `wait` seconds after wrong tokens."""
     return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 
-def _format_event(kind: str, values: Mapping[str, Any]) -> str:
-    """Format a server-sent event of a `kind` such as "live", with its values as one line of JSON."""
-    return f"event: {kind}\ndata: {json.dumps(values, allow_nan=False)}\n\n"
+def _format_live(curves: Mapping[str, Any]) -> str:
+    """Format the server-sent event "live"."""
+    return f"event: live\ndata: {json.dumps(curves, allow_nan=False)}\n\n"
 
 
 def _client_address(request: Request) -> str:
-    """Return the IP address of the client that sent a request, "" if it is unknown."""
     return "" if request.client is None else request.client.host
 
 
 async def _read_body(request: Request) -> bytes:
-    """Read the body of a request; raise InputError if it is too large, and TimeoutError if it takes too long."""
     data = b""
     async with asyncio.timeout(_BODY_S):
         async for part in request.stream():
@@ -356,7 +350,6 @@ class PageServer:
         self._thread = actuators.supervisor.start("page", self._serve)
 
     def _open_socket(self) -> socket.socket:
-        """Open the page's socket; raise InputError if its port is taken."""
         try:
             family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
             return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
@@ -394,7 +387,7 @@ class PageServer:
             raise RuntimeError("the page's server has ended")
 
     def leave(self) -> None:
-        """Tell the web server and its open event streams to end, and return at once."""
+        """Tell the web server and its open event streams to end."""
         self._actuators.closed = True
         if self._server is not None:
             self._server.should_exit = True

@@ -77,9 +77,8 @@ class WatchedFolder:
         newest_s: float = -math.inf,
     ) -> None:
         assert settings.folder is not None
-        self.actuator, self.folder, self.pattern = settings.name, settings.folder, settings.pattern
+        self.actuator, self.folder, self._settings = settings.name, settings.folder, settings
         self.settle_s, self._is_stored = settle_s, is_stored
-        self._rig, self._rate, self._limit_lpm = settings.rig, settings.rate, settings.error_lpm
         self._channel_map = settings.map or load_watched(settings.rig).channel_map
         # start and end of the newest recording [s since 1970]; after a restart both are the last stored sample's time
         self._newest_s = self._end_s = newest_s
@@ -156,9 +155,8 @@ class WatchedFolder:
         return [(file, reading) for _, file, reading in rows]
 
     def _read(self, path: Path) -> _Reading:
-        """Read a file."""
         try:
-            return read_by_map(path, self._channel_map, self._rate), ""
+            return read_by_map(path, self._channel_map, self._settings.rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
             return None, escape_text(str(error)) or type(error).__name__
         except Exception as error:
@@ -193,7 +191,7 @@ class WatchedFolder:
         if not len(corrected_samples):
             return replace(block, samples=corrected_samples)
         try:
-            watched = load_watched(self._rig)  # read anew, as the file may have changed
+            watched = load_watched(self._settings.rig)  # read anew, as the file may have changed
         except (SealscopeError, OSError) as error:
             raise PartAway(escape_text(str(error))) from None
         if _is_midnight_before(start, self._newest_s):
@@ -203,7 +201,8 @@ class WatchedFolder:
         times = corrected_samples.t + shift
         verdict = None
         try:
-            verdict = judge_recording(watched, recording, escape_text(path.name), shift, limit_lpm=self._limit_lpm)
+            limit_lpm = self._settings.error_lpm
+            verdict = judge_recording(watched, recording, escape_text(path.name), shift, limit_lpm=limit_lpm)
         except Exception as error:  # the samples are still watched
             reason = describe_error(error)
             _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
@@ -224,7 +223,8 @@ class WatchedFolder:
         except OSError as error:
             raise PartAway(f"{self.folder}: {error.strerror}") from None
         for path in entries:
-            if path.name.startswith(".") or path.name.endswith(_UNFINISHED) or not fnmatch(path.name, self.pattern):
+            is_unfinished = path.name.startswith(".") or path.name.endswith(_UNFINISHED)
+            if is_unfinished or not fnmatch(path.name, self._settings.pattern):
                 continue
             try:
                 if path.is_symlink() and not path.resolve().is_relative_to(root):

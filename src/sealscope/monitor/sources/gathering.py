@@ -73,7 +73,6 @@ class ValueGatherer:
         self._max_lead, self._count, self._now = math.ceil(_AHEAD_S * rate), count, now
         self._channels = {name: _Channel() for name in channels}
         self._start: int | None = None
-        self._newest: int | None = None
 
     def push(self, channel: str, t: float, values: Sequence[float]) -> list[Recording]:
         """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
@@ -89,7 +88,8 @@ class ValueGatherer:
             self._count("values without a clock, or too many")
             return []
         first = round(t * self.rate)
-        lead = 0 if self._newest is None else first - self._newest  # [samples], of the first new one over the newest
+        newest_indices = (state.newest for state in self._channels.values() if state.newest is not None)
+        lead = first - max(newest_indices, default=first)  # [samples], of the first new one over the newest
         target = self._channels[channel]
         if lead < -self._max_lead and target.last_value() is None:
             target.previous, target.arrival = values[-1], self._now()
@@ -116,14 +116,13 @@ class ValueGatherer:
         while self._start is None and len(target.values) > self._max_lead:
             target.previous = target.values.pop(next(iter(target.values)))  # the one added first
         last = first + len(values) - 1
-        self._newest = last if self._newest is None else max(self._newest, last)
         target.newest = last if target.newest is None else max(last, target.newest)
         target.arrival = self._now()
 
     def discard_values(self) -> None:
         """Discard all values that are in no block yet; the time axis begins anew, as after a lost connection."""
         self._channels = {name: _Channel() for name in self._channels}
-        self._start = self._newest = None
+        self._start = None
 
     def _pop_blocks(self) -> list[Recording]:
         """Remove and return the complete blocks, up to whose end every channel has values or is silent."""

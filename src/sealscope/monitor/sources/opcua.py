@@ -11,7 +11,6 @@ import asyncio
 import math
 from collections.abc import Callable
 from datetime import UTC, datetime
-from functools import partial
 from importlib.util import find_spec
 from typing import Any
 
@@ -19,12 +18,16 @@ import numpy as np
 
 from sealscope.errors import MissingExtra
 from sealscope.monitor.bounded_queue import BoundedQueue
-from sealscope.monitor.settings import OpcUaSettings, read_secret
+from sealscope.monitor.settings import ActuatorSettings, OpcUaSettings, read_secret
 from sealscope.monitor.sources.gathering import ValueGatherer
-from sealscope.monitor.sources.source_block import BlockReceiver, SourceBlock, compute_digest, count_bytes
+from sealscope.monitor.sources.source_block import (
+    BlockReceiver,
+    SourceBlock,
+    compute_digest,
+    convert_to_si,
+    count_bytes,
+)
 from sealscope.monitor.supervisor import OPCUA, PartAway
-from sealscope.recordings.recording import CHANNEL_UNITS
-from sealscope.units import to_si
 
 #: Publications per block.
 _PUBLICATIONS = 4
@@ -54,21 +57,14 @@ class _OpcUaSession:
         self._settings, self._password, self._service = settings, password, service
         self._server = service.supervisor.part(OPCUA)
         self._gatherers: dict[str, ValueGatherer] = {}
-        # by actuator and channel: function that converts values to SI units
-        self._converters: dict[tuple[str, str], Callable[[Any], Any]] = {}
         self._actuators = [actuator for actuator in service.settings.actuator if actuator.nodes]
         for actuator in self._actuators:
             rate = float(actuator.rate or math.nan)  # never None: the settings are checked
             self._gatherers[actuator.name] = ValueGatherer(tuple(actuator.nodes), rate, settings.block_s, service.count)
-            for channel in actuator.nodes:
-                si_unit = CHANNEL_UNITS[channel]
-                unit = actuator.units.get(channel) or si_unit
-                self._converters[actuator.name, channel] = partial(to_si, unit=unit, si_unit=si_unit, name=channel)
-        self._channels: dict[Any, tuple[str, str]] = {}  # actuator and channel by node
+        self._channels: dict[Any, tuple[ActuatorSettings, str]] = {}  # actuator and channel by node
         self._waiting: BoundedQueue[SourceBlock] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
 
     def run(self) -> None:
-        """Submit blocks until the service stops, and reconnect after a lost connection."""
         stopping = self._service.stopping
         submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):
@@ -100,7 +96,7 @@ class _OpcUaSession:
             subscription = await client.create_subscription(period_ms, self)
             for actuator in self._actuators:
                 nodes = {client.get_node(node): channel for channel, node in actuator.nodes.items()}
-                self._channels.update({node.nodeid: (actuator.name, channel) for node, channel in nodes.items()})
+                self._channels.update({node.nodeid: (actuator, channel) for node, channel in nodes.items()})
                 rate = self._gatherers[actuator.name].rate
                 queue_size = math.ceil(2.0 * rate * self._settings.block_s)  # the samples of two blocks
                 results = await subscription.subscribe_data_change(
@@ -122,7 +118,7 @@ class _OpcUaSession:
         `value`: number or array of samples; numbers that are not finite or not of good quality become NaN, and values
         of other types are dropped and counted. `data`: time and quality of the value.
         """
-        name, channel = self._channels[node.nodeid]
+        actuator, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value
         timestamp = data_value.SourceTimestamp or data_value.ServerTimestamp or datetime.now(UTC)
         t = (timestamp if timestamp.tzinfo is not None else timestamp.replace(tzinfo=UTC)).timestamp()
@@ -135,11 +131,11 @@ class _OpcUaSession:
         if samples.ndim != 1 or not samples.size:
             self._service.count(_NO_NUMBER)
             return
-        si_samples = self._converters[name, channel](samples)
-        for block in self._gatherers[name].push(channel, t, si_samples.tolist()):
+        si_samples = convert_to_si(samples, actuator.units.get(channel), channel)
+        for block in self._gatherers[actuator.name].push(channel, t, si_samples.tolist()):
             # a digest of the contents: a block sent again is recognised
             identity = compute_digest(np.concatenate([block.t, *block.channels.values()]).tobytes())
-            if not self._waiting.put(SourceBlock(name, identity, block), count_bytes(block)):
+            if not self._waiting.put(SourceBlock(actuator.name, identity, block), count_bytes(block)):
                 self._service.count(_NO_ROOM)
 
     def _submit(self) -> None:
