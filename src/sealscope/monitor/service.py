@@ -235,8 +235,8 @@ class Service:
         else:
             self._is_database_blocked = False
             self._database.end_outage()
-        finished_ids = set(map(id, blocks))  # stored or dropped
-        self._unstored = [block for block in self._unstored if id(block) not in finished_ids]
+        finished_blocks = {*blocks}  # stored or dropped; each block equals only itself
+        self._unstored = [block for block in self._unstored if block not in finished_blocks]
         for block in blocks:
             self.supervisor.part("acknowledgements").attempt(block.done, at_once=True)
 

@@ -134,8 +134,7 @@ class ActuatorSettings(WatchSettings):
         rig = values.get("rig")
         if not isinstance(rig, str) or not rig.endswith(".toml"):
             return values
-        path = Path(info.context["folder"]) / rig if info.context else Path(rig)
-        watched = load_watched(os.fspath(path))
+        watched = load_watched(_resolve_in_folder(rig, info))
         if isinstance(machine_file, str) and watched.machine is None:
             raise ValueError(f"machine must be a file that sealscope commission wrote, got a rig: {rig[:100]}")
         # a text is "auto": the columns are then found only when a file is read

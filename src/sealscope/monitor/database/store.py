@@ -150,7 +150,7 @@ class MonitorStore:
 
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Open a transaction for changes, one at a time."""
+        """Open a transaction for changes, which an error rolls back."""
         with self._writing_lock, self.engine.begin() as connection:
             yield connection
 

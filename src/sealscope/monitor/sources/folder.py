@@ -48,8 +48,6 @@ _AHEAD_S = 60.0
 _READ_AHEAD_BYTES = 64_000_000
 #: Gap between recordings of one day that state no time of day [s].
 _GAP_S = 1.0
-
-
 #: A recording and "", or None and the reason why its file cannot be read.
 _Reading = tuple[Recording | None, str]
 

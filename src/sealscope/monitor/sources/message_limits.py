@@ -80,7 +80,7 @@ def check_json_keys(values: Any, payload: bytes, n_colons: int) -> None:
 
 
 def check_keys(values: Any, n_pairs: int) -> None:
-    """Check that a decoded message has as many key-value pairs as its bytes, `n_pairs`; raise MessageLimit otherwise.
+    """Check that a decoded message has the `n_pairs` key-value pairs of its bytes; raise MessageLimit otherwise.
 
     It has fewer if a key is repeated, as a decoder keeps only the last value of the key.
     """
