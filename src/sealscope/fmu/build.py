@@ -45,16 +45,12 @@ system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so
 
 
 class Platform(NamedTuple):
-    """An operating system and processor on which an FMU can run.
+    """An operating system and processor on which an FMU can run."""
 
-    `triple`, `target`: its names for LLVM and for the C compiler; `folders`: by FMI version, folder of the library in
-    the FMU's archive; `suffix`: ending of the library's file name.
-    """
-
-    triple: str
-    target: str
-    folders: Mapping[int, str]
-    suffix: str
+    triple: str  # name for LLVM
+    target: str  # name for the C compiler
+    folders: Mapping[int, str]  # by FMI version: folder of the library in the FMU's archive
+    suffix: str  # of the library's file name
 
 
 PLATFORMS: Mapping[str, Platform] = convert_type(
@@ -119,22 +115,17 @@ def choose_step(rig: Rig, error: float) -> tuple[float, float]:
 
 
 class MockUp(NamedTuple):
-    """The code and data of a functional mock-up unit (FMU), to be compiled and archived.
+    """The code and data of a functional mock-up unit (FMU), to be compiled and archived."""
 
-    `summary`: one line that describes the FMU; `modules`: LLVM code by name of the function; `values`: initial values
-    of the parameters, in the order of the code; `n_states`: number of states, or of doubles in the memory of a soft
-    sensor; `step` [s]: longest step of the solver, or sampling interval; `failures`: messages by a function's code.
-    """
-
-    summary: str
-    modules: Mapping[str, str]
+    summary: str  # one line that describes the FMU
+    modules: Mapping[str, str]  # LLVM code by name of the function
     variable_list: tuple[Variable, ...]
-    values: tuple[float, ...]
+    values: tuple[float, ...]  # initial values of the parameters, in the order of the code
     n_inputs: int
     n_results: int
-    n_states: int
-    step: float
-    failures: Mapping[int, str]
+    n_states: int  # or doubles in the memory of a soft sensor
+    step: float  # longest step of the solver, or sampling interval of a soft sensor [s]
+    failures: Mapping[int, str]  # messages, by the code that a function returns
 
     @property
     def token(self) -> str:

@@ -81,19 +81,13 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 
 
 class RigChoice(NamedTuple):
-    """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables.
+    """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables."""
 
-    `laws`: for each entry of `physics.rig.CHOICES`, which equation the rig has, or if an optional equation is present;
-    `exponent`: 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter;
-    `literal_metering`: True if eqs. (4.9)-(4.12) of the thesis are taken as printed; `implicit`: True for the
-    implicit-explicit method, False for Runge-Kutta; `euler`: True to compute the speed loop's integral by eq. (4.2).
-    """
-
-    laws: tuple[bool | tuple[bool, ...], ...]
-    exponent: float
-    literal_metering: bool
-    implicit: bool
-    euler: bool
+    laws: tuple[bool | tuple[bool, ...], ...]  # of `physics.rig.CHOICES`: equation that the rig has, or if it has one
+    exponent: float  # 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter
+    literal_metering: bool  # True if eqs. (4.9)-(4.12) of the thesis are taken as printed
+    implicit: bool  # True for the implicit-explicit method, False for Runge-Kutta
+    euler: bool  # True to compute the speed loop's integral by eq. (4.2)
 
     @classmethod
     def from_rig(cls, rig: Rig) -> RigChoice:

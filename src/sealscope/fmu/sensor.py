@@ -121,15 +121,11 @@ def variables(rig: Rig) -> Iterator[Variable]:
 
 
 class SensorChoice(NamedTuple):
-    """The settings that are compiled into a soft sensor.
+    """The settings that are compiled into a soft sensor."""
 
-    `rate` [Hz]: sampling rate; `size_error`: relative standard error of the leakage that uncertain sizes of the machine
-    (displacement, piston area) cause; `column_order`: indices into `COLUMNS` in the order that `weigh_rows` needs:
-    first the `n_fast` terms whose coefficients are fitted to each block, then the other terms, last the response.
-    """
-
-    rate: float
-    size_error: float
+    rate: float  # sampling rate [Hz]
+    size_error: float  # relative standard error of the leakage due to the machine's displacement and piston area
+    # indices into `COLUMNS`: first the `n_fast` terms fitted to each block, then the other terms, last the response
     column_order: tuple[int, ...]
     n_fast: int
 
@@ -157,38 +153,26 @@ def _count_samples(rate: float) -> tuple[int, int, int]:
 
 
 def memory_layout(choice: SensorChoice) -> np.dtype[Any]:
-    """Build the layout of a soft sensor's memory: numpy's type of a record of the scalars `_SCALARS` and some arrays.
-
-    A block is open until its rows are weighted.
-
-    - `ring`: last samples, a column each; `increments`: of each term of the balance over the last sampling interval
-    - `unfinished`: the `SPAN` rows to which the present sample adds; `rows`: finished rows of the open blocks
-    - `ends`: index past the last row of each open block; `gram`: Gram matrices of the blocks weighted last
-    - `pressure_sums`: sum of abs(p_A - p_B) and number of samples, for each of the last blocks
-    - `slow_sums`: sums over earlier blocks for the coefficients that are not fitted to each block (`weigh_rows`)
-    - `waiting_grams`, `waiting_sizes`: of the blocks that wait for the first fit, Gram matrices and sizes
-      (`_BLOCK_ROWS`, `_BLOCK_PRESSURE`); `precisions`: precisions of these blocks' estimates
-    - `history`: results of each of the last blocks (`_G` ... `_PRESSURE`)
-    - `workspace`: a `Workspace`; `model`: a `Coefficients`
-    """
+    """Build the layout of a soft sensor's memory: a numpy record of the scalars `_SCALARS` and some arrays."""
     _, block_strides, half = _count_samples(choice.rate)
     n_slow = len(choice.column_order) - choice.n_fast - 1  # - 1: the response
     max_rows = SUPPORT * block_strides
     workspace = workspace_shapes(max_rows, SUPPORT, len(choice.column_order), n_slow)
     return record_dtype(
         *_SCALARS,
-        ring=(len(INPUTS), 2 * half + 2),  # the samples that `_compute_increments` reads
-        increments=(_N_COLUMNS,),
-        unfinished=(SPAN, _N_COLUMNS),
-        rows=(max_rows, _N_COLUMNS),
-        ends=(SUPPORT,),
-        gram=(SUPPORT, _N_COLUMNS, _N_COLUMNS),
-        pressure_sums=(SUPPORT + 1, 2),  # + 1: the last rows of a block end when samples of the next have begun
-        slow_sums=(n_slow + 1, n_slow + 1),
-        waiting_grams=(LEARNED, _N_COLUMNS, _N_COLUMNS),
-        waiting_sizes=(LEARNED, 2),
-        precisions=(LEARNED,),
-        history=(WINDOW, 5),
+        ring=(len(INPUTS), 2 * half + 2),  # last samples, those that `_compute_increments` reads
+        increments=(_N_COLUMNS,),  # of each term of the balance over the last sampling interval
+        unfinished=(SPAN, _N_COLUMNS),  # the rows to which the present sample adds
+        rows=(max_rows, _N_COLUMNS),  # finished rows of the open blocks, whose rows are not weighted yet
+        ends=(SUPPORT,),  # index past the last row of each open block
+        gram=(SUPPORT, _N_COLUMNS, _N_COLUMNS),  # of the blocks weighted last
+        # sum of abs(p_A - p_B), and number of samples; + 1: the last rows of a block end when the next has begun
+        pressure_sums=(SUPPORT + 1, 2),
+        slow_sums=(n_slow + 1, n_slow + 1),  # over earlier blocks, for the coefficients not fitted to each block
+        waiting_grams=(LEARNED, _N_COLUMNS, _N_COLUMNS),  # of the blocks that wait for the first fit
+        waiting_sizes=(LEARNED, 2),  # `_BLOCK_ROWS` and `_BLOCK_PRESSURE` of these blocks
+        precisions=(LEARNED,),  # of their estimates
+        history=(WINDOW, 5),  # results of each of the last blocks (`_G` ... `_PRESSURE`)
         workspace=record_dtype(**dict(zip(Workspace._fields, workspace, strict=True))),
         # `_LEAK`, the index of the leak, is also the number of the terms before it
         model=record_dtype(**dict(zip(Coefficients._fields, coefficient_shapes(_LEAK), strict=True))),

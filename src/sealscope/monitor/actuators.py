@@ -64,29 +64,20 @@ _AlarmEvent = tuple[Alarm, str, float]
 
 @dataclass
 class _Actuator:
-    """The state of one watched actuator in memory.
-
-    `watch`: the detector of a leak; `judge`: decides on the alarm; `bytes`: size [bytes] of the blocks of samples since
-    the last checkpoint; `n_stored`: number of all stored blocks; `last`: last estimate, with flows averaged over the
-    machine's cycles; `stored_summary`: summary stored last; `oil_celsius`: oil temperature [deg C], None if unknown;
-    `judged_s` [s]: end of the last judged block, or of the first block if none is judged yet; `verdict`: verdict on the
-    last recording, None if there is none or newer results replace it; `alarm_samples`: last samples during an alarm,
-    which may become a healthy recording; `recorder`: cuts the stream of a commissioned machine into recordings, None
-    for files and other actuators.
-    """
+    """The state of one watched actuator in memory."""
 
     settings: ActuatorSettings
-    watch: Watch
+    watch: Watch  # the detector of a leak
     judge: AlarmJudge
-    bytes: int = 0
-    n_stored: int = 0
-    last: BlockEstimate | None = None
+    bytes: int = 0  # of the blocks of samples since the last checkpoint
+    n_stored: int = 0  # number of all stored blocks
+    last: BlockEstimate | None = None  # last estimate, with flows averaged over the machine's cycles
     stored_summary: dict[str, Any] | None = None
     oil_celsius: float | None = None
-    judged_s: float | None = None
-    verdict: RecordingVerdict | None = None
-    alarm_samples: list[Recording] = field(default_factory=list)
-    recorder: StreamRecorder | None = None
+    judged_s: float | None = None  # end of the last judged block, or of the first block if none is judged yet [s]
+    verdict: RecordingVerdict | None = None  # on the last recording, None also if newer results replace it
+    alarm_samples: list[Recording] = field(default_factory=list)  # the last ones, perhaps a healthy recording later
+    recorder: StreamRecorder | None = None  # None for files, and for machines that are not commissioned
 
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None

@@ -42,36 +42,27 @@ MARKS = ("acknowledged", "comment", "shelved", *JUDGEMENTS)
 
 @dataclass(frozen=True)
 class Alarm:
-    """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence.
+    """An alarm of an actuator; times [s] are those of its samples, intervals have 95 % confidence."""
 
-    `id`: name of the actuator with a running number; `updated_s`: time of the last change; `onset_s`, `returned_s`:
-    begin of the leak, and its end, None while it lasts; `leak_lpm`: leak flow [L/min], None if unknown; `cause`: path
-    of the leaking oil; `evidence`: reason for the alarm, in one line; `next_check`: recommended inspection; `baseline`:
-    version of the healthy baseline, 0 while it is being learned; `mark`: last mark of a person ("valid", "invalid" or
-    "repaired"); `reason`: why the alarm is invalid; `shelved_until_s`: time before which it is not announced;
-    `by_chance_per_1000_h`: most false alarms of this strength that a healthy actuator raises in 1000 operating hours,
-    None if unknown.
-    """
-
-    id: str
+    id: str  # name of the actuator with a running number
     actuator: str
     level: Level
     state: AlarmState
     raised_s: float
-    updated_s: float
-    onset_s: float
+    updated_s: float  # time of the last change
+    onset_s: float  # begin of the leak
     onset_interval_s: Interval
-    leak_lpm: float | None
+    leak_lpm: float | None  # None if unknown
     leak_interval_lpm: Interval | None
-    cause: str
-    evidence: str
-    next_check: str
-    baseline: int
-    returned_s: float | None = None
-    mark: str = ""
-    reason: str = ""
-    shelved_until_s: float = 0.0
-    by_chance_per_1000_h: float | None = None
+    cause: str  # path of the leaking oil
+    evidence: str  # reason for the alarm, in one line
+    next_check: str  # recommended inspection
+    baseline: int  # version of the healthy baseline, 0 while it is being learned
+    returned_s: float | None = None  # end of the leak, None while it lasts
+    mark: str = ""  # last mark of a person: "valid", "invalid" or "repaired"
+    reason: str = ""  # why the alarm is invalid
+    shelved_until_s: float = 0.0  # time before which it is not announced
+    by_chance_per_1000_h: float | None = None  # most false alarms as strong, of a healthy actuator in 1000 hours
 
     @property
     def is_over(self) -> bool:
@@ -118,22 +109,16 @@ class Alarm:
 
 @dataclass
 class AlarmJudge:
-    """Raises, updates and ends the alarm of one actuator from its estimates; at most one alarm is open at a time.
-
-    `alarm`: the open alarm, None if there is none; `raised`: number of alarms so far; `above`, `error`, `below`:
-    numbers of successive blocks above the thresholds of a warning and of an error, and below the threshold at which the
-    alarm ends; `over_s` [s]: time at which the last alarm ended, or was last changed after its end, None if none has
-    ended; `evidence`: evidence of a leak from the recordings of a stream (`add_evidence`), 0 without any.
-    """
+    """Raises, updates and ends the alarm of one actuator from its estimates; at most one alarm is open at a time."""
 
     actuator: str
-    alarm: Alarm | None = None
-    raised: int = 0
-    above: int = 0
-    error: int = 0
-    below: int = 0
-    over_s: float | None = None
-    evidence: float = 0.0
+    alarm: Alarm | None = None  # the open alarm
+    raised: int = 0  # number of alarms so far
+    above: int = 0  # number of successive blocks above the threshold of a warning,
+    error: int = 0  # ... of an error,
+    below: int = 0  # ... and below the threshold at which the alarm ends
+    over_s: float | None = None  # time at which the last alarm ended, or was last changed after its end [s]
+    evidence: float = 0.0  # of a leak, from the recordings of a stream (`add_evidence`)
 
     def update(
         self,

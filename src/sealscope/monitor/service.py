@@ -75,13 +75,12 @@ class Service:
         self._extra_sources = [*sources]
         self._refused = self._n_waits = self._n_sources = 0
         self._is_database_blocked = False  # True while the database refuses blocks
-        self._resources = ExitStack()
-        if "://" not in settings.database:
-            if not Path(settings.database).parent.is_dir():
-                raise InputError(f"the monitor's database must be in a folder that exists, got {settings.database}")
-            busy = f"the database must belong to one monitor, but another one is running ({settings.database})"
-            self._resources.enter_context(lock_file(Path(settings.database + ".lock"), busy))
-        try:
+        with ExitStack() as resources:  # released after an error
+            if "://" not in settings.database:
+                if not Path(settings.database).parent.is_dir():
+                    raise InputError(f"the monitor's database must be in a folder that exists, got {settings.database}")
+                busy = f"the database must belong to one monitor, but another one is running ({settings.database})"
+                resources.enter_context(lock_file(Path(settings.database + ".lock"), busy))
             self.store = MonitorStore(settings.database)
             with threadpool_limits(limits=1):  # as in `run`: the number of threads changes rounding
                 actuators = WatchedActuators(settings.actuator, self.store, settings.keep_days)
@@ -93,9 +92,7 @@ class Service:
             self.page: PageServer | None = None
             if settings.page is not None and not once:
                 self.page = PageServer(actuators, settings.page, self.queue_load, self._live)
-        except BaseException:
-            self._resources.close()
-            raise
+            self._resources = resources.pop_all()
 
     def submit(self, block: SourceBlock | RefusedMessage) -> None:
         """Queue a block or a refused message for storage; wait while the queue is full.

@@ -1,4 +1,7 @@
-"""The settings of a monitor, read from a TOML file and checked completely before anything is opened."""
+"""The settings of a monitor, read from a TOML file and checked completely before anything is opened.
+
+The comments of `template.toml` explain each key.
+"""
 
 from __future__ import annotations
 
@@ -53,24 +56,16 @@ class _Table(BaseModel):
 
 
 class WatchSettings(_Table):
-    """Settings by which an actuator is watched.
-
-    `rig`: name of a packaged rig or path of a file; `false_alarms_per_1000_h`: most false alarms in 1000 h of
-    operation; `learn_hours`: time in which the leakage of the healthy machine is learned; `warning_lpm`, `error_lpm`
-    [L/min]: leaks at which an alarm is a warning or an error, None for no error; `debounce_blocks`: number of
-    successive blocks (some seconds each) beyond a threshold after which the alarm changes; `return_share`: fraction of
-    a threshold below which the leak counts as ended; `recording_s` [s]: length of the recordings into which the stream
-    of a commissioned machine is cut, to be judged as a whole, 0 for none; `no_data_s`, `not_comparable_s` [s]: time
-    without samples, or without a judged block, after which the state of the actuator is "no data" or "not comparable".
-    """
+    """Settings by which an actuator is watched."""
 
     rig: Annotated[_Text, AfterValidator(_resolve_in_folder)] = "thesis"
     false_alarms_per_1000_h: float = Field(default=1.0, gt=0)
     learn_hours: float = Field(default=8.0, gt=0, le=1000)
     warning_lpm: float = Field(default=0.0, ge=0, allow_inf_nan=False)
     error_lpm: float | None = Field(default=None, gt=0, allow_inf_nan=False)
-    debounce_blocks: int = Field(default=2, ge=1, le=1000)
-    return_share: float = Field(default=0.7, gt=0, lt=1)
+    debounce_blocks: int = Field(default=2, ge=1, le=1000)  # successive blocks after which the alarm changes
+    return_share: float = Field(default=0.7, gt=0, lt=1)  # fraction of a threshold below which the leak has ended
+    # length of the recordings into which the stream of a commissioned machine is cut, 0 for none
     recording_s: Annotated[float, AfterValidator(_check_recording_length)] = 180.0
     no_data_s: float = Field(default=3600.0, gt=0)
     not_comparable_s: float = Field(default=3600.0, gt=0)
@@ -97,11 +92,9 @@ class SimulateSettings(_Table):
 class ActuatorSettings(WatchSettings):
     """The settings of one actuator: its name, the source of its samples, and how it is watched.
 
-    - Files: `folder` of the recordings, and `pattern` of their names.
-    - MQTT: `topic` of the messages. Sparkplug: `sparkplug`, as "group/node" or "group/node/device".
-    - OPC UA: `nodes`, the node of each channel. Simulation: `simulate`, a simulated rig as the source.
-    - `map`: by channel, the column of the files or the Sparkplug metric; `rate` [Hz]: sampling rate, None if the source
-      states it; `units`: by channel, the unit of values whose source does not state it.
+    The sources are files (`folder`, `pattern` of their names), MQTT (`topic`), Sparkplug (`sparkplug`: "group/node" or
+    "group/node/device"), OPC UA (`nodes`: node of each channel) and a simulated rig (`simulate`). `map`: by channel,
+    the column of the files or the Sparkplug metric; `units`: by channel, the unit of values that come without one.
     """
 
     name: _Text
@@ -148,11 +141,7 @@ class ActuatorSettings(WatchSettings):
 
 
 class PageSettings(_Table):
-    """The settings of the web page.
-
-    `host`, `port`: address at which it is served; `token_file`: file with the token that a visitor must state;
-    `proxies`: addresses of proxies whose statement of the visitor's address is trusted.
-    """
+    """The settings of the web page; `proxies`: addresses of proxies, which may state the address of a visitor."""
 
     host: str = "127.0.0.1"
     port: int = Field(default=8765, ge=0, le=65535)
@@ -179,11 +168,7 @@ class BrokerSettings(_Table):
 
 
 class OpcUaSettings(_Table):
-    """The settings of the connection to an OPC UA server.
-
-    `security`: security string of the library asyncua, None for no security; `block_s` [s]: length of the blocks into
-    which values are gathered; `timeout_s` [s]: longest time for an answer.
-    """
+    """The settings of the connection to an OPC UA server; `security`: security string of the library asyncua."""
 
     url: Annotated[str, Field(pattern=r"^opc\.tcp://[^\s@]+$", max_length=2000)]
     user: str | None = None
@@ -210,13 +195,7 @@ class WebhookSettings(_Table):
 
 
 class MonitorSettings(_Table):
-    """All settings of a monitor.
-
-    `database`: file of SQLite or URL; `lines`: True to read blocks from standard input; `settle_s` [s]: time without
-    change before a file is read; `keep_days`: days of operation whose estimates are stored;
-    `fleet_false_alarms_per_1000_h`: most false alarms of all actuators, None if each has its own limit; `defaults`: for
-    settings that actuators omit. Where a table is None, the page, or this input or output, is switched off.
-    """
+    """All settings of a monitor; where a table is None, the page, or this input or output, is switched off."""
 
     database: Annotated[str, AfterValidator(_resolve_in_folder)] = Field(default="monitor.db", validate_default=True)
     lines: bool = False

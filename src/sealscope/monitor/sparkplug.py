@@ -40,19 +40,14 @@ _UNIT = "engUnit"
 
 @dataclass(frozen=True)
 class SparkplugMetric:
-    """A metric of Sparkplug B, a named value.
+    """A metric of Sparkplug B, a named value."""
 
-    `name`: None if the message has the number `alias` instead; `value`: a number, text or bool, an array (n,) of
-    numbers, or None for null; `datatype`: number of its Sparkplug type, 0 if only the birth message of its sender
-    states it; `timestamp` [ms since 1970]: None if not stated; `unit`: its property `engUnit`, None if not stated.
-    """
-
-    name: str | None
-    value: Any
-    datatype: int = 0
+    name: str | None  # None if the message has the number `alias` instead
+    value: Any  # a number, text or bool, an array (n,) of numbers, or None for null
+    datatype: int = 0  # number of its Sparkplug type, 0 if only the birth message of its sender states it
     alias: int | None = None
-    timestamp: int | None = None
-    unit: str | None = None
+    timestamp: int | None = None  # [ms since 1970]
+    unit: str | None = None  # its property `engUnit`
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
         """Convert the value from its transmitted form to a Sparkplug data type; return the changed metric.

@@ -31,40 +31,27 @@ STREAM_SHARE: float = LIVE.recording.share
 
 @dataclass(frozen=True)
 class RecordingVerdict:
-    """The verdict on one recording, as plain values for the database; times are in seconds since 1970.
-
-    - `file`: name of the file; `verdict`: "leak", "no leak" or "cannot tell", with its `reason` in words;
-    - `summary`, `size`, `odds`: texts that state the verdict, the size or bound of the leak, and the fraction of
-      healthy recordings that look like this one;
-    - `cause`: cause of the leak or of another event, "" if not named; `state`: state of the machine by NAMUR NE 107, as
-      plain values (`MachineState.as_dict`);
-    - `start_s`, `end_s`: times of the first and last sample; `onset_s`, `onset_interval_s`: start of the leak, None if
-      it leaks from the first sample on or not at all;
-    - `leak_lpm`, `total_lpm`, `bound_lpm` [L/min]: flows of the leak and of all leakage, with 95 % intervals, and upper
-      bound of a leak that is not found, None if not stated;
-    - `chance`: probability that a leak-free recording scores as high, None if not known;
-    - `mark`: mark of a person that ended the alarm, else "".
-    """
+    """The verdict on one recording, as plain values for the database; times are in seconds since 1970."""
 
     file: str
-    verdict: str
-    summary: str
-    size: str
+    verdict: str  # "leak", "no leak" or "cannot tell"
+    summary: str  # the verdict in words
+    size: str  # size or bound of the leak in words
     reason: str
-    cause: str
-    state: dict[str, Any]
-    start_s: float
+    cause: str  # of the leak or of another event, "" if not named
+    state: dict[str, Any]  # state of the machine by NAMUR NE 107 (`MachineState.as_dict`)
+    start_s: float  # time of the first sample
     end_s: float
-    onset_s: float | None = None
+    onset_s: float | None = None  # start of the leak, None if it leaks from the first sample on or not at all
     onset_interval_s: Interval | None = None
     leak_lpm: float | None = None
     leak_interval_lpm: Interval | None = None
-    total_lpm: float | None = None
+    total_lpm: float | None = None  # all leakage
     total_interval_lpm: Interval | None = None
-    bound_lpm: float | None = None
-    chance: float | None = None
-    odds: str = ""
-    mark: str = ""
+    bound_lpm: float | None = None  # upper bound of a leak that is not found
+    chance: float | None = None  # probability that a leak-free recording scores as high, None if not known
+    odds: str = ""  # fraction of healthy recordings that look like this one, in words
+    mark: str = ""  # mark of a person that ended the alarm
 
     @classmethod
     def from_diagnosis(cls, diagnosis: Diagnosis, start_s: float, end_s: float, shift: float) -> RecordingVerdict:

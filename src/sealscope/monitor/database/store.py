@@ -40,27 +40,23 @@ _ATTEMPTS = 10
 
 
 class StoredSamples(NamedTuple):
-    """Samples of a stored block, with its running `number` among all blocks of the actuator.
+    """Samples of a stored block."""
 
-    `follows`: False after a gap; `verdict`: verdict on the recording that ends with the samples, None for none.
-    """
-
-    number: int
+    number: int  # running number among all blocks of the actuator
     samples: Recording
-    follows: bool
-    verdict: RecordingVerdict | None
+    follows: bool  # False after a gap
+    verdict: RecordingVerdict | None  # on the recording that ends with the samples
 
 
 @dataclass
 class StoredRows:
-    """The rows that one transaction writes to the tables of the database, besides the blocks' identities.
+    """The rows that one transaction writes to the tables of the database, besides the blocks' identities."""
 
-    `new`: by table, rows to insert; `current`: by table and primary key, rows that are new or replace stored ones;
-    `old`: by table and actuator, the running number up to which rows are deleted.
-    """
-
+    # rows to insert
     new: dict[sa.Table, list[dict[str, Any]]] = field(default_factory=lambda: defaultdict(list))
+    # by primary key: rows that are new or replace stored ones
     current: dict[sa.Table, dict[str, dict[str, Any]]] = field(default_factory=lambda: defaultdict(dict))
+    # by actuator: the running number up to which rows are deleted
     old: dict[sa.Table, dict[str, int]] = field(default_factory=lambda: defaultdict(dict))
 
     def add_estimates(self, actuator: str, estimates: Iterable[BlockEstimate], oil_celsius: float | None) -> None:

@@ -39,16 +39,12 @@ PRESSURES = ("p_A", "p_B")
 
 @dataclass
 class _Window:
-    """The last samples of an actuator without a gap.
+    """The last samples of an actuator without a gap; no array is changed after it is set, so readers need no copy."""
 
-    `rate` [Hz]: sampling rate; `t` (n,) [s]: times; `channels`: samples (n,) by channel; `version`: number of blocks
-    added. An array is never changed after it is set, so readers need no copy.
-    """
-
-    rate: float = 0.0
-    t: Array = field(default_factory=lambda: np.empty(0))
-    channels: dict[str, Array] = field(default_factory=dict)
-    version: int = 0
+    rate: float = 0.0  # sampling rate [Hz]
+    t: Array = field(default_factory=lambda: np.empty(0))  # times (n,) [s]
+    channels: dict[str, Array] = field(default_factory=dict)  # samples (n,)
+    version: int = 0  # number of blocks added
 
     def add(self, samples: Recording) -> None:
         """Append samples to the window; start anew after a gap, or if the sampling rate or the channels change.

@@ -26,16 +26,12 @@ LATE = "values that came after their block"
 
 @dataclass
 class _Channel:
-    """The values of one channel that are not in a block yet.
+    """The values of one channel that are not in a block yet."""
 
-    `values`: by index of the sample on the time axis; `previous`: the last value before them; `arrival` [s]: time at
-    which the last value arrived; `newest`: largest index of any value so far.
-    """
-
-    values: dict[int, float] = field(default_factory=dict)
-    previous: float | None = None
-    arrival: float = -math.inf
-    newest: int | None = None
+    values: dict[int, float] = field(default_factory=dict)  # by index of the sample on the time axis
+    previous: float | None = None  # the last value before them
+    arrival: float = -math.inf  # time at which the last value arrived [s]
+    newest: int | None = None  # largest index of any value so far
 
     def last_value(self) -> float | None:
         """Return the latest value on the time axis, or None if there is none."""

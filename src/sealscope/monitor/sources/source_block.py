@@ -121,19 +121,14 @@ def raising_refused_message() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class SourceBlock:
-    """A block of samples of one actuator.
-
-    `identity`: text that no other block of the actuator has, even after a restart; `samples`: None if only the identity
-    is to be stored; `follows`: False if there is a gap before these samples; `done`: function called when the block is
-    stored; `verdict`: verdict on the samples as a whole recording, None for none.
-    """
+    """A block of samples of one actuator."""
 
     actuator: str
-    identity: str
-    samples: Recording | None
-    follows: bool = True
-    done: Callable[[], None] = lambda: None
-    verdict: RecordingVerdict | None = None
+    identity: str  # text that no other block of the actuator has, even after a restart
+    samples: Recording | None  # None if only the identity is to be stored
+    follows: bool = True  # False if there is a gap before these samples
+    done: Callable[[], None] = lambda: None  # called when the block is stored
+    verdict: RecordingVerdict | None = None  # on the samples as a whole recording
 
     @property
     def bytes(self) -> int:

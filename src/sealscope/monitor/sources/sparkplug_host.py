@@ -50,15 +50,11 @@ _BRACKETED = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\]]*)\]")
 
 @dataclass
 class _Birth:
-    """The channels of an actuator in the birth message of its Sparkplug node, which states all metrics.
+    """The channels of an actuator in the birth message of its Sparkplug node, which states all metrics."""
 
-    `names`: name of the metric of each channel and of the sampling rate; `aliases`: name of the metric of each alias, a
-    number; `metrics`: by name, the metric with its last value.
-    """
-
-    names: dict[str, str] = field(default_factory=dict)
-    aliases: dict[int | None, str] = field(default_factory=dict)
-    metrics: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)
+    names: dict[str, str] = field(default_factory=dict)  # of the metrics, by channel or `_RATE`
+    aliases: dict[int | None, str] = field(default_factory=dict)  # name of the metric, by its alias, a number
+    metrics: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)  # by name, with the last value
 
     @classmethod
     def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
@@ -113,16 +109,12 @@ class _Birth:
 
 @dataclass
 class _EdgeState:
-    """The state of the session of a Sparkplug edge node, which begins with a birth message that states all metrics.
+    """The state of the session of a Sparkplug edge node, which begins with a birth message."""
 
-    `births`: by device, "" for the node itself; `birth_sequence`: number bdSeq of the last birth; `seq`: last sequence
-    number, None before a birth; `is_complete`: True if no sequence number since the birth is missing.
-    """
-
-    births: dict[str, _Birth] = field(default_factory=dict)
-    birth_sequence: int | None = None
-    seq: int | None = None
-    is_complete: bool = False
+    births: dict[str, _Birth] = field(default_factory=dict)  # by device, "" for the node itself
+    birth_sequence: int | None = None  # number bdSeq of the last birth
+    seq: int | None = None  # last sequence number, None before a birth
+    is_complete: bool = False  # True if no sequence number since the birth is missing
 
 
 class SparkplugHost:

@@ -32,20 +32,13 @@ class StreamRecorder(SavedAttributes):
     and the first after a gap, such a clock, such a change or `clear`, is shorter than `duration_s` by up to a half.
     This fraction depends on the `actuator`'s name, so that the recordings of many actuators do not end at the same
     moment.
-
-    Attributes
-    ----------
-    first : int
-        Running number of the first collected block, 0 if none is collected.
-    follows : bool
-        True if the collected blocks follow a recording that ended at its full length or at `_MAX_BYTES`.
     """
 
     SAVED: ClassVar = ("first", "follows")  # the blocks are stored elsewhere
     actuator: str
     duration_s: float
-    first: int = 0
-    follows: bool = False
+    first: int = 0  # running number of the first collected block, 0 if none is collected
+    follows: bool = False  # True if they follow a recording that ended at its full length or at `_MAX_BYTES`
     blocks: list[Recording] = field(default_factory=list)
 
     def take(self, number: int, samples: Recording) -> Recording | None:
