@@ -76,7 +76,8 @@ class _Actuator:
     oil_celsius: float | None = None
     judged_s: float | None = None  # end of the last judged block, or of the first block if none is judged yet [s]
     verdict: RecordingVerdict | None = None  # on the last recording, None also if newer results replace it
-    alarm_samples: list[Recording] = field(default_factory=list)  # the last ones, perhaps a healthy recording later
+    # last samples during an alarm, which may become a healthy recording
+    alarm_samples: list[Recording] = field(default_factory=list)
     recorder: StreamRecorder | None = None  # None for files, and for machines that are not commissioned
 
     def judge_samples(

@@ -39,15 +39,14 @@ class PartAway(Exception):  # noqa: N818 (says what happened)
 class SupervisedPart:
     """A part of a monitor, or a service that it uses, with its outages and the pause after an error.
 
-    `name`: name in the log, on the page and in metrics; `since` [s since 1970], `reason`: start of the present outage,
-    None if there is none, and its reason; `count`: number of outages so far; `seconds` [s]: total length of the outages
-    that have ended. Only one thread at a time may call `attempt`.
+    `name`: name in the log, on the page and in metrics. Only one thread at a time may call `attempt`.
     """
 
     def __init__(self, name: str, supervisor: Supervisor) -> None:
         self.name, self._supervisor = name, supervisor
-        self.since: float | None = None
-        self.reason, self.count, self.seconds = "", 0, 0.0
+        self.since: float | None = None  # start of the present outage [s since 1970]
+        self.reason = ""  # of the present outage
+        self.count, self.seconds = 0, 0.0  # number of outages so far, and length of those that have ended [s]
         self._began = 0.0  # monotonic time at which the present outage began [s]
         self._pause = self._due = 0.0  # length of the last pause [s], and the monotonic time at which it ends
         self._lock = threading.Lock()
