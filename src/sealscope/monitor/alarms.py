@@ -124,7 +124,7 @@ class AlarmJudge:
         self,
         estimate: BlockEstimate,
         leak: WatchedLeak | None,
-        baseline: int,
+        baseline_version: int,
         settings: WatchSettings,
         allowed_rate: float,
     ) -> tuple[Alarm, str] | None:
@@ -163,7 +163,7 @@ class AlarmJudge:
                 cause=leak.cause,
                 evidence=leak.reason,
                 next_check=state_of(_CONDITIONS[level], leak.cause).action,
-                baseline=baseline,
+                baseline=baseline_version,
                 # rarity: the fraction of the allowed false alarms that score as high as this leak
                 by_chance_per_1000_h=allowed_rate * leak.rarity,
             )
@@ -213,7 +213,7 @@ class AlarmJudge:
         self,
         verdict: RecordingVerdict,
         earlier: RecordingVerdict | None,
-        baseline: int,
+        baseline_version: int,
         settings: WatchSettings,
         *,
         is_stream: bool = False,
@@ -268,7 +268,7 @@ class AlarmJudge:
             min_onset_s = min(earlier.end_s, min_onset_s)
         interval = verdict.onset_interval_s or (min_onset_s, onset_s)
         findings |= {"raised_s": verdict.end_s, "onset_s": onset_s, "onset_interval_s": interval}
-        return self._raise_alarm(cause=verdict.cause, baseline=baseline, **findings), "raised"
+        return self._raise_alarm(cause=verdict.cause, baseline=baseline_version, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.

@@ -135,10 +135,10 @@ class WatchedFolder:
     def _sort_by_start(self, files: list[_FoundFile]) -> list[tuple[_FoundFile, _Reading | None]]:
         """Sort files by the time of their first sample, or of their last change if they are unreadable.
 
-        They may be copied in another order than recorded. Several files are read for this. The result has what was read
-        of each file, or None where it must be read again, as the recordings exceed `_READ_AHEAD_BYTES`.
+        They may be copied in another order than recorded. The result has what was read of each file for this, or None
+        where it must be read again, as the recordings exceed `_READ_AHEAD_BYTES`.
         """
-        if len(files) < 2:
+        if len(files) < 2:  # nothing to sort
             return [(file, None) for file in files]
         rows: list[tuple[float, _FoundFile, _Reading | None]] = []
         n_bytes = 0
