@@ -32,8 +32,8 @@ _MAX_OPEN_ROWS = 45
 class PageProduct(NamedTuple):
     """Entry of a figure or table on the page of the reproduction.
 
-    `picture`: the figure as a data URI, "" for a table; `links`: (format, path) of its files; `claims`: claims that
-    it supports or refutes; `search_text`: text in which the page's search looks.
+    `picture`: the figure as a data URI, "" for a table; `links`: (format, path) of its files; `search_text`: text in
+    which the page's search looks.
     """
 
     id: str
