@@ -30,10 +30,7 @@ def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index page of a folder, with a row for each page, the most severe first; return the path.
-
-    `pages`: pairs of the path of a page and the diagnosis that it shows.
-    """
+    """Write the index page of a folder of `pages` (path, diagnosis), the most severe first; return the path."""
     ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

@@ -47,10 +47,7 @@ def _format_short(value: float) -> str:
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Format an overview of a recording: length, channels with range and small curve, notes, and findings on its data.
-
-    `name`: name of the recording's file.
-    """
+    """Format an overview of the recording in the file `name`: length, channels with small curves, notes, findings."""
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""

@@ -32,7 +32,7 @@ class PageTable(NamedTuple):
     """A table of the campaign's page.
 
     `id`: identifier in the HTML; `about`: description; `heads`: of the columns; `rows`: cells as text; `words`: number
-    of columns with text, which stand left of the columns with numbers.
+    of leading columns with text, not numbers.
     """
 
     id: str
@@ -62,8 +62,7 @@ def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, Pa
 def _format_cell(row: Any, content: str) -> str:
     """Format the value of one cell, which is an attribute of `row`.
 
-    `content`: format, a space, and the dotted path of the attribute. The format is the name of an entry of `_FORMATS`,
-    such as "percent", or a format specification of Python, or missing.
+    `content`: optional format, an entry of `_FORMATS` or a format specification of Python, and path of the attribute.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
@@ -73,9 +72,9 @@ def _format_cell(row: Any, content: str) -> str:
 class CauseTable(NamedTuple):
     """The table of the causes that one detector names, as text.
 
-    `columns`: named causes; `rows`: true cause, number of its records, and for each column the fraction of them for
-    which that cause is named; `right`: fraction of all records for which exactly the true cause is named; `covered`:
-    the same if an ambiguous cause that includes the true one counts, too.
+    `columns`: named causes; `rows`: true cause, number of its records, and fraction of them for each named cause;
+    `right`, `covered`: fractions of all records for which the true cause is named, alone and also within an ambiguous
+    one.
     """
 
     detector: str
@@ -86,10 +85,7 @@ class CauseTable(NamedTuple):
 
 
 def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Build a table for each detector: fractions of records by true cause (rows) and by named cause (columns).
-
-    A true cause without records has no row.
-    """
+    """Build a table for each detector: fractions of records by true cause (rows) and by named cause (columns)."""
     tables = []
     for causes in judgement.causes:
         confusion = causes.confusion
@@ -105,10 +101,7 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:
-    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a dash for a quantile that is not finite.
-
-    An end of the interval that is not finite is a dash, too. If neither is finite, the interval is left out.
-    """
+    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a number that is not finite is a dash."""
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):
