@@ -202,12 +202,6 @@ def test_a_figures_numbers_are_what_it_plots() -> None:
     assert float(str(rows[251][1])) == pytest.approx(np.sin(T[250]), rel=1e-6)
 
 
-def test_an_id_that_is_no_file_name_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"\.\./fig"):
-        publish(Item("fig-1", 4, "figure", "T", make), (figure("../fig"),), tmp_path)
-    assert not list(tmp_path.rglob("*.svg"))
-
-
 # the page
 
 

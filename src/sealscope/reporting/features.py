@@ -119,10 +119,7 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
 def changes(
     recording: Recording, chambers: list[ChamberDetails], parts: Parts
 ) -> list[tuple[str, str, float | None, float | None]]:
-    """Compute the RMS of each wavelet detail in two parts of the recording, None without finite values.
-
-    Returns (channel, name of the detail, RMS in the first part, in the second).
-    """
+    """List (channel, detail, RMS in the first part, in the second), with None for an RMS without finite values."""
     t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())

@@ -43,11 +43,8 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    After these two, the cells of a row are, with geometric means over the tests:
-
-    - change of the RMS with the leak [%], simulated and measured;
-    - ratio of simulated to measured RMS without the leak: mean and geometric standard deviation;
-    - number of tests in which both RMS change in the same direction, and correlation of both log changes.
+    The cells are change of the RMS [%], simulated and measured (geometric means over the tests); ratio of simulated to
+    measured RMS without the leak, mean and scatter; tests with the same sign of change, and correlation of the changes.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:

@@ -128,10 +128,7 @@ COLUMNS = (
 def make_row(
     condition: Condition, change: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: RmsPairs
 ) -> tuple[Cell, ...]:
-    """Build the row of a test in a table with the columns `COLUMNS`.
-
-    `change`: text of what changes at half time; `ranges_MPa`: of p_A and p_B in the first half; `rms`: in both halves.
-    """
+    """Build the row of a test in a table with `COLUMNS`; `change`: at half time; `ranges_MPa`: in the first half."""
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
 

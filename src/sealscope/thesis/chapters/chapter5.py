@@ -244,7 +244,6 @@ class LeakTestMeasures:
     d3 (`fit_step_time`).
     """
 
-    test: PrintedTest
     rms: RmsPairs
     speed: tuple[float, float]
     drift: tuple[float, float]
@@ -290,7 +289,6 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
         step_times[chamber] = fit_step_time(centres[is_settled], curves["d3"][is_settled])
     before, after = (sine_fit(t[mask], run.outputs["x"][mask], test.omega).slope * 1e3 for mask in masks)
     return LeakTestMeasures(
-        test=test,
         rms=part_detail_rms(recording, test.parts),
         speed=compute_pair(run.outputs["omega"]),
         drift=(before, after),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, fields
 from itertools import zip_longest
@@ -15,14 +14,12 @@ from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 from sealscope.thesis.pages.plots import draw, drawn_points
 
-_NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
-
 
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
     """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
     A figure becomes `figures/ID.svg` and `.png`, and `tables/ID.csv`; a table `tables/ID.csv`; an item's claims
-    `tables/ID.csv`, or `tables/ID-claims.csv` beside a table. Raises ValueError for an id that is no file name.
+    `tables/ID.csv`, or `tables/ID-claims.csv` beside a table.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
@@ -41,8 +38,6 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
         files.append(name)
 
     for product in products:
-        if not isinstance(product, Claim) and not _NAME.fullmatch(product.id):
-            raise ValueError(f"an id must consist of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
         if isinstance(product, Figure):
             svg, png = draw(product)
             write_bytes(f"figures/{product.id}.svg", svg)

@@ -30,16 +30,14 @@ _LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
 #: Number of panels, one below the other -> height of a panel [inch], smaller for more panels.
 _ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
 _CAPTION_CHARACTERS = 122
-#: Width [characters] of a label's line and margin in a legend, and of all labels above a figure or a panel.
-_LABEL_MARGIN, _MAX_SHARED_CHARACTERS, _MAX_LEGEND_CHARACTERS = 6, 100, 92
+#: Width [characters] of a label's line and margin in a legend, and of all labels above a figure.
+_LABEL_MARGIN, _MAX_SHARED_CHARACTERS = 6, 100
 #: Points to which a line is thinned.
 _MAX_POINTS = 2400
 #: A line with more points is drawn thin and without dashes, as it looks like noise.
 _DENSE_POINTS = 1500
 #: A line with more points is rasterised in an SVG that is too large otherwise.
 _RASTER_POINTS = 300
-#: Estimated size of a point in an SVG [bytes].
-_POINT_BYTES = 15
 
 
 def require_drawing() -> None:
@@ -63,12 +61,10 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
         matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
         matplotlib.rcParams["svg.hashsalt"] = figure.id  # equal figures give equal files
         mpl_figure = _draw_figure(figure)
-        long_lines = [line for ax in mpl_figure.axes for line in ax.lines if np.size(line.get_xdata()) > _RASTER_POINTS]
-        is_large = sum(np.size(line.get_xdata()) for line in long_lines) * _POINT_BYTES > MAX_SVG_BYTES
-        svg = b"" if is_large else _render_svg(mpl_figure, figure)
-        if is_large or len(svg) > MAX_SVG_BYTES:
-            for line in long_lines:
-                line.set_rasterized(True)
+        svg = _render_svg(mpl_figure, figure)
+        if len(svg) > MAX_SVG_BYTES:
+            for line in (line for ax in mpl_figure.axes for line in ax.lines):
+                line.set_rasterized(np.size(line.get_xdata()) > _RASTER_POINTS)
             svg = _render_svg(mpl_figure, figure)
         return svg, _render_png(mpl_figure, has_image=any(panel.image is not None for panel in figure.panels))
 
@@ -225,16 +221,11 @@ def _has_shared_legend(panels: Sequence[Panel]) -> bool:
 
 
 def _add_legend(ax: Axes, panel: Panel) -> None:
-    """Add the legend of a panel, if its title or axis does not tell all, above the axes on one line or on the right."""
+    """Add the legend of a panel above the axes, unless the title or the y axis names its only curve."""
     labels = [curve.label for curve in panel.curves]
-    if not labels or (len(labels) == 1 and (not panel.title or labels[0] in panel.y_label)):
-        return
-    n_characters = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) + len(panel.title)
-    if n_characters <= _MAX_LEGEND_CHARACTERS and len(labels) <= 5:
+    if len(labels) > 1 or (labels and panel.title and labels[0] not in panel.y_label):
         legend = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)
-    else:
-        legend = ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), borderaxespad=0.1)
-    _thicken_lines(legend)
+        _thicken_lines(legend)
 
 
 def _thicken_lines(legend: Legend) -> None:

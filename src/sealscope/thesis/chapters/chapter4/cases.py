@@ -165,16 +165,9 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Compute the numbers by which runs are compared from pi to 2 pi s (`STEADY`); all are nan if the run diverged.
+    """Compute the numbers by which runs are compared from pi to 2 pi s (`STEADY`), nan if the run diverged.
 
-    Pressures in Pa:
-
-    - "range of p_A", "peak of p_A": maximum minus minimum, and maximum, of each pressure;
-    - "lowest pressure": minimum of all pressures;
-    - "mean of p_1 - p_A", "mean of p_2 - p_B": mean drops at the orifices;
-    - "largest drop": largest magnitude of these drops.
-
-    "flow difference" is rms(Q_A - Q_B) / rms(Q_A).
+    Pressures are in Pa; the drops are those at the orifices; "flow difference" is rms(Q_A - Q_B) / rms(Q_A).
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}
