@@ -196,7 +196,7 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     if level is not None and top < level < _MAX_LIMIT_RATIO * top:
         top = 1.06 * level  # 6 % margin above the limit
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
-    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, True, (bottom, top), level)]
+    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, band=True, limits=(bottom, top), level=level)]
 
 
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:

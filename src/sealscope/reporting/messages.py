@@ -189,7 +189,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the known ones of leak in mL/min, fraction of the pump's flow, and equal creep speed; None if none is."""
+    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep speed, as far as known, or None."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -228,7 +228,7 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage, at a `pressure` as text, as a fraction of the pump's flow, with the smallest step."""
+    """Format a total leakage as a fraction of the pump's flow, with its smallest detectable step; `pressure`: text."""
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)

@@ -210,11 +210,8 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
-        log_ratios = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in level_columns]
+        ratios = [float(np.exp(np.mean(predicted.log_ratio(sheet, c, q)))) for c, q in level_columns]
         changes = [log_change_to_percent(predicted.log_change(c, q)) for c, q in change_columns]
-        same_sign = [
-            int(np.sum(np.sign(predicted.log_change(c, q)) == np.sign(sheet.log_change(c, q))))
-            for c, q in level_columns
-        ]
-        rows.append((hypothesis.name, *(float(np.exp(log_ratio)) for log_ratio in log_ratios), *changes, *same_sign))
+        same_signs = [predicted.count_same_signs(sheet, c, q) for c, q in level_columns]
+        rows.append((hypothesis.name, *ratios, *changes, *same_signs))
     return (item.table(rows, format_note("hypotheses"), heads),)

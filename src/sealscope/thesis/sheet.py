@@ -97,6 +97,15 @@ class DataSheet:
         pairs = self.rms[chamber][quantity]
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
+    def log_ratio(self, other: DataSheet, chamber: str, quantity: str) -> Array:
+        """Compute log(RMS / RMS in another sheet) of a wavelet detail without the leak, in each test, (tests,)."""
+        return np.asarray(np.log(self.rms[chamber][quantity][:, 0] / other.rms[chamber][quantity][:, 0]))
+
+    def count_same_signs(self, other: DataSheet, chamber: str, quantity: str) -> int:
+        """Count the tests in which the RMS of a wavelet detail changes in the same direction in another sheet."""
+        changes = (np.sign(sheet.log_change(chamber, quantity)) for sheet in (self, other))
+        return int(np.sum(np.equal(*changes)))
+
 
 def log_change_to_percent(change: Array | float) -> float:
     """Convert a change c of a logarithm, or the mean of several, to the relative change 100 (exp(c) - 1) [%]."""

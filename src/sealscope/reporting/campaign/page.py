@@ -43,12 +43,6 @@ def _format_area(area: Area) -> str:
     return f"{area.value:.3f} ({area.low:.3f}–{area.high:.3f})"
 
 
-def column_sizes(judgement: Judgement) -> list[float]:
-    """List the sizes of leaks that have a column in the main table, or [nan] for one column of all sizes together."""
-    sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
-    return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
-
-
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row of cells for each detector.
 
@@ -56,8 +50,10 @@ def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     confidence bound. Two detectors for comparison, which always or never raise an alarm, come last.
     """
     judgement = result.judgement
-    sizes = column_sizes(judgement)
-    rows = judgement.overall if math.isnan(sizes[0]) else judgement.table  # nan: all sizes together
+    sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
+    rows = judgement.table
+    if not 0 < len(sizes) <= _MAX_SIZES:
+        sizes, rows = [math.nan], judgement.overall  # nan: one column of all sizes together
     by_detector: dict[str, dict[str, AlarmFractions]] = defaultdict(dict)
     for row in rows:
         by_detector[row.detector][str(row.leak_lpm)] = row  # sizes as text, since nan (all sizes) does not equal itself

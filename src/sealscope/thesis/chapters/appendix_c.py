@@ -52,12 +52,12 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
         comparison: tuple[Cell, ...] = (None,) * 5  # the five columns that need a measured sheet
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
-            log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
+            log_ratio = sheet.log_ratio(measured, chamber, name)
             comparison = (
                 log_change_to_percent(measured_change),
                 float(np.exp(log_ratio.mean())),
                 float(np.exp(log_ratio.std(ddof=1))),
-                int(np.sum(np.sign(simulated_change) == np.sign(measured_change))),
+                sheet.count_same_signs(measured, chamber, name),
                 float(np.corrcoef(simulated_change, measured_change)[0, 1]),
             )
         rows.append((chamber, name, log_change_to_percent(simulated_change), *comparison))

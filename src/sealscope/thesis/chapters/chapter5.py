@@ -102,22 +102,18 @@ class FigureView:
         """Build a panel over time [s] with a mark where the leak opens; `label`: label of the y axis."""
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
-    def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
-        """Build the curve of `y` over `t` [s], by default the recording's times, within the figure's interval.
-
-        `role`: meaning of the curve, which determines the line style; `start` [s]: earliest time of the curve.
-        """
+    def _curve(
+        self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0, stop: float = math.inf
+    ) -> FigureCurve:
+        """Build the curve of `y` over `t` [s], by default the recording's times, from `start` to `stop` at most."""
         t = self.run.recorded.t if t is None else t
-        is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
+        is_drawn = (t >= max(start, self.span[0])) & (t <= min(stop, self.span[1]))
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
         """Build the curves of `y` over `t` [s], by default the recording's times, before and after the leak opens."""
         half = self.test.half
-        start, stop = self.span
-        # the curve before the leak is drawn as in a figure that ends where the leak opens
-        before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
-        return [before, self._curve(y, "leak", "leak", t, start=half)]
+        return [self._curve(y, "no leak", "no leak", t, stop=half), self._curve(y, "leak", "leak", t, start=half)]
 
     def _part_masks(self) -> Iterator[tuple[Mask, str]]:
         """Yield (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""

@@ -133,7 +133,7 @@ def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule on a single detail finds if the RMS must move as with a leak by a threshold.
+    """Count the leaks that each rule on a single detail finds if changes of the RMS count only above a threshold.
 
     The threshold is `d1_threshold` for the `measured` sheet, None if not given, and `drift_threshold` for the sheet
     simulated with a `leak`. Returns rows with the columns `THRESHOLDS`.

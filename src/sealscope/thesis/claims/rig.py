@@ -163,13 +163,12 @@ def _agreement_claim(evidence: ClaimEvidence) -> Claim:
         return judge_claim("6.1.4", [], compared="compared with the sheet only", sheet=NO_SHEET)
     ratios = {}  # geometric mean ratio of the RMS without the leak, by chamber and detail
     for c, name in itertools.product(CHAMBERS, ("d1", "d2", "d3", "d4")):
-        log_ratios = np.log(leak.rms[c][name][:, 0] / measured.rms[c][name][:, 0])
-        ratios[f"{c} {name}"] = float(np.exp(np.mean(log_ratios)))
-    same_sign = np.sign(leak.log_change("p_A", "d3")) == np.sign(measured.log_change("p_A", "d3"))
+        ratios[f"{c} {name}"] = float(np.exp(np.mean(leak.log_ratio(measured, c, name))))
+    n_same = leak.count_same_signs(measured, "p_A", "d3")
     text = (
         f"leak-free RMS over the sheet's: {', '.join(f'{name} {ratio:.2f}' for name, ratio in ratios.items())}; "
-        f"d3 of P_A moves the same way in {int(same_sign.sum())} of {same_sign.size}"
+        f"d3 of P_A moves the same way in {n_same} of {measured.tests}"
     )
     is_near = [1 / _MAX_RMS_RATIO <= ratio <= _MAX_RMS_RATIO for ratio in ratios.values()]
-    parts = [*is_near, bool(same_sign.sum() >= _MIN_AGREEING_TESTS)]
+    parts = [*is_near, n_same >= _MIN_AGREEING_TESTS]
     return judge_claim("6.1.4", parts, compared=text, sheet="the reference")

@@ -31,9 +31,9 @@ def format_range(values: Iterable[float], unit: str, factor: float = 1.0) -> str
 def judge_claim(id: str, tests: Iterable[bool], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    No tests: the claim cannot be tested. The texts are in `claims.toml` under `id`, or under `kind` for claims that
+    Without tests the claim cannot be tested. The texts are in `claims.toml` under `id`, or under `kind` for claims that
     share texts. The values `sheet`, `simulation` and `why` replace a whole text; the others fill the placeholders of
-    the same names, which may be those of the first three arguments.
+    the same names. These may be named as the first three arguments, which are therefore positional only.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])
