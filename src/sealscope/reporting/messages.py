@@ -189,7 +189,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow, and as a creep speed, as far as known, or None."""
+    """Format the known ones among leak in mL/min, fraction of the pump's flow, and equal creep speed; None for none."""
     severity = diagnosis.severity
     if severity is None:
         return None
