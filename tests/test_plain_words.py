@@ -32,7 +32,6 @@ KEPT = {
     ("diagnosis/verdict/machine.py", "stated"),
     ("monitor/bounded_queue.py", "put"),
     ("parameters/rig.py", "given"),
-    ("reporting/campaign/page_tables.py", "about"),
     ("simulation/bench/profile.py", "each"),
     ("simulation/experiment.py", "of"),
     ("simulation/faults.py", "at"),

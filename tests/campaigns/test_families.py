@@ -63,7 +63,7 @@ def test_the_table_says_which_half_it_is():
 
 
 def test_the_page_shows_each_family():
-    lines = page_tables(judge(ROWS, [NAME]), "L/min")["families"].rows
+    lines = page_tables(judge(ROWS, [NAME]), "L/min")["families"]["rows"]
     assert lines[0][:3] == (NAME, ALL, "no leak")
     both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
     assert both[3].startswith("50 %")

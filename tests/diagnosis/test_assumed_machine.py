@@ -17,7 +17,7 @@ from sealscope.diagnosis.verdict.severity import RepairLimit, severity
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.charts import course_charts
-from sealscope.reporting.messages import flow_basis, how_bad, how_much, next_steps, short_text
+from sealscope.reporting.messages import how_bad, how_much, machine_text, next_steps, short_text
 from sealscope.simulation.simulate import simulate
 
 from ..refusals import refusal
@@ -63,7 +63,7 @@ def test_a_machine_five_times_as_large_gives_the_same_recording_and_no_flow(fore
         assert result.severity is not None and other.severity is not None
         assert other.severity.pump_share == pytest.approx(result.severity.pump_share)
         assert other.severity.creep_mm_per_min == pytest.approx(result.severity.creep_mm_per_min)
-        assert says(str(flow_basis(other)), "machine.area") and says(short_text(other), "machine.area")
+        assert says(str(machine_text(other.machine)), "machine.area") and says(short_text(other), "machine.area")
 
 
 def test_pump_share_and_creep_are_those_of_the_machine(foreign: Recording) -> None:

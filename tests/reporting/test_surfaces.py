@@ -123,7 +123,7 @@ def test_a_baseline_is_proposed_where_the_total_is_like_the_healthy_ones(make_di
 
 def test_what_is_stated_is_printed_and_drawn(recording, make_diagnosis):
     diagnosis = make_diagnosis(machine=MACHINE)
-    assert "7854 mm² at A and 4006 mm² at B as stated" in messages.flow_basis(diagnosis)
+    assert "7854 mm² at A and 4006 mm² at B as stated" in str(messages.machine_text(diagnosis.machine))
     circuit = build_circuit(None, recording, MACHINE)
     assert (circuit.cylinder, circuit.rods) == ("single-rod cylinder", "B")
     text = Reader(render_page(recording, diagnosis)).text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.parameters import load_rig
 from sealscope.thesis.chapters import chapter6
 from sealscope.thesis.engine.products import Figure, ThesisTable
 
@@ -12,7 +13,7 @@ from .conftest import ITEMS, Kept
 
 
 def test_a_leak_has_its_size_under_the_load():
-    rig = chapter6._rig()
+    rig = load_rig(chapter6.RIG)
     G = chapter6.conductance(0.5, rig)
     assert pytest.approx(0.5) == G * chapter6.LOAD / rig.cylinder.A_A * 6e4
 

@@ -33,7 +33,7 @@ def one_shown(section: str, step_s: float | None = None) -> LeakTestMeasures:
     rms = {chamber: {name: (2.0, 1.5) for name in QUANTITIES} for chamber in CHAMBERS}
     pairs = {chamber: (0.12, 0.118) for chamber in CHAMBERS}
     steps = {chamber: test.half + 1.0 if step_s is None else step_s for chamber in CHAMBERS}
-    return LeakTestMeasures(test, rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, steps)
+    return LeakTestMeasures(rms, (14.0, 14.01), (0.04, 0.002), (17.0, 16.5), pairs, steps)
 
 
 def evidence(measured: DataSheet | None, leak: DataSheet | None = None) -> ClaimEvidence:

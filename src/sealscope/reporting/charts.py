@@ -24,8 +24,7 @@ SAMPLES = "samples"
 POINTS, STILL_POINTS = 16_000, 800
 #: Samples around the onset that are all drawn, so that the ringing is visible.
 NEAR_SAMPLES = 6_000
-#: Largest magnitude that is drawn. Values count as constant if their range is at most `_MIN_EXTENT`, or at most
-#: `_MIN_RELATIVE_EXTENT` times their largest magnitude.
+#: Largest magnitude that is drawn; largest range of values that count as constant, absolute and over their magnitude.
 _MAX_DRAWN, _MIN_EXTENT, _MIN_RELATIVE_EXTENT = 1e100, 1e-100, 1e-12
 #: Unit of wavelet details, by the unit of the pressures.
 _DETAIL_UNITS = {"bar": "kPa", "MPa": "kPa", "kPa": "kPa", "psi": "psi"}
@@ -38,7 +37,7 @@ class Mark:
     """A moment marked on every chart: `t` [s] on the recording's time axis, and its label.
 
     `known=True` marks a moment that is known independently of the diagnosis, such as the onset of a leak that was
-    made on purpose; it is drawn in another style. Raises InputError if `t` is not finite.
+    made on purpose; it is drawn in another style.
     """
 
     t: float
@@ -62,10 +61,10 @@ class ChartLine(NamedTuple):
 class Chart(NamedTuple):
     """One chart of the page.
 
-    `key`: its identifier; `group`: section of the page, one of `GROUPS`; `base`: name of the time axis: `SAMPLES` for
-    the recording's samples, "windows-CHANNEL" for the centres of the RMS windows, or `COURSE` for the times of the
-    leak's estimates; `height`: in pixels; `band`: True if the second and third line are the interval of the first;
-    `limits`: ends of the y axis, None to show all values; `level`: repair limit in `unit`, None if there is none.
+    `group`: section of the page, one of `GROUPS`; `base`: name of the time axis: `SAMPLES` for the recording's samples,
+    "windows-CHANNEL" for the centres of the RMS windows, or `COURSE` for the times of the leak's estimates; `height`:
+    in pixels; `band`: True if the second and third line are the interval of the first; `limits`: ends of the y axis,
+    None to show all values; `level`: repair limit in `unit`, None if there is none.
     """
 
     key: str
@@ -81,10 +80,7 @@ class Chart(NamedTuple):
 
     @property
     def level_text(self) -> str:
-        """Text of the repair limit in the chart's legend, with a remark if the limit lies above the frame.
-
-        The chart must have a limit (`level`).
-        """
+        """Text of the repair limit (`level`) in the chart's legend, with a remark if it lies above the frame."""
         is_above = self.level is not None and self.limits is not None and self.level > self.limits[1]
         return f"repair limit, {self.level:.2g} {self.unit}" + (", above the frame" if is_above else "")
 
@@ -98,8 +94,7 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    Pressures are shown in `pressure_unit`, and raw counts as they are. Other channels are shown in the unit of the log
-    or, if it has none, in degC, mm, rpm, L/min or the SI unit.
+    Pressures are shown in `pressure_unit`, other channels in the unit of the log or, if it has none, as `display_unit`.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -110,28 +105,25 @@ def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple
     return unit, recording[name] / scale
 
 
-def display_unit(unit: str, pressure_unit: str, *, detail: bool = False) -> tuple[str, float]:
+def display_unit(unit: str, pressure_unit: str) -> tuple[str, float]:
     """Choose the unit in which values in the SI unit `unit` are displayed; return this unit and its size in SI.
 
-    `pressure_unit`: display unit of pressures; `detail`: True for a wavelet detail, whose unit may be smaller. Raises
-    InputError for an unknown `pressure_unit`.
+    Raises InputError for an unknown `pressure_unit`, the display unit of pressures.
     """
     if pressure_unit not in _DETAIL_UNITS:
         raise InputError(f"pressure unit must be one of {', '.join(_DETAIL_UNITS)}, got {pressure_unit!r}")
     if unit == COUNTS:
         return "counts", 1.0
-    pressure = _DETAIL_UNITS[pressure_unit] if detail else pressure_unit
-    display = pressure if unit == "Pa" else _DISPLAY_UNITS.get(unit, unit)
+    display = pressure_unit if unit == "Pa" else _DISPLAY_UNITS.get(unit, unit)
     return display, to_si(1.0, display, unit)
 
 
 def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
-    """Choose the display unit of the wavelet detail `name`, such as "d3"; return this unit and its size in SI units.
+    """Choose the display unit of the wavelet detail `name` of a channel in the SI unit `unit`, and its size in SI.
 
-    For the product d3d4, unit and size are squared. `unit`: SI unit of the channel; `pressure_unit`: the page's unit of
-    pressure.
+    For the product d3d4, both are squared.
     """
-    display, scale = display_unit(unit, pressure_unit, detail=True)
+    display, scale = display_unit(unit, _DETAIL_UNITS.get(pressure_unit, pressure_unit))
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
 
@@ -141,10 +133,7 @@ def detail_label(name: str) -> str:
 
 
 def channel_charts(recording: Recording, pressure_unit: str) -> list[Chart]:
-    """Build the charts of the channels in `_CHANNELS` that have finite values, over the time of the recording.
-
-    The two chamber pressures share a chart, and so do those at the pump's ports, unless their display units differ.
-    """
+    """Build the charts of the channels in `_CHANNELS` that have finite values, one for each display unit of a row."""
     charts = []
     for key, title, height, members in _CHANNELS:
         lines_by_unit: dict[str, list[ChartLine]] = {}
@@ -170,10 +159,7 @@ _CHANNELS = (
 
 
 def rms_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build the charts of the windowed RMS of wavelet details: d1 to d4 of each chamber, then d3d4 (d3 times d4).
-
-    A chamber without RMS windows has no chart. `pressure_unit`: the page's unit of pressure.
-    """
+    """Build the charts of the windowed RMS of wavelet details: d1 to d4 of each chamber, then d3d4 (d3 times d4)."""
     charts = []
     for names, quantity, suffix, height in (
         (QUANTITIES[:-1], "the details", "", 230),
@@ -198,10 +184,7 @@ _MAX_LIMIT_RATIO = 4.0
 
 
 def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
-    """Build the chart of the leak flow [L/min] over the time of the recording, with its interval and the repair limit.
-
-    It shows the total leakage of pump and piston if only that is known. The list is empty if neither is known.
-    """
+    """Build the chart of the leak flow [L/min], or else of the total leakage, over time; [] if neither is known."""
     course = diagnosis.course
     if course is None or not np.isfinite(course.lpm).any():
         return []
@@ -213,8 +196,7 @@ def course_charts(diagnosis: Diagnosis, *, height: int = 190) -> list[Chart]:
     if level is not None and top < level < _MAX_LIMIT_RATIO * top:
         top = 1.06 * level  # 6 % margin above the limit
     title = "Passed by pump and piston together" if course.whole else "Leak past the piston"
-    options: dict[str, Any] = {"base": COURSE, "height": height, "band": True, "limits": (bottom, top), "level": level}
-    return [Chart(COURSE, COURSE, title, "L/min", lines, **options)]
+    return [Chart(COURSE, COURSE, title, "L/min", lines, COURSE, height, band=True, limits=(bottom, top), level=level)]
 
 
 def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
@@ -237,10 +219,7 @@ def _y_limits(values: Array, low: Array, high: Array) -> tuple[float, float]:
 
 
 def detail_charts(chambers: list[ChamberDetails], pressure_unit: str) -> list[Chart]:
-    """Build a chart for each wavelet detail of each chamber, ordered by detail.
-
-    `pressure_unit`: the page's unit of pressure.
-    """
+    """Build a chart for each wavelet detail of each chamber, ordered by detail."""
     charts = []
     for name in QUANTITIES:
         for chamber in chambers:
@@ -260,7 +239,7 @@ class DrawnCharts(NamedTuple):
     """All charts in the form that a page needs.
 
     `data`: plain JSON values for the script that draws the charts; `still`: by key of the chart, a still picture for
-    readers without scripts; `base`: times at which the channels are drawn; `span` [s]: first and last of these times;
+    readers without scripts; `base`: times [s] at which the channels are drawn; `span`: the first and the last of them;
     `fine` [s]: ends of the interval in which all samples are drawn.
     """
 
@@ -280,9 +259,8 @@ def draw(
 ) -> DrawnCharts:
     """Encode the lines of all charts for the script of the page, and draw a still picture of each chart.
 
-    Long channels are divided into groups of successive samples, of which only minimum and maximum are drawn, so that
-    peaks are preserved. Around the onset, or around the middle of the recording if there is no onset, all samples are
-    drawn. `chambers`: wavelet details with the times of their RMS windows; `marks`: moments to mark besides the onset.
+    Long channels are reduced (`choose_drawn_times`), but not around the onset or, without one, around the recording's
+    middle. `chambers`: for the times of their RMS windows; `marks`: moments to mark besides the onset.
     """
     t, _ = ordered_time(recording.t, recording.rate)  # the time axis of the charts
     middle = float(t[t.size // 2])
@@ -301,7 +279,11 @@ def draw(
     moments += [(f"mark {'known' if mark.known else 'other'}", mark.t, None) for mark in marks]
     encoded_charts, still = [], {}
     for chart in charts:
-        values_of_lines = [_clip_values(line.values) for line in chart.lines]
+        # larger finite values would make the scale of a chart overflow
+        values_of_lines = [
+            np.where(np.isfinite(line.values), np.clip(line.values, -_MAX_DRAWN, _MAX_DRAWN), line.values)
+            for line in chart.lines
+        ]
         still_t, still_values = axes[chart.base], values_of_lines
         if chart.base == SAMPLES:
             still_t, still_values = still_base.t, [still_base.reduce(values) for values in values_of_lines]
@@ -322,16 +304,8 @@ def draw(
     return DrawnCharts(data, still, base, span, fine)
 
 
-def _clip_values(values: Array) -> Array:
-    """Limit finite values to +-`_MAX_DRAWN`, because larger ones would make the scale of a chart overflow."""
-    return np.where(np.isfinite(values), np.clip(values, -_MAX_DRAWN, _MAX_DRAWN), values)
-
-
 def _clip_onset(diagnosis: Diagnosis, span: tuple[float, float]) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the onset of the leak [s], and its interval [s] with both ends limited to the times `span` [s].
-
-    Both are None without a finite onset; the interval alone is None if it is not known.
-    """
+    """Return the finite onset of the leak [s], and its interval limited to the times `span` [s]; None if unknown."""
     onset, interval = diagnosis.onset_s, diagnosis.onset_interval_s
     if onset is None or not isfinite(onset):
         return None, None
@@ -346,8 +320,7 @@ def _render_still(
 ) -> Picture:
     """Draw the still picture of a chart, 860 pixels wide and `chart.height` pixels high, shown where no script runs.
 
-    `lines`: for each of `chart.lines`, the values (n,) at the times `t` (n,) [s], in place of those in `chart`, within
-    +-`_MAX_DRAWN`; `span` [s]: ends of the time axis; `moments`: moments and intervals to be marked.
+    `lines`: the values (n,) of `chart.lines` to draw at the times `t` (n,) [s]; `span` [s]: ends of the time axis.
     """
     all_values = np.concatenate(lines)
     finite = all_values[np.isfinite(all_values)]

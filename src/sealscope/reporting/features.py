@@ -19,11 +19,11 @@ HALF_WINDOWS = 10
 
 
 class ChamberDetails(NamedTuple):
-    """Wavelet details d1..d4 of one chamber's pressure, and d3d4, the product of d3 and d4.
+    """Wavelet details d1..d4 of one chamber's pressure in the channel's `unit`, and their product d3d4 in its square.
 
     `values`: by name, each detail (n,) over the whole recording, NaN where it depends on samples beyond an end or on a
     defect of the data; `window_t` (w,) [s]: centres of the windows of the RMS; `window_rms`: by name, the RMS (w,) in
-    each window, NaN between two usable parts of the recording. d1..d4 have the `unit` of the channel, d3d4 its square.
+    each window, NaN between two usable parts of the recording.
     """
 
     channel: str
@@ -33,28 +33,11 @@ class ChamberDetails(NamedTuple):
     window_rms: dict[str, Array]
 
 
-class DetailChange(NamedTuple):
-    """The RMS of the wavelet detail `name` in two parts of a recording, `before` and `after`, None if not known."""
-
-    channel: str
-    name: str
-    before: float | None
-    after: float | None
-
-    @property
-    def percent(self) -> float | None:
-        """Relative change ``100 (after - before) / before`` [%], None if one is missing or `before` is 0."""
-        if self.before is None or self.after is None or self.before <= 0:
-            return None
-        return 100 * (self.after - self.before) / self.before
-
-
 def chamber_details(recording: Recording, channel: str) -> tuple[ChamberDetails | None, str]:
     """Compute the wavelet details of `channel`, a chamber's pressure; return them with a note on what is missing.
 
-    Only parts of the recording that are long enough and without a defect are transformed. The details are None if there
-    is no such part, the channel is missing, or the transform fails. The note then states the reason. Otherwise it
-    states omitted samples, and that no part is long enough for an RMS window; it is "" if neither is the case.
+    Only parts of the recording that are long enough and without a defect are transformed. Without such a part, without
+    the channel, or if the transform fails, the details are None and the note is the reason.
     """
     if channel not in recording:
         return None, f"{channel} is not in this recording."
@@ -114,8 +97,8 @@ class Parts(NamedTuple):
 def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     """Choose two parts of a recording to compare: before and after the onset's interval, or halves without an onset.
 
-    If the halves are too short for `HALF_WINDOWS` RMS windows each, the first part is the whole recording and the
-    second is empty. A difference between short halves would reflect the motion of the piston and not the seal.
+    If the halves are too short for `HALF_WINDOWS` RMS windows each, their difference would reflect the piston's motion;
+    the first part is then the whole recording.
     """
     t, _ = ordered_time(recording.t, recording.rate)
     if diagnosis.onset_s is not None:
@@ -133,15 +116,14 @@ def parts_to_compare(diagnosis: Diagnosis, recording: Recording) -> Parts:
     return Parts(middle, middle, ("First half", "Second half"), text)
 
 
-def changes(recording: Recording, chambers: list[ChamberDetails], parts: Parts) -> list[DetailChange]:
-    """Compute the RMS of each wavelet detail of `chambers` in two parts of the recording.
-
-    The RMS is None for a part without finite values.
-    """
+def changes(
+    recording: Recording, chambers: list[ChamberDetails], parts: Parts
+) -> list[tuple[str, str, float | None, float | None]]:
+    """List (channel, detail, RMS in the first part, in the second), with None for an RMS without finite values."""
     t, _ = ordered_time(recording.t, recording.rate)
     first, second = t < parts.end, t >= parts.start
     series = ((chamber.channel, name, values) for chamber in chambers for name, values in chamber.values.items())
-    return [DetailChange(channel, name, _rms(values[first]), _rms(values[second])) for channel, name, values in series]
+    return [(channel, name, _rms(values[first]), _rms(values[second])) for channel, name, values in series]
 
 
 def _rms(values: Array) -> float | None:

@@ -18,22 +18,17 @@ _ORDER = ("leak", "cannot tell", "no leak")
 def severity_key(diagnosis: Diagnosis) -> tuple[int, float, float, str]:
     """Compute a key that sorts diagnoses by severity, the most severe first.
 
-    The order is by verdict ("leak", "cannot tell", "no leak"), then by the leak divided by the repair limit, then by
-    the leak or else the total leakage [L/min], the largest first and 0 if unknown, and last by the file's name.
+    It is the verdict, then the leak over the repair limit, the leak or else the total leakage, and the file's name.
     """
     severity = diagnosis.severity
-    # `of_limit` is the ratio of leak to limit, and the ends of the ratio's interval
-    limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]
+    limit_ratio = 0.0 if severity is None or severity.of_limit is None else severity.of_limit[0]  # [0]: no interval
     total_lpm = None if diagnosis.total_leakage is None else diagnosis.total_leakage.lpm
     lpm = total_lpm if diagnosis.leak_lpm is None else diagnosis.leak_lpm
     return (_ORDER.index(diagnosis.verdict), -limit_ratio, -(lpm or 0.0), diagnosis.file)
 
 
 def write_index(path: str | os.PathLike[str], pages: Sequence[tuple[Path, Diagnosis]]) -> Path:
-    """Write the index page of a folder, with a row for each page, the most severe first; return the path.
-
-    `pages`: pairs of the path of a page and the diagnosis that it shows.
-    """
+    """Write the index page of a folder of `pages` (path, diagnosis), the most severe first; return the path."""
     ordered_pages = sorted(pages, key=lambda page: severity_key(page[1]))
     counts = {verdict: sum(diagnosis.verdict == verdict for _, diagnosis in pages) for verdict in _ORDER}
     summary = ", ".join(f"{count} {verdict}" for verdict, count in counts.items() if count)

@@ -39,8 +39,8 @@ def say(name: str, /, **values: Any) -> str:
 def number(value: float | None, digits: int = 3) -> str:
     """Format a number with `digits` significant digits; a dash stands for None or NaN, "∞" for infinity.
 
-    Magnitudes from 1e-6 to 1e9 are written without an exponent and without zeros at the end of the decimals; digits
-    before the decimal point are all written, such as 12345 with `digits` 3.
+    Magnitudes from 1e-6 to 1e9 have no exponent, no zeros at the end of the decimals, and all digits before the point,
+    such as 12345 with `digits` 3.
     """
     if value is None or isnan(value):
         return ABSENT
@@ -55,10 +55,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def clock(seconds: float | None) -> str:
-    """Format a time in seconds, such as "3.25 s", "75.5 s" or "3725.0 s (1:02:05)"; a dash if it is not known.
-
-    Three significant digits are written below 10 s, and one decimal from then on. From an hour on, h:mm:ss is added.
-    """
+    """Format a time in seconds, such as "3.25 s", "75.5 s" or "3725.0 s (1:02:05)"; a dash if it is not known."""
     if seconds is None or not isfinite(seconds):
         return ABSENT
     text = f"{seconds:.1f} s" if abs(seconds) >= 10 else f"{seconds:.3g} s"
@@ -69,11 +66,7 @@ def clock(seconds: float | None) -> str:
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """Format the verdict as a heading, by the text that `messages.toml` has for it or for the cause of the leak.
-
-    For "no leak" the heading is "No leak began within this recording" unless the machine is known to be healthy,
-    because a leak from the start cannot be excluded. Without a text, the heading is the summary with a capital letter.
-    """
+    """Format the verdict as a heading: the text of `messages.toml` for it or for its cause, else its summary."""
     texts = _texts()["headline"]
     key = diagnosis.summary
     if diagnosis.verdict == "leak" and diagnosis.cause in texts:
@@ -84,17 +77,12 @@ def headline(diagnosis: Diagnosis) -> str:
 
 
 def cause(diagnosis: Diagnosis) -> str | None:
-    """Return the cause of the change in a recording that texts may name, or None if there is none.
-
-    A leak past the piston, or one that cannot be told from it (`LEAKS`), is named only with the verdict "leak".
-    """
-    if diagnosis.cause in LEAKS and diagnosis.verdict != "leak":
-        return None
-    return diagnosis.cause
+    """Return the cause that texts may name, or None; a cause of `LEAKS` is named only with the verdict "leak"."""
+    return None if diagnosis.cause in LEAKS and diagnosis.verdict != "leak" else diagnosis.cause
 
 
 def shows_reason(diagnosis: Diagnosis) -> bool:
-    """Return True if the short text must show the reason: for `cannot tell`, or for a named cause other than a leak."""
+    """Return True if short texts show the reason: for `cannot tell`, or for a named cause other than a leak."""
     return diagnosis.verdict == "cannot tell" or (diagnosis.verdict != "leak" and cause(diagnosis) is not None)
 
 
@@ -105,11 +93,7 @@ def state_text(machine_state: MachineState) -> str:
 
 
 def since(diagnosis: Diagnosis) -> str | None:
-    """Format the onset of the leak with its interval; None if the verdict is not "leak".
-
-    If no onset is stated, the text says that the leakage rises within the recording, or that it was there from the
-    start.
-    """
+    """Format the onset of the leak with its interval, or the reason why there is none; None for other verdicts."""
     if diagnosis.verdict != "leak":
         return None
     if diagnosis.onset_s is None:
@@ -121,10 +105,9 @@ def since(diagnosis: Diagnosis) -> str | None:
 
 
 def how_much(diagnosis: Diagnosis) -> str | None:
-    """Format the leak flow [L/min] with its interval, or the reason why no flow is stated.
+    """Format the leak flow [L/min] with its interval, or its fraction of the pump's flow and why no flow is stated.
 
-    If the leak is known as a fraction of the pump's flow, this fraction precedes the reason. For verdicts other than
-    "leak", the text is the upper bound of a leak, or None if it is not known.
+    For verdicts other than "leak", the text is the upper bound of a leak, or None if it is not known.
     """
     interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
@@ -147,8 +130,7 @@ def _pump_fraction(diagnosis: Diagnosis) -> str | None:
     severity = diagnosis.severity
     if severity is None or severity.pump_share is None:
         return None
-    fraction, _low, _high = severity.pump_share  # without the interval
-    return f"{_format_percent(fraction)} of the pump's flow in this duty"
+    return f"{_format_percent(severity.pump_share[0])} of the pump's flow in this duty"  # [0]: without the interval
 
 
 def _why_no_flow(diagnosis: Diagnosis) -> str:
@@ -164,16 +146,10 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
     return say(f"how_much.{'machine' if diagnosis.measured_ratio is None else 'machine_or_area'}")
 
 
-def flow_basis(diagnosis: Diagnosis) -> str | None:
-    """Format the piston area and pump displacement on which a diagnosis bases flows [L/min]; None if unknown."""
-    return None if diagnosis.machine is None else machine_text(diagnosis.machine)
-
-
-def machine_text(machine: AssumedMachine) -> str:
-    """Format the piston area and pump displacement on which flows [L/min] are based, and the origin of both.
-
-    If a meter measures the flow to the cylinder or to its valve, the text names only this meter.
-    """
+def machine_text(machine: AssumedMachine | None) -> str | None:
+    """Format the piston area and pump displacement on which flows are based, or the flow meter; None if unknown."""
+    if machine is None:
+        return None
     if machine.flow_meter:
         key = "meter"  # of `messages.toml`
     elif machine.stated_by == "recording":
@@ -191,9 +167,8 @@ def machine_text(machine: AssumedMachine) -> str:
 def how_bad(diagnosis: Diagnosis) -> str | None:
     """Format the severity of the leak as a percentage of the repair limit, or as a multiple from 10 times the limit on.
 
-    If this ratio is not known although a limit was stated, the text asks for the piston area. If no limit was stated,
-    the text is the leak as a fraction of the pump's flow, unless `how_much` states this already. Returns None if there
-    is no leak or its size is not known.
+    If this ratio is not known, the text asks for the piston area if a limit was stated, else it is the fraction of the
+    pump's flow, unless `how_much` states it. None if there is no leak or its size is not known.
     """
     severity, limit = diagnosis.severity, diagnosis.limit
     if severity is None:
@@ -214,10 +189,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the leak in mL/min, as a fraction of the pump's flow, and as an equal creep speed of the piston.
-
-    Unknown figures are left out. Returns None if all are unknown.
-    """
+    """Format the known ones among leak in mL/min, fraction of the pump's flow, and equal creep speed; None for none."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -234,9 +206,8 @@ def other_sizes(diagnosis: Diagnosis) -> str | None:
 def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     """Format the total leakage past pump and piston, with its smallest change that could have been detected.
 
-    It is stated in L/min or, if this is not known, as a fraction of the pump's flow. Returns None if no detector
-    measured it. `basis`: True to add the piston area and pump displacement of the flows, unless the verdict is "leak",
-    for which they stand beside the leak (`_figure_rows`).
+    It is stated in L/min or else as a fraction of the pump's flow; None if no detector measured it. `basis`: True to
+    add `machine_text`, unless the verdict is "leak", for which it stands beside the leak (`_figure_rows`).
     """
     leakage = diagnosis.total_leakage
     if leakage is None:
@@ -249,20 +220,15 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
     key = "none" if not high > 0.0 else "at_most" if not low > 0.0 else "interval"
     figures = {"lpm": number(leakage.lpm, 2), "low": number(low, 2), "high": number(high, 2)}
     text = say(f"leakage.{key}", pressure=pressure, **figures)
-    if basis and diagnosis.verdict != "leak" and (machine := flow_basis(diagnosis)) is not None:
-        text += f" ({machine})"
+    if basis and diagnosis.verdict != "leak" and diagnosis.machine is not None:
+        text += f" ({machine_text(diagnosis.machine)})"
     text += "" if leakage.healthy_lpm is None else say("leakage.healthy", lpm=number(leakage.healthy_lpm, 2))
-    if leakage.findable_lpm is None:
-        return text
-    return text + say("leakage.findable", size=f"{number(leakage.findable_lpm, 2)} L/min")
+    findable = leakage.findable_lpm
+    return text + ("" if findable is None else say("leakage.findable", size=f"{number(findable, 2)} L/min"))
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage as a fraction of the pump's flow, with its smallest detectable change.
-
-    `pressure`: the pressure difference at which the leakage was measured, as text. An unknown fraction is written "not
-    measured".
-    """
+    """Format a total leakage as a fraction of the pump's flow, with its smallest detectable step; `pressure`: text."""
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -300,8 +266,7 @@ def _format_percent(fraction: float | None) -> str:
 def how_sure(diagnosis: Diagnosis) -> str:
     """Format the evidence: odds that a healthy recording looks like this one, score, threshold, false-alarm rate.
 
-    For example "1 in 2000; score 5.1, over the threshold of 3.2 of volume balance; ...". If an alarm has another cause
-    than a leak, the text names the cause to which odds and score refer. Without a score, the text says only this.
+    If an alarm has another cause than a leak, the text names the cause to which odds and score refer.
     """
     if diagnosis.score is None or diagnosis.threshold is None:
         return say("how_sure.no_score")
@@ -325,10 +290,7 @@ def odds_or_false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def false_alarms(diagnosis: Diagnosis) -> str:
-    """Format the false-alarm probability of all tests together as a percentage and as "1 in n".
-
-    A value that is not between 0 and 1 is written as a plain number.
-    """
+    """Format the false-alarm probability of all tests together in % and as "1 in n", or as a number if it is 0 or 1."""
     p = diagnosis.false_alarm_probability
     if not 0 < p < 1:
         return say("how_sure.probability", probability=number(p))
@@ -337,10 +299,7 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """List the recommended next steps as sentences, most useful first.
-
-    If the data have faults, one of the steps names them.
-    """
+    """List the recommended next steps as sentences, most useful first; one of them names faults of the data."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     # an unknown level is treated as the middle one, `plan`
@@ -385,10 +344,7 @@ def quality_summary(diagnosis: Diagnosis) -> str:
 
 
 def raw_counts(diagnosis: Diagnosis) -> str | None:
-    """Format a note on channels recorded in raw counts (numbers of a converter), with the remedy.
-
-    Returns None if there are no such channels.
-    """
+    """Format a note on channels recorded in raw counts (numbers of a converter), with the remedy; None if none are."""
     names = [finding.channel for finding in diagnosis.quality if finding.code == "raw_counts" and finding.channel]
     return f"{' and '.join(names)} in raw counts: state the unit, or a leak's size stays relative" if names else None
 
@@ -419,10 +375,7 @@ def short_text(diagnosis: Diagnosis) -> str:
 
 
 def diagnosis_text(diagnosis: Diagnosis) -> str:
-    """Format a whole diagnosis as text: verdict, numbers, all methods and all findings.
-
-    The text has no colours. Unprintable characters, which file names or headers may contain, are replaced.
-    """
+    """Format a whole diagnosis as text: verdict, numbers, all methods and all findings."""
     rows: list[tuple[str, str | None]] = [
         ("state", state_text(diagnosis.state)),
         *_figure_rows(diagnosis),
@@ -446,26 +399,20 @@ def diagnosis_text(diagnosis: Diagnosis) -> str:
 
 def _figure_rows(diagnosis: Diagnosis) -> list[tuple[str, str | None]]:
     """Build the rows (label, text) on the onset, the size and the severity of the leak; a text is None if unknown."""
-    size, basis = how_much(diagnosis), flow_basis(diagnosis)
-    if size is not None and basis is not None and diagnosis.leak_lpm is not None:
-        size = f"{size}; {basis}"
+    size = how_much(diagnosis)
+    if size is not None and diagnosis.machine is not None and diagnosis.leak_lpm is not None:
+        size = f"{size}; {machine_text(diagnosis.machine)}"
     return [("since", since(diagnosis)), ("how much", size), ("how bad", how_bad(diagnosis))]
 
 
 def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]]) -> str:
-    """Format a diagnosis as lines of text: file and verdict, then a paragraph for each row.
-
-    `rows`: pairs (label, text). A row without a text is left out.
-    """
+    """Format file and verdict, then a paragraph for each row (label, text) that has a text."""
     first = say("terminal.diagnosis", file=printable(diagnosis.file), summary=diagnosis.summary)
     return "\n".join((first, *paragraphs(rows, columns=12)))
 
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
-    """Format the leak flow [L/min] with its interval for the verdict "leak", and its upper bound for other verdicts.
-
-    If this is not known, the text is "L/min not stated".
-    """
+    """Format the leak flow [L/min] with its interval, or its bound for verdicts other than "leak", for a table."""
     if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
         low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
@@ -484,9 +431,8 @@ _FILE_COLUMNS = 22
 
 
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
-    """Format a diagnosis as a line of a table with file, date, verdict and leak flow [L/min].
+    """Format a diagnosis as a line of a table with file, date, verdict and leak flow [L/min], then what to do.
 
-    Lines on what to do follow, except for "no leak" without another cause. A long file name stands on a separate line.
     `start_s` [s since 1970]: start of the recording, None for a blank date.
     """
     file = PurePath(diagnosis.file).name

@@ -14,11 +14,11 @@ from sealscope.recordings.recording import Recording
 from sealscope.reporting.charts import display_values
 
 _BARS = "▁▂▃▄▅▆▇█"
-#: Width of a curve in characters.
-CURVE_WIDTH = 20
+#: Smallest width of a curve in characters.
+_MIN_CURVE_WIDTH = 10
 
 
-def draw_curve(values: Array, width: int = CURVE_WIDTH) -> str:
+def draw_curve(values: Array, width: int) -> str:
     """Draw values (n,) as a line of at most `width` bar characters, scaled between minimum and maximum.
 
     Each character shows the middle one of the finite values in its part of the curve, or is blank if there are none.
@@ -47,10 +47,7 @@ def _format_short(value: float) -> str:
 
 
 def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) -> str:
-    """Format an overview of a recording: length, channels with range and small curve, notes, and findings on its data.
-
-    `name`: name of the recording's file.
-    """
+    """Format an overview of the recording in the file `name`: length, channels with small curves, notes, findings."""
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""
@@ -62,7 +59,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
         finite = display_samples[np.isfinite(display_samples)]
         ends = f"{_format_short(finite.min())} to {_format_short(finite.max())} {unit}" if finite.size else "no values"
         line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
-        width = max(CURVE_WIDTH // 2, WIDTH - len(line))  # the rest of the line
+        width = max(_MIN_CURVE_WIDTH, WIDTH - len(line))  # the rest of the line
         lines.append(line + draw_curve(values, width))
     texts = [f"{name}: {value}" for name, value in recording.remarks.items()]
     texts += [f"not used: {', '.join(recording.unused)}"] if recording.unused else []

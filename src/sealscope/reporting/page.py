@@ -98,10 +98,7 @@ def report(
 
 
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Choose the rig whose values the page shows: `rig` if given, else the packaged rig stated for the diagnosis.
-
-    Returns None if `rig` has only the assumed values of the default rig, or if nobody stated a packaged rig.
-    """
+    """Choose the rig whose values the page shows: `rig`, else that of the diagnosis; None if it is only assumed."""
     if rig is not None:
         loaded_rig = load_rig(rig)
         return loaded_rig if states_rig(loaded_rig) else None
@@ -112,10 +109,7 @@ def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) 
 
 
 def _all_marks(recording: Recording, marks: Sequence[Mark], truth_onset_s: float | None) -> list[Mark]:
-    """Collect the moments to mark on all charts: `marks`, then the true onset [s] if it is stated.
-
-    Raises InputError if the recording is empty.
-    """
+    """Collect `marks` and the true onset [s], if stated; raise InputError if the recording is empty."""
     if len(recording) == 0:
         raise InputError("recording must have at least 1 sample to be reported, got 0")
     return [*marks, *([] if truth_onset_s is None else [Mark(float(truth_onset_s), "true onset", known=True)])]
@@ -130,10 +124,9 @@ def render_card(
     truth_onset_s: float | None = None,
     title: str | None = None,
 ) -> str:
-    """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels.
+    """Render the card, a picture of the diagnosis, as HTML of `WIDTH` x `HEIGHT` pixels, by arguments of `report`.
 
-    `rig`: names the machine if the recording does not; `marks`, `truth_onset_s` [s]: moments marked on the curve of the
-    leak; `title`: by default the name of the machine or file. Raises InputError if the recording is empty.
+    `rig`: names the machine if the recording does not. Raises InputError if the recording is empty.
     """
     card_charts = charts.course_charts(diagnosis, height=_CURVE_HEIGHT)
     all_marks = _all_marks(recording, marks, truth_onset_s)
@@ -221,22 +214,19 @@ def _change_rows(
     unknown numbers; `bar_limit`, the largest change [%] that the table's bars show; and the two `parts`.
     """
     parts = features.parts_to_compare(diagnosis, recording)
-    rows = []
-    for change in features.changes(recording, chambers, parts):
-        unit, scale = charts.detail_unit(recording.units[change.channel], change.name, pressure_unit)
-        before, after = (None if value is None else value / scale for value in (change.before, change.after))
-        label = charts.detail_label(change.name)
-        rows.append((change.channel, label, unit, before, after, change.percent))
+    rows: list[tuple[str, str, str, float | None, float | None, float | None]] = []
+    for channel, name, *both_rms in features.changes(recording, chambers, parts):
+        unit, scale = charts.detail_unit(recording.units[channel], name, pressure_unit)
+        before, after = (None if rms is None else rms / scale for rms in both_rms)
+        percent = 100 * (after - before) / before if before and after is not None else None  # None for a `before` of 0
+        rows.append((channel, charts.detail_label(name), unit, before, after, percent))
     max_change = max([10.0, *(abs(percent) for *_, percent in rows if percent is not None)])  # at least 10 %
     bar_limit = min(100.0, 10.0 * ceil(max_change / 10.0))  # rounded up to tens of percent, at most 100 %
     return {"changes": rows, "bar_limit": bar_limit, "parts": parts}
 
 
 def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> dict[str, Any]:
-    """Compute minimum, mean and maximum of a channel in its display unit, and count the missing samples.
-
-    Returns a mapping for the page's template. The three numbers are None if all samples are missing.
-    """
+    """Compute minimum, mean and maximum (None without samples) of a channel for the page, and count missing samples."""
     unit, values = charts.display_values(recording, name, pressure_unit)
     finite = values[np.isfinite(values)]
     statistics = (np.min, np.mean, np.max)
@@ -245,10 +235,7 @@ def _summarise_channel(recording: Recording, name: str, pressure_unit: str) -> d
 
 
 def _flatten(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested mappings as pairs (`prefix` + dotted name, text), such as ("rig.name", "thesis").
-
-    A value that is no text is written as JSON.
-    """
+    """Yield the entries of nested mappings as pairs (`prefix` + dotted name, text or JSON)."""
     for key, inner in value.items():
         if isinstance(inner, Mapping):
             yield from _flatten(inner, f"{prefix}{key}.")

@@ -13,8 +13,8 @@ from sealscope.recordings.recording import Recording
 def collect_particulars(recording: Recording, rig: Rig | None = None) -> dict[str, str]:
     """Collect the facts about a recording for the head of its page, as texts by label, such as "Date" or "Operator".
 
-    The facts come from remarks in the recording's file. If no remark states the machine, it is the title or name of
-    `rig`; if none states the date, it is the start of the recording. Labels are in the order of `particulars.toml`.
+    They come from remarks in the recording's file, else from `rig` (machine) and the recording's start (date), in the
+    order of `particulars.toml`.
     """
     remarks = recording.remarks
     patterns_by_label = tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8"))

@@ -30,9 +30,9 @@ class SvgPath(NamedTuple):
 
 
 class SvgText(NamedTuple):
-    """A text of a picture at `x`, `y`, in pixels from the top left corner of the frame; it reads upwards if `turned`.
+    """A text whose `anchor` ("start", "middle" or "end") is at `x`, `y`, in pixels from the frame's top left corner.
 
-    `anchor`: the "start", "middle" or "end" of the text is at this position.
+    It reads upwards if `turned`.
     """
 
     x: float
@@ -87,24 +87,18 @@ class Picture:
         self.shapes.append(SvgPath(style, path, title))
 
     def line(self, style: str, x: Array, y: Array, title: str = "", digits: int = 1) -> None:
-        """Draw a line through points (n,), given as values of the axes; a missing y (NaN) interrupts the line.
-
-        `title`: tooltip, "" for none; `digits`: decimals of the coordinates.
-        """
+        """Draw a line through points (n,) of the axes, interrupted at NaN; `digits`: decimals of the coordinates."""
         self.draw(style, self._path(x, y, digits), title)
 
     def _path(self, x: Array, y: Array, digits: int = 1) -> str:
-        """Format the line through points (n,) of the axes as an SVG path; a missing y (NaN) interrupts the line."""
+        """Format the line through points (n,) of the axes as an SVG path."""
         is_drawn = np.isfinite(y)
         is_first = is_drawn & ~np.append(False, is_drawn[:-1])  # the point before is not drawn: a new piece begins
         points = zip(is_first[is_drawn], self.x(x[is_drawn]), self.y(y[is_drawn]), strict=True)
         return "".join(f"{'M' if first else 'L'}{left:.{digits}f} {top:.{digits}f}" for first, left, top in points)
 
     def area(self, style: str, x: Array, low: Array, high: Array) -> None:
-        """Draw the area between the lines `low` and `high` (n,) over `x` (n,), given as values of the axes.
-
-        Points at which one of the lines is NaN are left out.
-        """
+        """Draw the area between the lines `low` and `high` (n,) over `x` (n,); points with NaN are left out."""
         is_known = np.isfinite(low) & np.isfinite(high)
         if is_known.any():
             # along the upper line, and back along the lower one
@@ -112,10 +106,7 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from `begin` to `end` on the x axis and from `low` to `high` on the y axis.
-
-        None stands for an end of the frame. Each side is at least `_MIN_BOX` pixels long, so that the box is visible.
-        """
+        """Draw a box from `begin` to `end` on the x axis and from `low` to `high` on the y axis, None for its end."""
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)

@@ -12,7 +12,6 @@ import tomllib
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from sealscope.errors import InputError, MissingExtra
 from sealscope.storage.atomic import atomic_write
@@ -69,8 +68,7 @@ def draw_page(page: str, path: str | os.PathLike[str], width: int, height: int) 
 def _inline_styles(page: str) -> str:
     """Copy the style sheet of a page (HTML) into each drawing, with each CSS variable replaced by its value for print.
 
-    WeasyPrint neither applies the page's style sheet to drawings nor knows CSS variables there. A page without a style
-    sheet is returned unchanged.
+    WeasyPrint neither applies the page's style sheet to drawings nor knows CSS variables there.
     """
     sheet = re.search(r"<style>(.*?)</style>", page, re.DOTALL)
     if sheet is None:
@@ -111,19 +109,19 @@ def _write_by_browser(
 ) -> None:
     """Let a browser convert a page (HTML) to the file `target`; raise InputError if this fails.
 
-    `options`: options of the browser's command line, which name the target; `kind`: description of the file for the
-    error message; `is_complete`: function that tests the bytes of the file. The browser is ended after
-    `_BROWSER_TIMEOUT`.
+    `options`: of the browser's command line, which name the target; `kind`: description of the file for the error
+    message; `is_complete`: tests the bytes of the file.
     """
     with tempfile.TemporaryDirectory(prefix="sealscope-", ignore_cleanup_errors=True) as folder:
         source = Path(folder) / "page.html"
         source.write_text(page, encoding="utf-8", errors="backslashreplace")
-        command = [browser, *_OPTIONS, *options, f"--user-data-dir={folder}/profile"]
-        run_options: dict[str, Any] = {"stdin": subprocess.DEVNULL, "timeout": _BROWSER_TIMEOUT}
+        command = [browser, *_OPTIONS, *options, f"--user-data-dir={folder}/profile", source.as_uri()]
         if hasattr(os, "geteuid") and os.geteuid() == 0:
-            command.append("--no-sandbox")  # the sandbox does not start for the user root
+            command.insert(1, "--no-sandbox")  # the sandbox does not start for the user root
         try:
-            result = subprocess.run([*command, source.as_uri()], capture_output=True, check=False, **run_options)
+            result = subprocess.run(
+                command, stdin=subprocess.DEVNULL, capture_output=True, timeout=_BROWSER_TIMEOUT, check=False
+            )
         except OSError as error:
             raise InputError(f"a browser must be a program that starts, got: {error.strerror} ({browser})") from None
         except subprocess.TimeoutExpired:

@@ -31,8 +31,8 @@ class Circuit(NamedTuple):
     """The parts of a machine that the schematic shows.
 
     `cylinder`: name of its type; `rods`: sides of the piston with a rod, "A", "B" or "AB"; `rod`: drawn rod height;
-    `throttles`, `make_up`, `bypass`, `valve`: True if there are throttles in the lines, make-up valves, a bypass with a
-    flow meter, or a servo valve; `values`: by label, the value with its unit, "" if unknown.
+    `throttles`, `make_up`, `bypass`, `valve`: whether there are throttles in the lines, make-up valves, a bypass with a
+    flow meter, a servo valve; `values`: by label, the value with its unit, "" if unknown.
     """
 
     cylinder: str
@@ -46,10 +46,9 @@ class Circuit(NamedTuple):
 
 
 def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMachine | None = None) -> Circuit:
-    """Choose the parts of a machine to draw in the schematic.
+    """Choose the parts of a machine to draw in the schematic, of which channels are `recorded`.
 
-    Without `rig`, only the parts that every pump-controlled actuator has are drawn, labelled with the areas and the
-    displacement if `machine` states them. A bypass is drawn if `q_leak` is among the `recorded` channels.
+    Without `rig`, these are the parts of every pump-controlled actuator, labelled with the sizes that `machine` states.
     """
     bypass = "q_leak" in recorded
     values = dict.fromkeys(_VALUES, "")
@@ -74,8 +73,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    `areas`: areas of the sides A and B. The height of a single rod over that of the bore is the ratio of the diameters,
-    sqrt(1 - smaller/larger area), but at most 0.8. That of a double-rod cylinder is unknown: it is drawn as `_ROD`.
+    A single rod over the bore is the ratio of the diameters, sqrt(1 - smaller/larger area).
     """
     ratio = min(areas) / max(areas)
     if ratio >= _MIN_DOUBLE_ROD_RATIO:
@@ -85,7 +83,7 @@ def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
 
 
 def _value_text(value: float, unit: str, scale: float) -> str:
-    """Format a value in SI units as a number of `unit`, with four significant digits; `scale`: size of `unit` in SI."""
+    """Format a value in SI with four significant digits in `unit`, whose size in SI is `scale`."""
     return f"{messages.number(value / scale, 4)} {unit}"
 
 
@@ -106,10 +104,7 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
 
 
 def channel_columns(recording: Recording) -> dict[str, str]:
-    """Return the name of each channel's column in the file, by channel; {} if the recording does not state them.
-
-    Names are cut to 60 characters.
-    """
+    """Return the name (up to 60 characters) of each channel's column in the file; {} if it is not stated."""
     columns: Any = recording.provenance.get("columns")
     if not isinstance(columns, dict):
         return {}

@@ -20,11 +20,10 @@ class DrawnTimes:
     """The times at which the channels of a recording are drawn.
 
     Samples are divided into buckets, groups of successive samples of which only the minimum and the maximum are drawn.
-    `t` (m,) [s]: times of the drawn points, never decreasing; `starts`, `stops` (k,): samples [start, stop) of each
-    bucket; `width`: number of samples in a full bucket, 1 if all are drawn; `fine`: range of samples that are all
-    drawn; `breaks` (g,): for each gap in time, the index of the first point after it, in a count without NaN, before
-    which a NaN interrupts the line; `by_sample`: True if the time stamps do not increase, so that `t` is the number of
-    the sample over the sampling rate.
+    `t` (m,) [s]: times of the drawn points; `starts`, `stops` (k,): samples [start, stop) of each bucket; `width`:
+    number of samples in a full bucket, 1 if all are drawn; `fine`: range of samples that are all drawn; `breaks` (g,):
+    points before which a NaN interrupts the line, as for `np.insert`; `by_sample`: True if the time stamps do not
+    increase, so that `t` is the number of the sample over the sampling rate.
     """
 
     t: Array
@@ -38,8 +37,7 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        Each bucket gives its minimum and maximum, the minimum first if its last value is not below its first. A bucket
-        of one sample gives one point. A NaN is inserted at each gap in time.
+        Each bucket gives its minimum and maximum, the minimum first if its last value is not below its first.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -57,11 +55,7 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Choose an increasing time axis (n,) [s] for a recording, the time stamps or else the numbers of the samples.
-
-    If the time stamps `t` (n,) [s] are finite and increase, the result is (`t`, False). Otherwise it is (sample number
-    / `rate` [Hz], True).
-    """
+    """Return the time stamps `t` [s] and False, or sample number / `rate` and True if `t` does not increase."""
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
 
@@ -71,12 +65,10 @@ def choose_drawn_times(
 ) -> DrawnTimes:
     """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
-    The samples are divided into buckets, groups of successive samples of which only minimum and maximum are drawn, at
-    the times of the bucket's first and last sample. Full buckets have equal numbers of samples, so a drawn peak is at
-    most one bucket away from its true time. At each gap in time a new bucket starts, and an additional point interrupts
-    the line. This is done for the longest gaps only, at most `points` / 20. `t` (n,) [s]: time stamps; `rate` [Hz]:
-    nominal sampling rate; `near` [s]: time around which `near_samples` samples are all drawn, each in a bucket of its
-    own; None for the start of the recording.
+    Minimum and maximum of a bucket (`DrawnTimes`) are drawn at the times of its first and last sample. Full buckets
+    have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At the longest gaps in
+    time, at most `points` / 20, a new bucket starts, and a point interrupts the line. `near` [s]: time around which
+    `near_samples` samples are all drawn, each in a bucket of its own; None for the start of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -103,19 +95,16 @@ def choose_drawn_times(
 def encode_values(values: Array) -> dict[str, Any]:
     """Encode values as base64 text of little-endian 16-bit integers, for the script of the page.
 
-    Returns the text `q`, the minimum `low` of the values, and `step`, 1/65534 of their range. An integer q of the text
-    stands for the value ``low + (q + 32767) * step``, and -32768 for a value that is not finite.
+    An integer q of the text `q` stands for the value ``low + (q + 32767) * step``, and -32768 for a value that is not
+    finite.
     """
     is_finite = np.isfinite(values)
-    low, high = 0.0, 0.0
-    if is_finite.any():
-        low, high = float(values[is_finite].min()), float(values[is_finite].max())
+    finite = values[is_finite]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     step = (high - low) / 65534
     codes = np.full(values.shape, _MISSING, dtype="<i2")
-    if step > 0:
-        codes[is_finite] = np.clip(np.rint((values[is_finite] - low) / step) - 32767, -32767, 32767)
-    else:  # all values are `low`
-        codes[is_finite] = -32767
+    # a step of 0: all values are `low`
+    codes[is_finite] = np.clip(np.rint((finite - low) / (step or 1.0)) - 32767, -32767, 32767)
     return {"low": low, "step": step, "q": b64encode(codes.tobytes()).decode()}
 
 

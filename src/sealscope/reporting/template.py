@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import re
 from base64 import b64encode
@@ -41,7 +40,8 @@ def _environment(package: str) -> jinja2.Environment:
     )
     read_file = partial(read_package_file, package=package)
     environment.globals |= {"packaged": read_file, "symbols": SYMBOLS, "version": _installed_version()}
-    environment.filters |= {"script_hash": _script_hash, "script_json": _script_json}
+    environment.filters["script_hash"] = _script_hash
+    environment.policies["json.dumps_kwargs"] = {"allow_nan": False, "separators": (",", ":")}  # of the filter `tojson`
     return environment
 
 
@@ -51,8 +51,7 @@ def render(
     """Render the template called `template` as the text of a page, with the values `context`.
 
     `package`: package of the template; `scripts`: names of script files in it that the page runs; `chart_data`: plain
-    JSON values of charts, which adds the scripts that draw charts, or None. Control characters in the text, such as
-    those of file names, are replaced.
+    JSON values, which adds the scripts that draw charts, or None. Control characters in the text are replaced.
     """
     names = scripts if chart_data is None else ("vendor/uPlot.iife.min.js", "templates/charts.js", *scripts)
     page = _environment(package).get_template(template)
@@ -61,10 +60,7 @@ def render(
 
 
 def read_package_file(name: str, package: str = _PACKAGE) -> Markup:
-    """Read a text file that templates do not escape, from `package` or else from `sealscope.reporting`.
-
-    `name`: path of the file within the package.
-    """
+    """Read a text file that templates do not escape, by its path in `package` or else in `sealscope.reporting`."""
     from markupsafe import Markup
 
     file = resources.files(package) / name
@@ -76,14 +72,6 @@ def _script_hash(code: str) -> Markup:
     from markupsafe import Markup
 
     return Markup(f"'sha256-{b64encode(sha256(code.encode()).digest()).decode()}'")
-
-
-def _script_json(value: Any) -> Markup:
-    """Format plain values as JSON inside an HTML element `script`, with <, > and & escaped."""
-    from markupsafe import Markup
-
-    text = json.dumps(value, ensure_ascii=True, allow_nan=False, separators=(",", ":"))
-    return Markup(text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026"))
 
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:

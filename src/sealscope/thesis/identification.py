@@ -46,10 +46,9 @@ def noise_free_mean_squares(
 ) -> Array:
     """Simulate a test of Appendix C without noise, and compute the mean squares of its wavelet details.
 
-    Returns (chambers, 5): the mean squares of d1..d4 [psi^2] and of the product d3d4 [psi^4]. The pressures are sampled
-    at the rig's rate after its anti-alias filter; the means are over 4 pi s (`ANALYSED`) from 7.2 s on (`SETTLING`).
-    `leak`: description of the leak, such as "0.01 L/min laminar", None for no leak; `x_0` [m]: initial position of the
-    piston; `values`: by name, parameters that replace those of the test.
+    Returns (chambers, 5): the mean squares of d1..d4 [psi^2] and of d3d4 [psi^4] over `ANALYSED` [s] after `SETTLING`,
+    at the rig's sampling rate. `leak`: such as "0.01 L/min laminar", None for no leak; `x_0` [m]: initial position of
+    the piston; `values`: by name, parameters that replace those of the test.
     """
     duration = ANALYSED + SETTLING + 128.0 / rig.daq.sample_rate  # 128: more than the 120 later samples of d4
     values = {**throttle_values(condition.closed_pct / 100.0), **(values or {})}
@@ -63,11 +62,10 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute the logarithm of the RMS (..., 5) of the wavelet details d1..d4 and d3d4 of pressures with white noise.
+    """Compute log RMS (..., 5) of d1..d4 and d3d4 of pressures with white noise, by the formulas above.
 
-    It is ``log(m_j + sigma^2) / 2`` for the detail d_j, and ``log(m_34 + sigma^2 m_3 + sigma^2 m_4 + sigma^4) / 2`` for
-    the product d3d4. `squares` (..., 5): mean squares without noise, m_1 to m_4 [psi^2] and m_34 [psi^4]; `sigma`:
-    standard deviation [psi] of the noise in the pressure.
+    `squares` (..., 5): mean squares without noise, m_1 to m_4 [psi^2] and m_34 [psi^4]; `sigma`: standard deviation
+    [psi] of the noise in the pressure.
     """
     variance = np.square(sigma)
     d1, d2, d3, d4, d3d4 = np.moveaxis(squares, -1, 0)
@@ -77,20 +75,14 @@ def log_rms(squares: Array, sigma: float) -> Array:
 
 
 def pressure_noise(rig: Rig, chamber: str) -> float:
-    """Compute the standard deviation [psi] of the noise in one sample of a chamber's pressure.
-
-    It is ``sqrt(sensor^2 + common^2 + step^2/12)``: noise of the sensor, common noise, and step of the quantisation.
-    """
+    """Compute the noise [psi] of a sample of a chamber's pressure: sensor, common noise, quantisation (step^2/12)."""
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
     return math.sqrt(sensor.noise**2 + rig.sensors.common_noise**2 + step**2 / 12.0) / PSI
 
 
 def log_residuals(rig: Rig, sheet: DataSheet) -> Array:
-    """Compute log(simulated RMS / measured RMS) of d1..d4 and d3d4 without the leak, for each test of Appendix C.
-
-    Returns (tests, chambers, 5). `rig`: rig to simulate, at its own sampling rate; `sheet`: the measured RMS.
-    """
+    """Compute log(simulated RMS / measured RMS) without the leak in each test of Appendix C, (tests, chambers, 5)."""
     group_squares = {}
     for command, closed_pct in GROUPS:
         # number, leak and level have no effect on a simulation without the leak
@@ -136,12 +128,9 @@ HYPOTHESES = tuple(Hypothesis(name, **values) for name, values in load_texts("hy
 def predicted_sheet(
     rig: Rig, hypothesis: Hypothesis = HYPOTHESES[0], conditions: tuple[Condition, ...] = APPENDIX_C
 ) -> DataSheet:
-    """Simulate the tests of Appendix C, without and with their leaks, on a rig changed according to a hypothesis.
-
-    Returns the RMS of the wavelet details, with the noise of the sensors, as a data sheet of the tests in `conditions`.
-    """
+    """Simulate tests of Appendix C, without and with their leaks, on a rig changed according to a hypothesis."""
     h = hypothesis
-    healthy_rig = _scale_parameters(rig.with_overrides(h.overrides) if h.overrides else rig, h.factors)
+    healthy_rig = _scale_parameters(rig.with_overrides(h.overrides), h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
     leak_free: dict[tuple[str, float], Array] = {}  # mean squares by operating condition, which several tests share
     # d1..d4 squared scale with the gain of sensor B squared, d3d4 squared with its fourth power
@@ -161,15 +150,12 @@ def predicted_sheet(
 
 
 def _scale_parameters(rig: Rig, factors: Mapping[str, float]) -> Rig:
-    """Return a copy of a rig with some parameters multiplied by `factors`, which are given by parameter name."""
-    return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()}) if factors else rig
+    """Multiply some parameters of a rig by `factors`, given by parameter name."""
+    return rig.with_overrides({name: float(rig[name]) * factor for name, factor in factors.items()})
 
 
 def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the parameters in which the rig fitted to Appendix C differs from the thesis's, with sources.
-
-    `context` is not used.
-    """
+    """Tabulate the parameters in which the fitted rig differs from the thesis's, with sources; `context` is unused."""
     fitted = load_rig(BENCH_RIG)
     thesis_rows = {row.name: row for row in load_rig("thesis").table()}
     rows = [
@@ -184,8 +170,7 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
-    The first table has the geometric mean over all tests, "yes" if this is within 25 % of 1, and the geometric standard
-    deviation. The second table has the geometric mean over the tests of each operating condition.
+    Geometric mean and standard deviation over all tests, then the mean over the tests of each operating condition.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)
@@ -207,13 +192,8 @@ def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the agreement of the fitted rig, changed according to each hypothesis, with the measured data sheet.
 
-    For each chamber the columns are:
-
-    - the ratio of simulated to measured RMS of d3 and d4 without the leak (geometric mean over the tests)
-    - the change [%] of the simulated RMS of d2 to d4 with the leak (geometric mean over the tests)
-    - the number of tests in which the RMS of d3 and d4 changes in the same direction in simulation and measurement
-
-    The first row compares the measured sheet with itself. A quick reproduction has the first two hypotheses only.
+    The columns are ratios of simulated to measured RMS without the leak and changes of the simulated RMS with the leak
+    (geometric means), and numbers of tests whose RMS moves as measured. A quick reproduction has two hypotheses only.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     sheet = context.sheet
@@ -223,10 +203,6 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     heads += [f"{c} {q} change with leak [%]" for c, q in change_columns]
     heads += [f"{c} {q} sign right [of 41]" for c, q in level_columns]
 
-    def signs(sheet: DataSheet, c: str, q: str) -> Array:
-        """Return the sign of the change with the leak of detail `q` of chamber `c` in each test, (tests,)."""
-        return np.asarray(np.sign(sheet.rms[c][q][:, 1] - sheet.rms[c][q][:, 0]))
-
     measured = [log_change_to_percent(sheet.log_change(c, q)) for c, q in change_columns]
     n = len(level_columns)
     # the sheet agrees with itself: all ratios are 1, and all tests have the same sign
@@ -234,8 +210,8 @@ def hypotheses_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     rig = load_rig(BENCH_RIG)
     for hypothesis in HYPOTHESES[:2] if context.quick else HYPOTHESES:
         predicted = predicted_sheet(rig, hypothesis)
-        log_ratios = [np.mean(np.log(predicted.rms[c][q][:, 0] / sheet.rms[c][q][:, 0])) for c, q in level_columns]
+        ratios = [float(np.exp(np.mean(predicted.log_ratio(sheet, c, q)))) for c, q in level_columns]
         changes = [log_change_to_percent(predicted.log_change(c, q)) for c, q in change_columns]
-        same_sign = [int(np.sum(signs(predicted, c, q) == signs(sheet, c, q))) for c, q in level_columns]
-        rows.append((hypothesis.name, *(float(np.exp(log_ratio)) for log_ratio in log_ratios), *changes, *same_sign))
+        same_signs = [predicted.count_same_signs(sheet, c, q) for c, q in level_columns]
+        rows.append((hypothesis.name, *ratios, *changes, *same_signs))
     return (item.table(rows, format_note("hypotheses"), heads),)

@@ -80,9 +80,9 @@ def mean_leaks() -> Array:
 class DataSheet:
     """The data sheet of Appendix C, measured or simulated.
 
-    `rms[chamber][quantity]` (tests, 2): RMS without and with the leak, for the chamber pressures "p_A" and "p_B" and
-    the wavelet details "d1" .. "d4" [psi] and "d3d4" [psi^2], the product of d3 and d4. The tests are usually those of
-    `APPENDIX_C`, in its order; a sheet simulated with drifting parameters may have them twice.
+    `rms[chamber][quantity]` (tests, 2): RMS without and with the leak of the wavelet details "d1" .. "d4" [psi] and
+    "d3d4" [psi^2], their product, of "p_A" and "p_B". The tests are those of `APPENDIX_C`, in its order; a sheet
+    simulated with drifting parameters may have them twice.
     """
 
     rms: Mapping[str, Mapping[str, Array]]
@@ -97,6 +97,15 @@ class DataSheet:
         pairs = self.rms[chamber][quantity]
         return np.asarray(np.log(pairs[:, 1] / pairs[:, 0]))
 
+    def log_ratio(self, other: DataSheet, chamber: str, quantity: str) -> Array:
+        """Compute log(RMS / RMS in another sheet) of a wavelet detail without the leak, in each test, (tests,)."""
+        return np.asarray(np.log(self.rms[chamber][quantity][:, 0] / other.rms[chamber][quantity][:, 0]))
+
+    def count_same_signs(self, other: DataSheet, chamber: str, quantity: str) -> int:
+        """Count the tests in which the RMS of a wavelet detail changes in the same direction in another sheet."""
+        changes = (np.sign(sheet.log_change(chamber, quantity)) for sheet in (self, other))
+        return int(np.sum(np.equal(*changes)))
+
 
 def log_change_to_percent(change: Array | float) -> float:
     """Convert a change c of a logarithm, or the mean of several, to the relative change 100 (exp(c) - 1) [%]."""
@@ -104,9 +113,9 @@ def log_change_to_percent(change: Array | float) -> float:
 
 
 def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
-    """Find the folder of the measured data sheet: `folder`, else that named by SEALSCOPE_SHEET, else `./data`.
+    """Find the folder of the measured data sheet: `folder`, else that named by SEALSCOPE_SHEET, else `./data` or None.
 
-    Returns None if no folder is named and `./data` has no sheet. Raises InputError if a named folder lacks a file.
+    Raises InputError if a named folder lacks a file.
     """
     named_folder = folder if folder is not None else os.environ.get(VARIABLE) or None
     candidate = Path(named_folder if named_folder is not None else "data")
@@ -121,8 +130,8 @@ def find_sheet(folder: str | os.PathLike[str] | None = None) -> Path | None:
 def read_sheet(folder: Path) -> tuple[DataSheet, str]:
     """Read the measured data sheet in `folder`; return it with a SHA-256 digest of its two files.
 
-    Raises UnreadableFile if a file cannot be read, and InputError if a column is missing, if a value is not a positive
-    number (only the throttles' closed fraction may be 0), or if the rows are not the tests of `APPENDIX_C`.
+    Raises UnreadableFile if a file cannot be read, and InputError if a column is missing, a value is no valid number,
+    or the rows are not the tests of `APPENDIX_C`.
     """
     rms: dict[str, dict[str, Array]] = {}
     digest = hashlib.sha256()
@@ -151,10 +160,9 @@ def read_sheet(folder: Path) -> tuple[DataSheet, str]:
 
 
 def _parse_number(row: dict[str, str], column: str, number: int, path: Path, *, allow_zero: bool = False) -> float:
-    """Parse the number in a column of a row of the data sheet.
+    """Parse a number of the data sheet; raise InputError unless it is finite and > 0, or 0 if `allow_zero`.
 
-    `number`, `path`: row number and file, for messages. Raises InputError unless the value is finite and > 0, or 0 if
-    `allow_zero`.
+    `number`, `path`: row number and file, for messages.
     """
     try:
         value = float(row[column] or "nan")  # an empty cell is no number > 0

@@ -6,7 +6,7 @@ import math
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -43,26 +43,17 @@ def _format_area(area: Area) -> str:
     return f"{area.value:.3f} ({area.low:.3f}–{area.high:.3f})"
 
 
-def column_sizes(judgement: Judgement) -> list[float]:
-    """List the sizes of leaks that have a column in the main table of a campaign, the smallest first.
-
-    If there are no leaks or more than `_MAX_SIZES` sizes, the list is [nan], for one column of all sizes together.
-    """
-    sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
-    return sizes if 0 < len(sizes) <= _MAX_SIZES else [math.nan]
-
-
 def main_table(result: CampaignResult) -> tuple[list[str], list[list[str]]]:
     """Build the main table of a campaign as text: the headings of its columns, and a row of cells for each detector.
 
-    The columns are: the detector; the information it was given, if stated; fraction of false alarms; fraction of
-    detected leaks for each size (`column_sizes`); area under the ROC curve of all leaks; a90, the leak size detected
-    with a probability of 90 %; and a90/95, its upper 95 % confidence bound. Two detectors for comparison, which always
-    or never raise an alarm, come last.
+    AUC is the area under the ROC curve, a90 the leak size detected with a probability of 90 %, a90/95 its upper 95 %
+    confidence bound. Two detectors for comparison, which always or never raise an alarm, come last.
     """
     judgement = result.judgement
-    sizes = column_sizes(judgement)
-    rows = judgement.overall if math.isnan(sizes[0]) else judgement.table  # nan: all sizes together
+    sizes = sorted({row.leak_lpm for row in judgement.table if row.leak_lpm > 0})
+    rows = judgement.table
+    if not 0 < len(sizes) <= _MAX_SIZES:
+        sizes, rows = [math.nan], judgement.overall  # nan: one column of all sizes together
     by_detector: dict[str, dict[str, AlarmFractions]] = defaultdict(dict)
     for row in rows:
         by_detector[row.detector][str(row.leak_lpm)] = row  # sizes as text, since nan (all sizes) does not equal itself
@@ -91,11 +82,7 @@ def _format_knowledge(known: PriorKnowledge | None) -> str:
 
 
 def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
-    """Format a90, the leak size that is detected with a probability of 90 %, and its upper 95 % bound a90/95.
-
-    `pod`: probability of detection over the size, for one detector. A size above the largest tested one, such as 2, is
-    written "> 2". An unknown size is a dash.
-    """
+    """Format a90 and a90/95: "> 2" above the largest tested size (here 2), a dash if unknown."""
     if pod is None or pod.curve is None:
         return "–", "–"
     largest = max(tested.size for tested in pod.sizes)
@@ -109,9 +96,8 @@ def _format_a90(pod: DetectorPod | None) -> tuple[str, str]:
 def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
-    At most `_MAX_NAMED` detectors are described, in the order of a90, the leak size that is detected with a probability
-    of 90 %. Detectors without an a90 within the tested sizes come last, ordered by the fraction of the largest leaks
-    that they find. The text ends with the number of judged records and the number of detectors that are not described.
+    At most `_MAX_NAMED` detectors are described, in the order of a90; those without an a90 within the tested sizes
+    come last, ordered by the fraction of the largest leaks that they find.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -173,10 +159,7 @@ def _say(name: str, **values: Any) -> str:
 
 
 def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
-    """Format notes on the channels and rigs that detectors were given, one for each set of channels and each rig.
-
-    A note names the detectors concerned, except that on channels if all detectors were given the same ones.
-    """
+    """Format a note for each set of channels and each rig that detectors were given."""
     by_channels: dict[str, list[str]] = defaultdict(list)
     by_rig: dict[str, list[str]] = defaultdict(list)
     for name, known in result.known.items():
@@ -188,24 +171,17 @@ def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
 
 
 def _is_batched(result: CampaignResult) -> bool:
-    """Return True if a campaign's records were simulated in batches; False if one by one, or for recordings."""
+    """Return True if a campaign's records were simulated in batches, and not one by one, or recorded."""
     return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
-    """Write the page of a campaign's result as HTML, and return its path.
-
-    `files`: names of files with tables in the folder of the page, to which the page has links.
-    """
+    """Write the page of a campaign's result as HTML, with links to `files` in its folder; return its path."""
     return template.write(path, render_campaign_page(result, files))
 
 
 def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> str:
-    """Render the page of a campaign's result as HTML.
-
-    `files`: names of files with tables in the folder of the page, to which the page has links. At most 200 failed
-    records are listed.
-    """
+    """Render the page of a campaign's result as HTML, with links to `files` and at most 200 failed records."""
     judgement, plan = result.judgement, result.plan
     heads, rows = main_table(result)
     failed = [
@@ -233,12 +209,7 @@ def render_campaign_page(result: CampaignResult, files: Sequence[str] = ()) -> s
 
 
 def _facts(result: CampaignResult) -> list[tuple[str, str]]:
-    """List the conditions of a campaign for its page, as pairs of label and text.
-
-    For recordings of machines there is a pair for each set of files. For simulated records the pairs are: rig; duration
-    and onset; each factor; base seed; mode, if simulated in batches; channels of each view (those that a detector is
-    given); the rig that detectors assume, if any do; and the achieved flow for each planned size of the leak.
-    """
+    """List the conditions of a campaign for its page, as pairs of label and text."""
     plan, judgement = result.plan, result.judgement
     if isinstance(plan, RecordedPlan):
         return [(group.label or group.files, f"{group.use}, size {group.size:g} {plan.unit}") for group in plan.sets]
@@ -278,9 +249,8 @@ def _describe_assumed_machine(plan: SimulatedPlan) -> str:
 def _detector_section(pod: DetectorPod, judgement: Judgement, unit: str) -> dict[str, Any]:
     """Build the template's values for the section of one detector on a campaign's page.
 
-    The section has a description of the score, plots, the areas under the ROC curves, and a table of the fractions of
-    alarms by leak size and by the levels of the campaign's factors. The table is empty if there are no factors or more
-    than `_MAX_SIZES` leak sizes. `pod`: the detector's probability of detection over the leak size, in `unit`.
+    `cells` are fractions of alarms by leak size and by the levels of the campaign's factors, left out if there are no
+    factors or more than `_MAX_SIZES` leak sizes. `pod`: the detector's probability of detection over the size.
     """
     name = pod.detector
     rocs = [roc for roc in judgement.rocs if roc.detector == name]
@@ -314,8 +284,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 def _describe_score(name: str) -> str:
     """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
 
-    `name`: the detector's name in the plan. In a name such as "diagnose @ pressures", the word after the "@" is the
-    view, i.e. the set of channels that the detector is given. The text also states the view.
+    The word after the "@" in a `name` such as "diagnose @ pressures" is the view, i.e. the set of channels it is given.
     """
     detector = parse_detector_name(name)
     view_text = f", given the channels of {detector.view} alone" if detector.view else ""
@@ -326,32 +295,26 @@ def _describe_score(name: str) -> str:
     return f"the score of the detector {detector.base!r}{view_text}" if detector.base in detectors() else ""
 
 
-class _PlotCurve(NamedTuple):
-    """A curve y(x) with a label; `band`: lower and upper end of its confidence band, None for none."""
-
-    label: str
-    x: Array
-    y: Array
-    band: tuple[Array, Array] | None
+#: A curve of a plot: label, x, y, and lower and upper end of its confidence band, None for none.
+_Curve = tuple[str, Array, Array, tuple[Array, Array] | None]
 
 
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
-    """Draw the fraction of leaks that a detector finds over the leak size, on a logarithmic axis.
+    """Draw the fraction of leaks that a detector finds over the leak size, with the fitted curve, a90 and a90/95.
 
-    `pod`: these fractions, and a curve fitted to them; `unit`: unit of the size. The picture shows the fractions with
-    their intervals, if there are at most `_MAX_FRACTIONS`, and the curve with its band. It marks the sizes a90
-    (detected with a probability of 90 %) and a90/95 (upper bound of a90). Returns title and picture by name for the
-    page's template, or None for fewer than two sizes.
+    More than `_MAX_FRACTIONS` fractions are left out. Returns title and picture by name for the page's template, or
+    None for fewer than two sizes.
     """
     if len(pod.sizes) < 2:
         return None
     first, last = pod.sizes[0].size, pod.sizes[-1].size
-    ends, curves, marks = (first, last), [], []
+    ends, marks = (first, last), []
+    curves: list[_Curve] = []
     if pod.curve is not None:
         ends = first / 1.5, last * 1.5  # so that the curve extends beyond the tested sizes
         grid = np.geomspace(*ends, _CURVE_POINTS)
         band = pod.curve.detection_band(grid)
-        curves = [_PlotCurve("hits and misses", grid, pod.curve.detection(grid), band)]
+        curves = [("hits and misses", grid, pod.curve.detection(grid), band)]
         sizes = ((pod.curve.a90, "a90"), (pod.curve.a90_95, "a90/95"))
         marks = [(size, label) for size, label in sizes if math.isfinite(size) and size <= grid[-1]]
     x_ends = (math.log10(ends[0]) - 0.02, math.log10(ends[1]) + 0.02)  # decimal logarithms, with a small margin
@@ -368,27 +331,20 @@ def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
 
 
 def _roc_plot(rocs: Sequence[SizeRoc], unit: str) -> dict[str, Any] | None:
-    """Draw the ROC curves of a detector, detections over false alarms, one for each leak size in `unit`.
-
-    A single curve is drawn with its confidence band. Returns title and picture by name for the page's template, or None
-    if there are no curves.
-    """
+    """Draw the ROC curves of a detector, one for each leak size, a single one with its band; None without curves."""
     if not rocs:
         return None
-    curves = []
+    curves: list[_Curve] = []
     for roc in rocs:
         band = (roc.curve.low, roc.curve.high) if len(rocs) == 1 else None
-        curves.append(_PlotCurve(_size_text(roc, unit), roc.curve.false_alarm, roc.curve.detection, band))
+        curves.append((_size_text(roc, unit), roc.curve.false_alarm, roc.curve.detection, band))
     picture = Picture(WIDTH, HEIGHT, (0.0, 1.0), (0.0, 1.0))
     _draw_detection_curves(picture, "false alarms", curves)
     return {"title": f"Detection over false alarms, {rocs[0].detector}", "picture": picture}
 
 
-def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_PlotCurve]) -> None:
-    """Draw curves of the detected fraction into `picture`, with grid, frame, and labels of both axes.
-
-    `x_label`: label of the x axis. Of each curve at most `_MAX_CURVE_POINTS` points are drawn.
-    """
+def _draw_detection_curves(picture: Picture, x_label: str, curves: Sequence[_Curve]) -> None:
+    """Draw curves of the detected fraction, of at most `_MAX_CURVE_POINTS` points each, with grid, frame and labels."""
     thinned_curves = []
     for label, x, y, band in curves:
         indices = np.unique(np.linspace(0, x.size - 1, min(x.size, _MAX_CURVE_POINTS)).round().astype(np.int64))

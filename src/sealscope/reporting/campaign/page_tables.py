@@ -6,7 +6,7 @@ import math
 import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import resolve_attribute
@@ -28,67 +28,43 @@ def _format_percent(fraction: float) -> str:
     return f"{value:.{digits}f}"
 
 
-class PageTable(NamedTuple):
-    """A table of the campaign's page.
+def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, dict[str, Any]]:
+    """Build the template's values for the tables of `page_tables.toml` that are not empty, by name.
 
-    `id`: identifier in the HTML; `about`: description; `heads`: of the columns; `rows`: cells as text; `words`: number
-    of columns with text, which stand left of the columns with numbers.
-    """
-
-    id: str
-    title: str
-    about: str
-    heads: list[str]
-    rows: list[tuple[str, ...]]
-    words: int = 1
-
-
-def page_tables(judgement: Judgement, unit: str, part: str = "") -> dict[str, PageTable]:
-    """Build the tables of `page_tables.toml` that are not empty, by name.
-
-    `unit`: unit of the leak sizes; `part`: purpose of the campaign, such as "development", "" if not stated.
+    `words` is the number of leading columns with text, not numbers. `unit`: of the leak sizes; `part`: purpose of the
+    campaign, such as "development", "" if not stated.
     """
     tables = {}
     for name, layout in tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")).items():
         columns = layout["columns"]
         rows = [tuple(_format_cell(row, content) for content in columns.values()) for row in getattr(judgement, name)]
         if rows:
-            title = layout["title"].format(part=f" ({part})" if part else "")
-            heads = [head.format(unit=unit) for head in columns]
-            tables[name] = PageTable(name, title, layout["about"], heads, rows, layout.get("words", 1))
+            tables[name] = {
+                "id": name,
+                "title": layout["title"].format(part=f" ({part})" if part else ""),
+                "about": layout["about"],
+                "heads": [head.format(unit=unit) for head in columns],
+                "rows": rows,
+                "words": layout.get("words", 1),
+            }
     return tables
 
 
 def _format_cell(row: Any, content: str) -> str:
     """Format the value of one cell, which is an attribute of `row`.
 
-    `content`: format, a space, and the dotted path of the attribute. The format is the name of an entry of `_FORMATS`,
-    such as "percent", or a format specification of Python, or missing.
+    `content`: optional format, an entry of `_FORMATS` or a format specification of Python, and path of the attribute.
     """
     format_name, _, path = content.rpartition(" ")
     value = resolve_attribute(row, path)
     return _FORMATS[format_name](value) if format_name in _FORMATS else format(value, format_name)
 
 
-class CauseTable(NamedTuple):
-    """The table of the causes that one detector names, as text.
+def cause_tables(judgement: Judgement) -> list[dict[str, Any]]:
+    """Build the template's values for a table of each detector: fractions of records by true cause and by named cause.
 
-    `columns`: named causes; `rows`: true cause, number of its records, and for each column the fraction of them for
-    which that cause is named; `right`: fraction of all records for which exactly the true cause is named; `covered`:
-    the same if an ambiguous cause that includes the true one counts, too.
-    """
-
-    detector: str
-    columns: tuple[str, ...]
-    rows: list[tuple[str, int, list[str]]]
-    right: str
-    covered: str
-
-
-def cause_tables(judgement: Judgement) -> list[CauseTable]:
-    """Build a table for each detector: fractions of records by true cause (rows) and by named cause (columns).
-
-    A true cause without records has no row.
+    `rows`: true cause, number of its records, and fraction of them for each named cause (`columns`); `right`,
+    `covered`: fractions of all records for which the true cause is named, alone and also within an ambiguous one.
     """
     tables = []
     for causes in judgement.causes:
@@ -99,16 +75,13 @@ def cause_tables(judgement: Judgement) -> list[CauseTable]:
             for name, counts, shares in confusion_rows
             if counts.any()  # else no record has this cause
         ]
-        right, covered = percent(confusion.accuracy), percent(causes.covered)
-        tables.append(CauseTable(causes.detector, confusion.columns, rows, right, covered))
+        rates = {"right": percent(confusion.accuracy), "covered": percent(causes.covered)}
+        tables.append({"detector": causes.detector, "columns": confusion.columns, "rows": rows, **rates})
     return tables
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:
-    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a dash for a quantile that is not finite.
-
-    An end of the interval that is not finite is a dash, too. If neither is finite, the interval is left out.
-    """
+    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a number that is not finite is a dash."""
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):

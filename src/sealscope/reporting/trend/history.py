@@ -36,11 +36,7 @@ _Level = tuple[float, float | None, float]
 def write_history_page(
     path: str | os.PathLike[str], judged: Sequence[Judged], *, title: str, left_out: int = 0
 ) -> Path:
-    """Write the page of a machine as .html, .htm or .pdf, and return its path; raise InputError if that fails.
-
-    `judged`: the machine's diagnosed recordings, in any order; `title`: name of the machine; `left_out`: number of
-    files that could not be read or diagnosed.
-    """
+    """Write the page of a machine (`render_history_page`) as .html, .htm or .pdf, and return its path."""
     return template.write(template.parse_page_path(path, card=False), render_history_page(judged, title, left_out))
 
 
@@ -76,11 +72,9 @@ def render_history_page(judged: Sequence[Judged], title: str, left_out: int = 0)
 
 
 def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
-    """Draw each recording's leak flow [L/min] over time, as a picture for each of the `SIZES`, "wide" and "narrow".
+    """Draw each recording's leak flow [L/min], or its bound, over time as `level_pictures`; None if none is known.
 
-    `ordered`: recordings in the order of their start; if a date is missing, the axis counts the recordings from 1. For
-    verdicts other than `leak`, the upper bound of a leak is drawn. Values far above the median are symbols at the top.
-    Returns None if no flow and no bound is known.
+    `ordered`: recordings in the order of their start; if a date is missing, the axis counts the recordings from 1.
     """
     levels = [_leak_level(entry.diagnosis) for entry in ordered]
     known_levels = [level for level in levels if level is not None]
@@ -122,11 +116,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
-    """Return the leak flow [L/min] of a diagnosis as (estimate, low, high); None if it is not known.
-
-    A lower end that is not finite becomes 0. For verdicts other than `leak`, the result is the upper bound of a leak,
-    as (bound, None, bound).
-    """
+    """Return the leak flow of a diagnosis or, for verdicts other than `leak`, its upper bound; None if not known."""
     leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
     if diagnosis.verdict != "leak":
         return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
@@ -147,13 +137,13 @@ def _draw_comparison(ordered: Sequence[Judged]) -> tuple[list[charts.Chart], cha
     """Draw the channels of the newest and of an earlier recording in the same charts, from a common start.
 
     The earlier recording is the last one with the verdict `no leak` or, if there is none, the last before the newest.
-    `ordered`: recordings in the order of their start. Returns the charts, their drawn lines, and the names of the two
-    files; or ([], None, []) if there is only one recording, no common channel, or a time that does not increase.
+    Returns the charts, their drawn lines, and the names of the two files; or ([], None, []) if there is only one
+    recording, no common channel, or a time that does not increase.
     """
     *earlier, newest = ordered
-    healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]
     if not earlier:
         return [], None, []
+    healthy = [entry for entry in earlier if entry.diagnosis.verdict == "no leak"]
     reference = (healthy or earlier)[-1]
     latest, other = newest.read(), reference.read()
     if not all(recording.t.size and np.all(np.diff(recording.t) > 0.0) for recording in (latest, other)):

@@ -53,9 +53,8 @@ def level_pictures(
 ) -> dict[str, Picture]:
     """Draw the leakage of a machine over time, as one picture for each of the `SIZES`, "wide" and "narrow".
 
-    `days`: times of the first and last recording [d], or their numbers if dates are unknown; `levels`: ends of the
-    leakage axis; `limit`: repair limit, drawn unless it lies above the axis; `format_day`: formats a value of the time
-    axis; `draw`: draws the recordings into a picture.
+    `days`: first and last value of the time axis, which `format_day` formats; `levels`: ends of the leakage axis;
+    `limit`: repair limit, drawn unless it lies above the axis; `draw`: draws the recordings into a picture.
     """
     margin = 0.02 * (days[1] - days[0]) or 0.5  # half a day if there is one time only
     first, last = days[0] - margin, days[1] + margin
@@ -86,11 +85,9 @@ def trend_pictures(trend: Trend) -> dict[str, Picture] | None:
 
 
 def _draw_trend(trend: Trend, picture: Picture) -> None:
-    """Draw a trend into a picture, in the trend's unit of leakage over days since the first recording.
+    """Draw recordings, alarms and repairs of a trend into a picture, and healthy range and fitted line by episode.
 
-    A recording is a point with its interval or, if its leakage is unknown, a symbol at the bottom. An episode, i.e. the
-    recordings from one repair to the next, has a box for the range of healthy recordings, and a fitted line. Alarms and
-    repairs are vertical lines.
+    An episode is the recordings from one repair to the next.
     """
     days = [trend.points[row].day for row in trend.rows]
     for episode in trend.episodes:
@@ -116,10 +113,9 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:
-    """Compute the limits (low, high) of the leakage axis in a trend's picture, in the trend's unit, with a margin.
+    """Compute the limits (low, high) of the leakage axis, which include intervals, healthy ranges and, in L/min, zero.
 
-    They include the intervals of all recordings, the healthy ranges and, in L/min, zero. The repair limit is included
-    only if it is less than 2.5 times the largest of these values, because a higher limit would flatten the curve.
+    The repair limit is included if it is below 2.5 times these values, because a higher one would flatten the curve.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]
@@ -133,11 +129,10 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 
 
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
-    """Compute the vertices (day, leakage) of the line fitted to an episode, the recordings from one repair to the next.
+    """Compute the vertices (day, leakage) of the line fitted to an episode, which ends at the present leakage.
 
-    Without an alarm or an onset, the line is straight, has the fitted growth, and ends at the present leakage.
-    Otherwise it stays at the healthy level until the onset, and then rises to the present leakage, linearly or in a
-    step. `days` [d]: times of the compared recordings (`Trend.rows`).
+    With an alarm and an onset it rises from the healthy level, linearly or in a step, else all along with the fitted
+    growth. `days` [d]: times of the compared recordings (`Trend.rows`).
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

@@ -32,10 +32,7 @@ def moment(trend: Trend, day: float) -> str:
 
 
 def stamp(seconds: float, span_days: float) -> str:
-    """Format a time [s since 1970] as a date in UTC, with the time of day if `span_days` is below 3.
-
-    `span_days` [days]: span of all times that are shown together.
-    """
+    """Format a time [s since 1970] as a date in UTC, with the time of day if all shown times span less than 3 days."""
     text = str(np.datetime64(round(seconds * 1e3), "ms"))  # such as 2026-11-25T09:30:00.000
     return text[:16].replace("T", " ") if span_days < 3.0 else text[:10]
 
@@ -50,26 +47,17 @@ def recordings_text(trend: Trend) -> str:
 
 
 def headline(trend: Trend) -> str:
-    """Format a trend in one line: the verdict, the date since which it holds, and the recordings.
-
-    The date is that of the last repair if the verdict is "no leak" and there was a repair, else that of the onset. It
-    is left out if the onset is not known.
-    """
-    key, since = "trend", ""  # neither an onset nor a repair
+    """Format a trend in one line: the verdict, the date since which it holds, if known, and the recordings."""
+    key, since = "trend", ""
     if trend.verdict == "no leak" and trend.repairs:  # a repair ended the earlier leak
-        key = "trend_fell"
-        since = moment(trend, trend.repairs[-1].day)
+        key, since = "trend_fell", moment(trend, trend.repairs[-1].day)
     elif trend.wear is not None and trend.wear.onset is not None:
-        key = "trend_since"
-        since = moment(trend, trend.wear.onset.value)
+        key, since = "trend_since", moment(trend, trend.wear.onset.value)
     return say(f"terminal.{key}", verdict=trend.decision.summary, since=since, recordings=recordings_text(trend))
 
 
 def verdict_sentence(trend: Trend) -> str:
-    """Format the verdict of a trend as a sentence for the heading of its page.
-
-    If another cause than a leak was found, the sentence names this cause.
-    """
+    """Format the verdict of a trend, or another cause than a leak, as a sentence for the heading of its page."""
     if trend.decision.summary != trend.verdict:  # the summary names another cause than a leak
         return trend.decision.summary.capitalize()
     if trend.verdict == "no leak":
@@ -87,11 +75,10 @@ def verdict_sentence(trend: Trend) -> str:
 def figures(trend: Trend) -> dict[str, str]:
     """Format the numbers of a trend as text, by name; the text is "" or a remark if a number is not known.
 
-    They are `total`, the present level: the leakage of pump and piston together or, for the basis "ringing", the
-    damping of the pressures' ringing; `leak`, its rise above the healthy level, if the verdict is `leak`; `healthy`,
-    the range of 95 % of the healthy recordings, cut off at the repair limit (`healthy_end`); `since`, the onset of the
-    rise; `growth`, the rise in a month, or in a sudden step; `limit`, the repair limit, and the date at which the level
-    reaches it. Levels are in `Trend.unit`.
+    `total`: present leakage of pump and piston together or, for the basis "ringing", damping of the pressures' ringing;
+    `leak`: its rise above the healthy level, for the verdict `leak`; `healthy`: range of 95 % of the healthy
+    recordings, up to `healthy_end`; `since`: onset of the rise; `growth`: rise in a month, or in a sudden step;
+    `limit`: repair limit, and the date at which the level reaches it. Levels are in `Trend.unit`.
     """
     wear = trend.wear
     if wear is None:
@@ -140,11 +127,10 @@ def _format_estimate(interval: Interval, unit: str) -> str:
 
 
 def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
-    """Format the repair limit, and the predicted date at which the leakage reaches it.
+    """Format the repair limit, and the predicted date at which the leakage reaches it, or why none is stated.
 
     `limit`: in the unit of the trend; `reach` [days]: time from the last compared recording until then (`Wear.reach`).
-    There is no date if the limit is reached already, the date is too far away (`history.furthest` of the priors), or
-    the recordings are too few. Without an alarm only the earliest date is stated (95 % confidence).
+    Without an alarm only the earliest date is stated.
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = (trend.points[row].day for row in (trend.rows[0], trend.rows[-1]))
@@ -201,10 +187,7 @@ def events(trend: Trend) -> list[str]:
 
 
 def trend_text(trend: Trend, *, whole: bool = False) -> str:
-    """Format a trend as text for the terminal, in lines of at most 80 columns.
-
-    `whole`: True to add the reason, the assumptions, the origin of the limit and all findings.
-    """
+    """Format a trend as text for the terminal; `whole`: with reason, assumptions, origin of the limit, all findings."""
     known_figures, findings = figures(trend), [finding.text for finding in trend.findings]
     rows = [("state", state_text(trend.state))]
     rows += [(level_name(trend), known_figures["total"])]

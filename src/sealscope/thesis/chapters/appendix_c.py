@@ -21,26 +21,20 @@ def _percent_change(pairs: Array) -> Array:
 
 
 def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, item: Item) -> ThesisTable:
-    """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis.
-
-    A detail has six columns: RMS without the leak, RMS with the leak, and the change [%], simulated and then measured.
-    Without a `measured` sheet its cells are empty.
-    """
+    """Tabulate the RMS of one chamber's wavelet details in all tests of Appendix C, in the form of the thesis."""
     heads = ["test", "mean leak [L/min]", "input", "closed [%]", "level"]
-    columns: list[list[float] | list[None]] = []
+    rows: list[tuple[Cell, ...]] = [
+        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level) for row in APPENDIX_C
+    ]
     for name in QUANTITIES:
         for label, source in (("simulated", sheet), ("measured", measured)):
             heads += [f"{name} {when}, {label} [{UNITS[name]}]" for when in ("no leak", "leak")]
             heads.append(f"{name} diff, {label} [%]")
-            if source is None:
-                columns += [[None] * len(APPENDIX_C)] * 3
-            else:
+            cells: list[list[float | None]] = [[None] * 3] * len(rows)
+            if source is not None:
                 pairs = source.rms[chamber][name]
-                columns += np.vstack([pairs.T, _percent_change(pairs)]).tolist()
-    rows = (
-        (row.number, row.mean_leak_lpm, row.command, row.closed_pct, row.level, *(column[k] for column in columns))
-        for k, row in enumerate(APPENDIX_C)
-    )
+                cells = np.column_stack([pairs, _percent_change(pairs)]).tolist()
+            rows = [(*row, *three_cells) for row, three_cells in zip(rows, cells, strict=True)]
     # the tail of the id, "-pa" or "-pb", tells the chambers' tables apart
     tail, title = f"-p{chamber[-1].lower()}", f"Appendix C, RMS of the wavelet details of {chamber}"
     return item.table(rows, "", heads, tail=tail, title=title)
@@ -49,14 +43,8 @@ def _chamber_table(sheet: DataSheet, measured: DataSheet | None, chamber: str, i
 def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[Cell, ...]]:
     """Compare the simulated data sheet with the measured one, in one row for each chamber and wavelet detail.
 
-    The cells of a row are:
-
-    - chamber and detail;
-    - change of the RMS with the leak [%], simulated and measured (geometric means over the tests);
-    - ratio of simulated to measured RMS without the leak: geometric mean and geometric standard deviation;
-    - number of tests in which both RMS change in the same direction, and correlation of both log changes.
-
-    Without a `measured` sheet, the five cells that need it are None.
+    The cells are change of the RMS [%], simulated and measured (geometric means over the tests); ratio of simulated to
+    measured RMS without the leak, mean and scatter; tests with the same sign of change, and correlation of the changes.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
@@ -64,12 +52,12 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
         comparison: tuple[Cell, ...] = (None,) * 5  # the five columns that need a measured sheet
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
-            log_ratio = np.log(sheet.rms[chamber][name][:, 0] / measured.rms[chamber][name][:, 0])
+            log_ratio = sheet.log_ratio(measured, chamber, name)
             comparison = (
                 log_change_to_percent(measured_change),
                 float(np.exp(log_ratio.mean())),
                 float(np.exp(log_ratio.std(ddof=1))),
-                int(np.sum(np.sign(simulated_change) == np.sign(measured_change))),
+                sheet.count_same_signs(measured, chamber, name),
                 float(np.corrcoef(simulated_change, measured_change)[0, 1]),
             )
         rows.append((chamber, name, log_change_to_percent(simulated_change), *comparison))
@@ -87,8 +75,7 @@ def agreement_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def difference_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the change of a wavelet detail's RMS with the leak, in its unit and in %, over the mean leak of each test.
 
-    The points are measured, simulated with the leak, and simulated without any leak. `item.inputs` has the chamber, the
-    detail, and the direction in which a leak should change the RMS ("down" or "up").
+    `item.inputs`: chamber, detail, and the direction in which a leak should change the RMS ("down" or "up").
     """
     chamber, name, direction = (item.inputs[key] for key in ("chamber", "detail", "way"))
     (table, sheet), leak = simulated_sheet(context, "leak"), mean_leaks()

@@ -38,11 +38,10 @@ RmsPairs = Mapping[str, Mapping[str, tuple[float, ...]]]
 
 
 def draw_drifts(number: int, half: float, draw: int = 0) -> tuple[ParameterDrift, ...]:
-    """Draw random steps of the rig's parameters in the middle of a test, which simulate drift.
+    """Draw random steps of the rig's parameters at the time `half` [s] of a test, which simulate drift.
 
-    Each entry under `drifts` in `cases.toml` lists parameters that step together by the same relative size. This size
-    is drawn uniformly from the entry's range, and its sign at random. `half`: time of the step [s]; `draw`: 0, 1, ..
-    for different draws of the test `number`. The random numbers depend on `number` and `draw` only.
+    The parameters of an entry under `drifts` in `cases.toml` step together, by a relative size drawn uniformly from the
+    entry's range and with a random sign. The draw depends on the test's `number` and on `draw` (0, 1, ...) only.
     """
     rng = np.random.default_rng([_SEEDS["drift"], draw, number])
     drifts = load_texts("cases.toml")["drifts"].values()
@@ -61,8 +60,7 @@ def leak_test(
 ) -> Experiment:
     """Build the experiment of one test of Appendix C, with its leak open in the second half.
 
-    The rig is the one fitted to the data of Appendix C. `half`: half the duration [s]; `seed`: seed of the noise;
-    `leak`: False for no leak; `drifts`: changes of the rig's parameters within the test.
+    `half`: half the duration [s]; `seed`: seed of the noise; `drifts`: changes of the rig's parameters within the test.
     """
     return Experiment.of(
         rig=BENCH_RIG,
@@ -76,11 +74,7 @@ def leak_test(
 
 
 def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condition, Experiment]]:
-    """Build the experiments of all tests of Appendix C, as pairs (inputs of the test, experiment).
-
-    `kind`: what changes in the middle of each test, at the time `half` [s]. With drift, parameters step by random
-    amounts, and each test occurs twice with different amounts, or once if `quick`.
-    """
+    """Build the experiments of all tests of Appendix C; with drift, two draws of each test, or one if `quick`."""
     runs = []
     for draw, condition in product(range(2 if kind == "drift" and not quick else 1), APPENDIX_C):
         drifts = draw_drifts(condition.number, half, draw) if kind == "drift" else ()
@@ -90,10 +84,7 @@ def build_experiments(kind: Runs, half: float, quick: bool) -> list[tuple[Condit
 
 
 def _describe_change(experiment: Experiment) -> str:
-    """Describe the change in the middle of a test: "leak opened", "nothing", or each drifting parameter.
-
-    A parameter is written with the factor of its step, such as "fluid.K_oil x 0.970".
-    """
+    """Describe the change in the middle of a test: "leak opened", "nothing", or drifts as "fluid.K_oil x 0.970"."""
     if experiment.leaks:
         return "leak opened"
     end = np.array(experiment.duration)
@@ -102,11 +93,9 @@ def _describe_change(experiment: Experiment) -> str:
 
 
 def part_detail_rms(recording: Recording, parts: Sequence[tuple[float, float]]) -> RmsPairs:
-    """Compute the RMS of the wavelet details of both chamber pressures in each part of a recording.
+    """Compute the RMS of the wavelet details d1..d4 [psi] and d3d4 [psi^2] of both pressures in parts of a recording.
 
-    `parts`: begin and end [s] of each part. Returns the RMS in each part, by chamber and detail: d1..d4 [psi] and the
-    product d3d4 [psi^2]. Samples near the ends of a part are left out, because their details depend on samples outside
-    it.
+    `parts`: begin and end [s] of each part. Samples whose details depend on samples outside the part are left out.
     """
     before, after = reach("db8", 4)[-1]  # numbers of earlier and later samples on which d4 depends
     bounds = np.round(np.array(parts) * recording.rate).astype(int) + np.array([before, -after])
@@ -139,11 +128,7 @@ COLUMNS = (
 def make_row(
     condition: Condition, change: str, mean_leak_lpm: float, ranges_MPa: Sequence[float], rms: RmsPairs
 ) -> tuple[Cell, ...]:
-    """Build the row of a test in a table with the columns `COLUMNS`.
-
-    `change`: text of what changes in the middle of the test; `ranges_MPa`: ranges of p_A and p_B in the first half
-    [MPa]; `rms`: RMS of each wavelet detail in the first and in the second half, by chamber and detail.
-    """
+    """Build the row of a test in a table with `COLUMNS`; `change`: at half time; `ranges_MPa`: in the first half."""
     values = (rms[chamber][name][k] for chamber, name, k, _ in _RMS_COLUMNS)
     return (condition.number, condition.command, condition.closed_pct, change, mean_leak_lpm, *ranges_MPa, *values)
 
@@ -164,9 +149,8 @@ def parse_sheet(table: ThesisTable) -> DataSheet:
 def runs_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Simulate the 41 tests of Appendix C, and tabulate the RMS of their wavelet details in both halves.
 
-    `item.inputs` states the kind of the runs. With the leak, the first test of each operating condition (command and
-    closing) is repeated with half the solver's step, except in a quick reproduction. The halves of a quick reproduction
-    are shorter.
+    With the leak, the first test of each operating condition (command and closing) is proved by half the solver's step.
+    A quick reproduction proves none, and has shorter halves.
     """
     half, kind = QUICK_HALF if context.quick else HALF, item.inputs["runs"]
     rows = []

@@ -30,46 +30,17 @@ _ONSET, _SETTLED, _BLOCK = 10.0, 1.0, 0.05
 _N_FACTORS = 24
 
 
-class WaveletFunctions(NamedTuple):
-    """Scaling function `phi` (n,) and mother wavelet `psi` (n,) of a wavelet, over the time `t` (n,) [samples]."""
-
-    phi: Array
-    psi: Array
-    t: Array
-
-
 class WaveletCentre(NamedTuple):
-    """Centre of a wavelet in time and in frequency.
-
-    `time`: centre of its energy [samples at scale 1]; `frequency` of its largest response [cycles per sample].
-    """
+    """Centre of a wavelet: of its energy in `time` [samples at scale 1], of its response in `frequency` [1/sample]."""
 
     time: float
     frequency: float
 
 
-class AmplitudeSpectrum(NamedTuple):
-    """Amplitudes and phases [degree] of the cosines whose sum is a signal, by frequency [Hz]; each (frequencies,)."""
-
-    frequency: Array
-    amplitude: Array
-    phase: Array
-
-
-class Spectrogram(NamedTuple):
-    """Amplitudes (frequencies, windows) of the cosines in successive windows of a signal.
-
-    `t` (windows,): middles of the windows [s]; `frequency` (frequencies,) [Hz].
-    """
-
-    t: Array
-    frequency: Array
-    amplitude: Array
-
-
-def mother_wavelet() -> WaveletFunctions:
-    """Compute the scaling function and the mother wavelet of db8 over time in samples, by the cascade algorithm."""
-    return WaveletFunctions(*discrete_wavelet(WAVELET).wavefun(level=10))  # 2^10 values per sample
+def mother_wavelet() -> tuple[Array, Array, Array]:
+    """Compute scaling function, mother wavelet and time [samples] of db8, (n,) each, by the cascade algorithm."""
+    phi, psi, t = discrete_wavelet(WAVELET).wavefun(level=10)  # 2^10 values per sample
+    return phi, psi, t
 
 
 def wavelet_spectrum(omega: Array) -> np.ndarray:
@@ -81,7 +52,7 @@ def wavelet_spectrum(omega: Array) -> np.ndarray:
     """
 
     def response(taps: list[float], omega: Array) -> np.ndarray:
-        """Compute the frequency response of a filter with the coefficients `taps` at `omega` [rad per sample]."""
+        """Compute the frequency response of a filter with the coefficients `taps`."""
         return np.asarray(np.polynomial.polynomial.polyval(np.exp(-1j * omega), np.array(taps, dtype=np.float64)))
 
     filters = discrete_wavelet(WAVELET)
@@ -108,12 +79,11 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     """Compute the continuous wavelet transform of samples `x` (n,) at `rate` [Hz] for `scales` a [s].
 
     CWT(a, b) = integral of x(t) |a|^(-1/2) psi((t - b)/a) dt, eqs. (3.4), (3.6). The mean of x is subtracted, and the
-    record is mirrored at its ends. The time b is that of the centre of the wavelet's energy. Returns the transform
-    (scales, n) [unit of x times s^0.5], with b at the time of each sample.
+    record is mirrored at its ends. Returns the transform (scales, n) [unit of x times s^0.5]; the centre of the
+    wavelet's energy is at each sample in turn.
     """
     # db8 is 15 samples long at scale 1; 16 leaves a margin
-    wavelet_reach = int(np.ceil(16.0 * float(np.max(scales)) * rate))
-    pad = min(x.size - 1, wavelet_reach)
+    pad = min(x.size - 1, int(np.ceil(16.0 * float(np.max(scales)) * rate)))
     padded = np.pad(x - x.mean(), pad, mode="symmetric")
     omega = 2.0 * np.pi * np.fft.rfftfreq(padded.size, 1.0 / rate)
     spectrum = np.fft.rfft(padded)
@@ -130,17 +100,13 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
 def inverse_gain(frequencies: Array, weight: float = 2.0) -> Array:
     """Compute the gain, at `frequencies` [Hz], of the wavelet transform (3.4) followed by its inverse.
 
-    The inverse integrates with da db / |a|^weight, which gives
-
-    gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da,
-
-    with Psi the spectrum of db8 and w = 2 pi f, over six decades of scales around the frequencies. With weight 2 the
-    gain is the same at all frequencies (the wavelet's admissibility constant). With weight 0, as in eq. (3.5), it falls
-    as 1/w^2.
+    The inverse integrates with da db / |a|^weight: gain(w) = integral over a > 0 of a^(1 - weight) |Psi(a w)|^2 da,
+    with w = 2 pi f and Psi the spectrum of db8. With weight 2 the gain is the same at all frequencies (the wavelet's
+    admissibility constant). With weight 0, as in eq. (3.5), it falls as 1/w^2.
     """
     omega = 2.0 * np.pi * np.asarray(frequencies, dtype=np.float64)
     geometric_mean = float(np.exp(np.mean(np.log(omega))))
-    a = np.geomspace(1e-3, 1e3, 12000) / geometric_mean
+    a = np.geomspace(1e-3, 1e3, 12000) / geometric_mean  # six decades of scales around the frequencies
     # da = a d(ln a)
     gains = [np.trapezoid(a ** (1.0 - weight) * np.abs(wavelet_spectrum(a * w)) ** 2 * a, np.log(a)) for w in omega]
     return np.array(gains)
@@ -151,21 +117,25 @@ def two_tone_signal(t: Array) -> Array:
     return np.asarray(np.cos(2.0 * np.pi * 100.0 * t) + 0.5 * np.sin(2.0 * np.pi * 30.0 * t))
 
 
-def amplitude_spectrum(x: Array, rate: float) -> AmplitudeSpectrum:
-    """Compute the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz], from its DFT, eq. (3.2)."""
+def amplitude_spectrum(x: Array, rate: float) -> tuple[Array, Array, Array]:
+    """Compute the cosines whose sum is the signal `x` (n,), sampled at `rate` [Hz], from its DFT, eq. (3.2).
+
+    Returns their frequencies [Hz], amplitudes, and phases [degree].
+    """
     spectrum = np.asarray(np.fft.rfft(x), dtype=np.complex128) * (2.0 / x.size)
     # 2: half of a cosine's amplitude is at its negative frequency; mean and Nyquist frequency have no such half
     spectrum[0] /= 2.0
     if x.size % 2 == 0:
         spectrum[-1] /= 2.0
     frequency = np.asarray(np.fft.rfftfreq(x.size, 1.0 / rate), dtype=np.float64)
-    return AmplitudeSpectrum(frequency, np.abs(spectrum), np.degrees(np.angle(spectrum)))
+    return frequency, np.abs(spectrum), np.degrees(np.angle(spectrum))
 
 
-def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectrogram:
+def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[Array, Array, Array]:
     """Compute the amplitudes of the cosines in successive Hann windows of `x` (n,), sampled at `rate` [Hz].
 
-    `window`: length of a window [samples]; `step`: distance from the start of one window to the next [samples].
+    `window`, `step`: length of a window, and distance to the next [samples]. Returns the middles of the windows [s],
+    the frequencies [Hz], and the amplitudes (frequencies, windows).
     """
     starts = np.arange(0, x.size - window + 1, step)
     hann = np.hanning(window + 1)[:-1]  # periodic: the last value is the first of the next period
@@ -174,7 +144,7 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> Spectr
     amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()
     frequency = np.asarray(np.fft.rfftfreq(window, 1.0 / rate), dtype=np.float64)
     middles = np.asarray((starts + window / 2.0) / rate, dtype=np.float64)
-    return Spectrogram(middles, frequency, np.asarray(amplitudes))
+    return middles, frequency, np.asarray(amplitudes)
 
 
 def nearest_index(values: Array, target: float) -> int:
@@ -274,11 +244,8 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _width(t: Array, values: Array) -> float:
-    """Compute the width [s] of the largest peak of a series `values` over `t` [s].
-
-    This is the standard deviation of the times within 0.1 s of the maximum, weighted by `values` squared.
-    """
-    near_peak = np.abs(t - t[values.argmax()]) < 0.1
+    """Compute the width [s] of the largest peak: standard deviation of the times near it, weighted by `values`^2."""
+    near_peak = np.abs(t - t[values.argmax()]) < 0.1  # [s]
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
     centre = np.sum(t[near_peak] * weight)
     return float(np.sqrt(np.sum((t[near_peak] - centre) ** 2 * weight)))
@@ -288,7 +255,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     """Draw the wavelet transform of the simulated pressure p_A, which rings, before and after a leak opens.
 
     The panels are the pressure, the rms of its transform in blocks of 0.05 s, with and without the noise of the
-    instruments, and the rms of the transform without noise over the times before and after the leak opens.
+    instruments, and the rms of the latter before and after the leak opens.
     """
     run = context.run(Experiment.of(command=_COMMAND, duration=20.0, leak=f"{_LEAK} from {_ONSET:g} s"))
     t = run.recorded.t
@@ -303,10 +270,10 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
         image = Image(middles, frequencies, block_rms * 1e3, "rms of CWT [kPa s^0.5]")
         title = f"({letter}) CWT(a, b), db8, {name}"
         panels.append(Panel("t [s]", "frequency [Hz]", title=title, marks=leak, image=image, log_y=True))
-    parts: tuple[tuple[Role, np.ndarray], ...] = (("no leak", (t > _SETTLED) & (t < _ONSET)), ("leak", t >= _ONSET))
+    parts: dict[Role, np.ndarray] = {"no leak": (t > _SETTLED) & (t < _ONSET), "leak": t >= _ONSET}
     # `transform` is now the last one, without noise
-    part_rms = {role: np.sqrt(np.mean(transform[:, part] ** 2, axis=1)) * 1e3 for role, part in parts}
-    curves = tuple(FigureCurve(frequencies, part_rms[role], role, role) for role, _ in parts)
+    part_rms = {role: np.sqrt(np.mean(transform[:, part] ** 2, axis=1)) * 1e3 for role, part in parts.items()}
+    curves = tuple(FigureCurve(frequencies, values, role, role) for role, values in part_rms.items())
     panels.append(Panel("frequency [Hz]", "rms of CWT [kPa s^0.5]", curves, "(d) rms of (c) over time", log_x=True))
     above_30_hz = frequencies > 30.0  # at lower frequencies the motion has peaks
     ring = int(np.flatnonzero(above_30_hz)[part_rms["no leak"][above_30_hz].argmax()])
@@ -320,10 +287,7 @@ def scalogram_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _running_rms(t: Array, rows: Array, size: int) -> tuple[Array, Array]:
-    """Compute the rms of each row of `rows` (rows, n) in successive blocks of `size` samples.
-
-    `t` (n,): times of the samples [s]. Returns the mean time of each whole block [s], and the rms (rows, blocks).
-    """
+    """Compute mean time [s] and rms (rows, blocks) of `rows` (rows, n) in successive whole blocks of `size` samples."""
     n_used = t.size // size * size
     block_rms = np.sqrt(np.mean(rows[:, :n_used].reshape(rows.shape[0], -1, size) ** 2, axis=2))
     return t[:n_used].reshape(-1, size).mean(axis=1), block_rms
@@ -335,11 +299,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _fourier_claims() -> Iterator[Claim]:
-    """Judge claims 3.1 and 3.2 on the spectrum of the signal of eq. (3.3).
-
-    3.1: it has lines of the stated amplitudes at 100 and 30 Hz, and is 0 elsewhere. 3.2: both lines are cosines, i.e.
-    have the phase 0.
-    """
+    """Judge claims 3.1 and 3.2: the spectrum of eq. (3.3) has the two stated lines and no other; both have phase 0."""
     t = np.arange(round(RATE)) / RATE
     frequency, amplitude, phase = amplitude_spectrum(two_tone_signal(t), RATE)
     tones = [nearest_index(frequency, tone) for tone, _ in TONES]

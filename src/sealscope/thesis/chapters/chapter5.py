@@ -36,9 +36,9 @@ NOMINAL_LPM: dict[str, float] = {"large": 0.0150, "medium": 0.0100, "small": 0.0
 class PrintedTest:
     """One of the ten leakage tests whose figures chapter 5 prints.
 
-    `section` of the thesis, such as "5.2a"; `level` of the leak, such as "large"; `first_figure`: n in the number 5.n
-    of its first figure; `n_input_figures`: number of its figures that show command, speed and displacement, 0 to 2 (2:
-    whole test and close-up); `half`: time [s] at which the leak opened, half the duration.
+    `section` of the thesis, such as "5.2a"; `level` of the leak, such as "large"; `first_figure`: n of its first figure
+    5.n; `n_input_figures`: number of its figures of command, speed and displacement (2: whole test and close-up);
+    `half`: time [s] at which the leak opened, half the duration.
     """
 
     section: str
@@ -73,7 +73,7 @@ TESTS: dict[str, PrintedTest] = {row[0]: PrintedTest(*row) for row in load_texts
 
 
 def make_test_experiment(test: PrintedTest) -> Experiment:
-    """Build the experiment of one of the ten tests of chapter 5, with the leak open in the second half."""
+    """Build the experiment of one of the ten tests, with the leak open in the second half."""
     return leak_test(test.condition, test.half, seed=test.condition.number)
 
 
@@ -89,11 +89,6 @@ class FigureView:
     span: tuple[float, float]
     chamber: str
 
-    @property
-    def recording(self) -> Recording:
-        """The recording of the simulated test."""
-        return self.run.recorded
-
     def notes(self) -> str:
         """Format the note that names the simulated test of Appendix C and the reason for its choice."""
         row = self.test.condition
@@ -107,34 +102,28 @@ class FigureView:
         """Build a panel over time [s] with a mark where the leak opens; `label`: label of the y axis."""
         return Panel("t [s]", label, curves, marks=((self.test.half, "leak opens"),), x_range=self.span)
 
-    def _curve(self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0) -> FigureCurve:
-        """Build the curve of `y` over `t` [s], by default the recording's times, within the figure's interval.
-
-        `role`: meaning of the curve, which determines the line style; `start` [s]: earliest time of the curve.
-        """
-        t = self.recording.t if t is None else t
-        is_drawn = (t >= max(start, self.span[0])) & (t <= self.span[1])
+    def _curve(
+        self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0, stop: float = math.inf
+    ) -> FigureCurve:
+        """Build the curve of `y` over `t` [s], by default the recording's times, from `start` to `stop` at most."""
+        t = self.run.recorded.t if t is None else t
+        is_drawn = (t >= max(start, self.span[0])) & (t <= min(stop, self.span[1]))
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
 
     def _curve_pair(self, y: Array, t: Array | None = None) -> list[FigureCurve]:
         """Build the curves of `y` over `t` [s], by default the recording's times, before and after the leak opens."""
         half = self.test.half
-        start, stop = self.span
-        # the curve before the leak is drawn as in a figure that ends where the leak opens
-        before = replace(self, span=(start, min(stop, half)))._curve(y, "no leak", "no leak", t)
-        return [before, self._curve(y, "leak", "leak", t, start=half)]
+        return [self._curve(y, "no leak", "no leak", t, stop=half), self._curve(y, "leak", "leak", t, start=half)]
 
-    def _part_masks(self) -> tuple[tuple[Mask, str], ...]:
-        """Return (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""
-        t, half = self.recording.t, self.test.half
-        return ((t >= SETTLING) & (t < half), _PART_LABELS[0]), (t >= half, _PART_LABELS[1])
+    def _part_masks(self) -> Iterator[tuple[Mask, str]]:
+        """Yield (mask, label) of the samples without the leak, after the start-up, and of those with the leak."""
+        t = self.run.recorded.t
+        for (start, stop), label in zip(self.test.parts, _PART_LABELS, strict=True):
+            yield (t >= start) & (t < stop), label
 
     def draw_inputs(self) -> PanelsAndNumbers:
-        """Draw command, motor speed and displacement of the test as three panels.
-
-        The numbers are the RMS of the speed and the linear trend of the displacement, without and with the leak.
-        """
-        recording = self.recording
+        """Draw command, motor speed and displacement; list RMS of the speed and trend of the displacement by part."""
+        recording = self.run.recorded
         rpm, x = recording["omega"] / _RPM, recording["x"] * 1e3
         panels = [
             self._panel("u [V]", self._curve(recording["u"], "command", "command")),
@@ -149,12 +138,8 @@ class FigureView:
         return panels, numbers
 
     def draw_leak(self) -> PanelsAndNumbers:
-        """Draw the leak flow and both chamber pressures of the test as three panels.
-
-        The numbers are the mean leak, simulated and in the thesis, and the range of each pressure between its 5 % and
-        95 % quantiles, without and with the leak.
-        """
-        recording = self.recording
+        """Draw the leak flow and both chamber pressures; list the mean leak, and the pressures' ranges by part."""
+        recording = self.run.recorded
         flow = self._curve(recording["q_leak"] / LITRE_PER_MINUTE, "flow meter, A to B positive", "leak")
         roles: dict[str, Role] = {"p_A": "A", "p_B": "B"}
         panels = [self._panel("leak [L/min]", flow)]
@@ -165,27 +150,20 @@ class FigureView:
         ]
         for mask, label in self._part_masks():
             for c in CHAMBERS:
-                low, high = np.percentile(recording[c][mask], [5.0, 95.0]) / 1e6
-                numbers.append(Number(f"5 to 95 % range of {c} {label}", float(high - low), "MPa"))
+                pressure_MPa = recording[c][mask] / 1e6
+                numbers.append(Number(f"5 to 95 % range of {c} {label}", pressure_range(pressure_MPa), "MPa"))
         return panels, numbers
 
     def draw_details(self) -> PanelsAndNumbers:
-        """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure as five panels.
-
-        The numbers are the RMS of each detail without and with the leak, and the change.
-        """
-        series = zip(QUANTITIES, details(self.recording[self.chamber] / PSI).quantities(), strict=True)
+        """Draw the wavelet details d1 to d4 and d3d4 of one chamber's pressure; list their RMS and its changes."""
+        series = zip(QUANTITIES, details(self.run.recorded[self.chamber] / PSI).quantities(), strict=True)
         panels = [self._panel(f"{name} [{UNITS[name]}]", *self._curve_pair(values)) for name, values in series]
         return panels, self._rms_changes(QUANTITIES)
 
     def draw_windowed_rms(self) -> PanelsAndNumbers:
-        """Draw the windowed RMS of the wavelet details d3, d4 and d3d4 of one chamber's pressure as three panels.
-
-        The RMS over the whole part without and with the leak are drawn as horizontal lines, and listed as numbers with
-        their changes.
-        """
-        t, curves = windowed_detail_rms(self.recording, self.chamber)
-        rms = part_detail_rms(self.recording, self.test.parts)[self.chamber]
+        """Draw the windowed RMS of d3, d4 and d3d4 of one chamber's pressure, and the RMS of each part as a line."""
+        t, curves = windowed_detail_rms(self.run.recorded, self.chamber)
+        rms = part_detail_rms(self.run.recorded, self.test.parts)[self.chamber]
         panels = []
         for name in _WINDOWED:
             part_rms = FigureCurve(np.ravel(self.test.parts), np.repeat(rms[name], 2), "RMS of each part", "reference")
@@ -195,7 +173,7 @@ class FigureView:
     def _rms_changes(self, names: tuple[str, ...]) -> list[Number]:
         """Compute the RMS of the wavelet details `names` without and with the leak, and the change [%] of each."""
         numbers = []
-        for name, (before, after) in part_detail_rms(self.recording, self.test.parts)[self.chamber].items():
+        for name, (before, after) in part_detail_rms(self.run.recorded, self.test.parts)[self.chamber].items():
             if name in names:
                 rms = zip(_PART_LABELS, (before, after), strict=True)
                 numbers += [Number(f"RMS of {name} {label}", value, UNITS[name]) for label, value in rms]
@@ -213,11 +191,7 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of each of Figs. 5.1 to 5.89.
-
-    A figure shows one view of a test, such as its leak flow and pressures, for the whole duration or for 10 s on either
-    side of the opening of the leak.
-    """
+    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: views of the tests, whole or 10 s around the leak's opening."""
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -246,8 +220,8 @@ def leak_test_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict[str, Array]]:
     """Compute the RMS of a chamber pressure's wavelet details in windows of 1000 samples that begin every 500 samples.
 
-    Windows near the record's ends, whose details depend on padding, are left out. Returns the centres of the windows
-    [s], and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
+    Windows whose details depend on padding at the record's ends are left out. Returns the centres of the windows [s],
+    and the RMS of d1..d4 [psi] and d3d4 [psi^2] by the detail's name.
     """
     transformed = details(recording[chamber] / PSI)
     inside = transformed.inside()
@@ -260,13 +234,12 @@ def windowed_detail_rms(recording: Recording, chamber: str) -> tuple[Array, dict
 class LeakTestMeasures:
     """Measures of one simulated test of chapter 5; each pair is (without leak, with leak).
 
-    `rms`: RMS of the wavelet details by chamber and detail, as in Appendix C; `speed`: RMS of the motor's speed
-    [rad/s]; `drift`: linear trend of the piston's position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s];
-    `range_MPa`: difference of the 95 % and 5 % quantiles of each chamber's noise-free pressure; `step_s`: by chamber,
-    the time [s] at which a single step fits the windowed RMS of d3 best, an estimate of the leak's onset.
+    `rms`: of the wavelet details by chamber and detail; `speed`: RMS of the motor's speed [rad/s]; `drift`: linear
+    trend of the piston's position [mm/s]; `velocity`: RMS of the piston's velocity [mm/s]; `range_MPa`: of each
+    chamber's noise-free pressure (`pressure_range`); `step_s`: by chamber, the onset estimated from the windowed RMS of
+    d3 (`fit_step_time`).
     """
 
-    test: PrintedTest
     rms: RmsPairs
     speed: tuple[float, float]
     drift: tuple[float, float]
@@ -291,10 +264,7 @@ def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
 
 
 def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> LeakTestMeasures:
-    """Simulate one of the ten tests of chapter 5, and compute measures of its parts before and after the leak opens.
-
-    `leak`: False to simulate the test without the leak.
-    """
+    """Simulate one of the ten tests, with or without its `leak`, and measure its parts before and after half time."""
     experiment = make_test_experiment(test)
     # no figure shows the run without the leak, so it is not proved by a smaller step
     run = context.run(experiment) if leak else context.run(replace(experiment, leaks=()), prove=False)
@@ -305,7 +275,7 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
     masks = [(t >= start) & (t < stop) for start, (_, stop) in zip(starts, test.parts, strict=True)]
 
     def compute_pair(values: Array, statistic: Callable[[Array], float] = rms) -> tuple[float, float]:
-        """Compute a statistic of `values` (n,) over whole periods of the command, without and with the leak."""
+        """Compute a statistic of `values` (n,) over whole periods in each part."""
         return statistic(values[masks[0]]), statistic(values[masks[1]])
 
     step_times = {}
@@ -315,7 +285,6 @@ def measure_test(context: Context, test: PrintedTest, *, leak: bool = True) -> L
         step_times[chamber] = fit_step_time(centres[is_settled], curves["d3"][is_settled])
     before, after = (sine_fit(t[mask], run.outputs["x"][mask], test.omega).slope * 1e3 for mask in masks)
     return LeakTestMeasures(
-        test=test,
         rms=part_detail_rms(recording, test.parts),
         speed=compute_pair(run.outputs["omega"]),
         drift=(before, after),

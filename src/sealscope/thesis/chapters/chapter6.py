@@ -6,7 +6,6 @@ import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,17 +71,8 @@ DUTY = f"position {1e3 * AMPLITUDE} mm sin({OMEGA!r}t)"
 
 
 def conductance(lpm: float, rig: Rig) -> float:
-    """Compute the conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] under a load of 2 kN (`LOAD`).
-
-    The pressure difference at the leak is then LOAD divided by the piston area A_A.
-    """
+    """Compute the conductance [m^3/(s Pa)] of a leak that passes `lpm` [L/min] at the pressure difference LOAD/A_A."""
     return lpm * LITRE_PER_MINUTE / (LOAD / rig.cylinder.A_A)
-
-
-@cache
-def _rig(name: str = RIG) -> Rig:
-    """Load a rig by its name; later calls return the same object."""
-    return load_rig(name)
 
 
 def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
@@ -91,10 +81,7 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the flow [m^3/s] (n,) from the supply of a servo valve.
-
-    It is Q_A, the flow into chamber A, for a spool position x_s > 0, and otherwise -Q_B, the flow into chamber B.
-    """
+    """Compute the flow [m^3/s] (n,) from the supply of a servo valve: into A for a spool at x_s > 0, else into B."""
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
@@ -113,11 +100,11 @@ class ControlledRig:
     values: tuple[tuple[str, float], ...] = ()
 
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
-        """Simulate the controlled rig for `duration` [s] under the load `LOAD` (2 kN) plus `load`.
+        """Simulate the rig for `duration` [s] under the load `LOAD` plus `load`, the text of a force against +x.
 
-        `command`: text of a position target or, in an open loop, a voltage; `load`: text of a force against +x.
+        `command`: text of a position target or, in an open loop, a voltage.
         """
-        rig = _rig(self.rig)
+        rig = load_rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
         if self.controller == "ideal":
             controller: Controller | None = FaultTolerant.from_rig(rig, known=leak_conductance)
@@ -135,18 +122,12 @@ class ControlledRig:
         return integrate_run(experiment, experiment.leaks)
 
     def run_duty(self, load: str = "0 N") -> tuple[Trajectory, Array]:
-        """Simulate five cycles of the position sine `DUTY`; return the run and the mask of its last two cycles.
-
-        `load`: text of a force that is added to `LOAD`.
-        """
+        """Simulate five cycles of the position sine `DUTY`; return the run and the mask of its last two cycles."""
         run = self.run(DUTY, 5.0 * CYCLE, load)
         return run, np.asarray((run.t >= 3.0 * CYCLE) & (run.t < 5.0 * CYCLE))
 
     def stiffness(self) -> float:
-        """Compute the dynamic stiffness |F/x| [N/mm] of the controlled piston at `STIFFNESS_FREQUENCY`.
-
-        The target is constant while the load varies as a sine of 0.5 Hz and amplitude `STIFFNESS_FORCE`.
-        """
+        """Compute the stiffness |F/x| [N/mm] at a constant target, from the motion under a sine of the force F."""
         force = f"{STIFFNESS_FORCE} N sin({2 * math.pi * STIFFNESS_FREQUENCY!r}t)"
         run = self.run("position 0 mm sin(t)", duration=16.0, load=force)  # amplitude 0: a constant target
         is_settled = run.t >= 8.0  # [s]
@@ -169,21 +150,18 @@ class ControlledRig:
         exceeding = np.flatnonzero(error > limit)
         if exceeding.size == 0:
             return math.inf
-        k = int(exceeding[0])
-        if k == 0:
-            return frequencies[0]
-        # interpolated on a logarithmic axis of frequency
-        fraction = (limit - error[k - 1]) / (error[k] - error[k - 1])
-        return float(frequencies[k - 1] * (frequencies[k] / frequencies[k - 1]) ** fraction)
+        # interpolated on a logarithmic axis of frequency, between the first larger error and the one before, if any
+        around = slice(max(0, int(exceeding[0]) - 1), int(exceeding[0]) + 1)
+        return float(np.exp(np.interp(limit, error[around], np.log(frequencies[around]))))
 
     def efficiencies(self) -> tuple[float, float]:
         """Compute the electrical and the hydraulic efficiency of a sine motion against a damper as the only load.
 
-        These are the work in the damper over the electrical energy of the motor, and over the hydraulic energy,
-        delivered by the pump at its ports or, in a valve-controlled rig, by a lossless supply at the supply's pressure.
+        These are the work in the damper over the motor's electrical energy, and over the hydraulic energy from the pump
+        at its ports or, in a valve-controlled rig, from a lossless supply at the supply's pressure.
         """
         run, mask = replace(self, values=(("F_l", 0.0), ("d_load", DAMPER))).run_duty()
-        flow = supply_flow(run) if _rig(self.rig).circuit.valve_controlled else run["Q_1"]
+        flow = supply_flow(run) if load_rig(self.rig).circuit.valve_controlled else run["Q_1"]
         damper_power = DAMPER * float(np.mean(run["v"][mask] ** 2))
         electrical_power = float(np.mean((run["V"] * run["i"])[mask]))
         hydraulic_power = float(np.mean((flow * (run["p_1"] - run["p_2"]))[mask]))
@@ -193,8 +171,7 @@ class ControlledRig:
 def tracking(run: Trajectory, mask: Array) -> tuple[float, float, float]:
     """Compute how the piston follows the position sine `DUTY` in the samples `mask` of whole cycles.
 
-    Returns the rms error of the position [mm], the electrical energy of the motor in a cycle [J], and the mean leakage
-    flow [L/min] that the controller compensates, 0 if it reports none.
+    Returns rms error [mm], electrical energy in a cycle [J], and mean leakage that the controller compensates [L/min].
     """
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
@@ -203,10 +180,7 @@ def tracking(run: Trajectory, mask: Array) -> tuple[float, float, float]:
 
 
 def controllers_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...]:
-    """Tabulate tracking, bandwidth, energy, stiffness and compensated leakage; plot error and stiffness over the leak.
-
-    The table has a row for each of the `CONTROLLERS` and each leak.
-    """
+    """Tabulate the performance of each controller with each leak; plot error and stiffness over the leak."""
     rows: list[tuple[Cell, ...]] = []
     for name, lpm in itertools.product(CONTROLLERS, _leak_flows(context)):
         loop = ControlledRig(name, lpm)
@@ -225,10 +199,9 @@ def _leak_flows(context: Context) -> tuple[float, ...]:
 def _figure_over_leak(
     table: ThesisTable, title: str, roles: Mapping[tuple[str, ...], Role], columns: Sequence[str], log_y: bool = False
 ) -> Figure:
-    """Draw some columns of a table over the leak, one panel each.
+    """Draw some `columns` of a table over the leak, one panel each.
 
-    `roles`: line style of each curve, by the first cells of its rows in `table`; `columns`: columns to draw; `log_y`:
-    True for logarithmic y axes. The logarithmic x axis shows a leak of 0 at 0.001 L/min.
+    `roles`: line style of each curve, by the first cells of its rows. A leak of 0 is drawn at 0.001 L/min.
     """
     panels = []
     for head in columns:
@@ -242,12 +215,7 @@ def _figure_over_leak(
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the drift of the piston's mean position over the leak, in an open loop and with two controllers.
-
-    In the open loop a sine of the voltage moves the piston. Its columns are the amplitude of the motion, its drift, and
-    this drift minus that without a leak. The last two columns are the drifts with the controllers "pi" and
-    "fault-tolerant".
-    """
+    """Tabulate the drift of the piston's mean position by leak: by a sine of the voltage, and with two controllers."""
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
 
@@ -296,8 +264,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column is the change [kPa] of the mean of min(p_A, p_B) over a cycle, from the third to the fifth cycle,
-    due to the loss of oil. The flow of a leak is stated for the mean pressure on its side in a run without leaks.
+    The last column [kPa] shows the loss of oil by the lower pressure's mean over a cycle. The flow of a leak is stated
+    for the mean pressure on its side in a run without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     mean_pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}
@@ -334,14 +302,10 @@ def valve_table(context: Context, item: Item) -> tuple[ThesisTable | Figure, ...
 
 
 def _column_by_leak(table: ThesisTable, names: tuple[str, ...], head: str) -> dict[float, float]:
-    """Return the values in the column `head` of a table by the leak [L/min], from rows that begin with `names`.
-
-    `names`: the first cells, such as a controller's name; the leak is in the next column. The tables have no empty
-    cells: `or 0.0` is for the type checker.
-    """
-    leak_column, value_column = len(names), table.columns.index(head)
-    rows = [row for row in table.rows if row[:leak_column] == names]
-    return {float(row[leak_column] or 0.0): float(row[value_column] or 0.0) for row in rows}
+    """Return the column `head` of a table by the leak [L/min], from rows that begin with `names`, then the leak."""
+    rows = [row[: len(names)] == names for row in table.rows]
+    leaks = column(table, table.columns[len(names)])
+    return dict(zip(leaks[rows].tolist(), column(table, head)[rows].tolist(), strict=True))
 
 
 def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
@@ -350,11 +314,7 @@ def judge_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _disturbance_claim(context: Context) -> Claim:
-    """Judge claim 6.2.1, that position feedback suppresses disturbances, by the drift of the piston with a leak.
-
-    With the PI controller the drift must be below 0.1 mm/min (`NEGLIGIBLE_DRIFT`) for each leak. The result also states
-    the drift that the leak causes without feedback.
-    """
+    """Judge claim 6.2.1, that position feedback suppresses disturbances: with the PI controller no leak makes drift."""
     table = first_table(context, "sec-6.2-open-loop")
     heads = "leak [L/min]", "open: drift by the leak [mm/min]", "pi: drift [mm/min]"
     rows = [row for row in zip(*(column(table, head) for head in heads), strict=True) if row[0] > 0]  # with a leak
@@ -385,10 +345,7 @@ def _tolerance_claim(context: Context) -> Claim:
 
 
 def _load_claim(context: Context) -> Claim:
-    """Judge claim 6.2.3: the largest tracking error over the loads, without a leak, differs between controllers.
-
-    The worst of three controllers must have more than 1.5 times the largest error of the best (`DISTINCT_RATIO`).
-    """
+    """Judge claim 6.2.3: without a leak, the largest error over the loads differs distinctly between controllers."""
     table = first_table(context, "sec-6.2-load")
     error_ranges = {}
     for name in LOAD_CONTROLLERS:
@@ -403,10 +360,7 @@ def _load_claim(context: Context) -> Claim:
 
 
 def _valve_claim(context: Context) -> Claim:
-    """Judge claim 6.2.4: pump and valve differ in efficiency and tracking error by more than a factor of 1.5.
-
-    Both are compared with the PI controller and without a leak.
-    """
+    """Judge claim 6.2.4: with PI and no leak, pump and valve differ distinctly in efficiency and tracking error."""
     table = first_table(context, "sec-6.2-valve")
     tests = []
     for head in ("efficiency against a damper [%]", _ERROR):

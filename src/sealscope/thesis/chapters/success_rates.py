@@ -27,11 +27,10 @@ _Row = tuple[Cell, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """A rule of Table 5.1, by which the RMS of some wavelet details indicates a leak.
+    """A rule of Table 5.1, which fires, i.e. indicates a leak, if the RMS of all its `details` move as with a leak.
 
-    The rule fires in a test, i.e. indicates a leak, if the RMS of all its details of p_A fall and of all its details of
-    p_B rise (`DIRECTION`) when the leak opens. `details`: (chamber, detail) pairs; `printed`: success rates [%] that
-    the thesis prints, "" for a rule that the thesis does not claim.
+    With a leak, those of p_A fall and those of p_B rise (`DIRECTION`). `details`: (chamber, detail) pairs; `printed`:
+    success rates [%] that the thesis prints, "" for a rule that the thesis does not claim.
     """
 
     name: str
@@ -39,27 +38,19 @@ class Rule:
     printed: str = ""
 
     def fires(self, sheet: DataSheet) -> Fires:
-        """Find the tests of a data sheet in which the rule fires, i.e. indicates a leak; return a mask (tests,)."""
+        """Find the tests (tests,) of a data sheet in which the rule fires."""
         moves = [sheet.log_change(chamber, detail) * DIRECTION[chamber] > 0 for chamber, detail in self.details]
         return np.asarray(np.all(moves, axis=0))
 
 
-def _load_rules(name: str) -> tuple[Rule, ...]:
-    """Load the rules in the entry `name` of `cases.toml`."""
-    return tuple(Rule(*row) for row in load_texts("cases.toml")[name])
-
-
 #: Rules of the six cells of Table 5.1, then of d3d4 in both chambers; and of the columns that the table leaves out.
-CLAIMED, UNCLAIMED = _load_rules("claimed"), _load_rules("unclaimed")
+CLAIMED, UNCLAIMED = (tuple(Rule(*row) for row in load_texts("cases.toml")[key]) for key in ("claimed", "unclaimed"))
 #: Rules of the six cells only, each with one detail.
 CLAIMED_CELLS = CLAIMED[:6]
 
 
 def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
-    """Format the count of a rule's firings as four cells: k/n, rate [%], and both ends of its 95 % interval [%].
-
-    `fires`: mask (tests,) of the tests in which the rule fires; all cells are empty for None.
-    """
+    """Format how often a rule fires as four cells, empty for None: k/n, rate [%], and its 95 % interval [%]."""
     if fires is None:
         return None, None, None, None
     k, n = int(fires.sum()), fires.size
@@ -68,10 +59,7 @@ def _format_count(fires: Fires | None) -> tuple[Cell, Cell, Cell, Cell]:
 
 
 def _count_heads(source: str, count: str) -> tuple[str, ...]:
-    """Build the heads of the four columns for a count on a data sheet, its rate, and both ends of the rate's interval.
-
-    `source`: name of the sheet; `count`: name of the count, such as "fires".
-    """
+    """Build the heads of the four columns of `_format_count`, for the sheet `source` and a `count` such as "fires"."""
     return tuple(f"{source}: {part}" for part in (count, "rate [%]", "95 % low [%]", "95 % high [%]"))
 
 
@@ -91,22 +79,19 @@ THRESHOLDS = (
 
 
 def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count for each rule of Table 5.1 the tests in which it fires (indicates a leak); return rows of a table.
+    """Count the tests in which each rule fires, as rows with the columns `RATES`.
 
-    The table has the columns `RATES` and a row for each rule. For comparison it has two more rows, for a rule that
-    fires in all tests and one that fires in none. `measured`: measured sheet, None if not given; `leak`, `no_leak`,
-    `drift`: sheets simulated with leak, without leak, and without leak but with drifting parameters. The last cell of a
-    row is the rate with leak minus the rate with drift [percentage points].
+    For comparison there are two more rules, one that always fires and one that never does. `measured`: measured sheet,
+    None if not given; `leak`, `no_leak`, `drift`: sheets simulated with leak, without, and with drift alone.
     """
-    # by name: the success rates that the thesis prints ("" for none), and the function that finds the firings
-    rules: dict[str, tuple[str, Callable[[DataSheet], Fires]]] = {
-        **{rule.name: (rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)},
-        "always fires": ("", lambda sheet: np.full(sheet.tests, True)),
-        "never fires": ("", lambda sheet: np.full(sheet.tests, False)),
-    }
+    sheets = (measured, leak, no_leak, drift)
+    rules: list[tuple[str, str, Callable[[DataSheet], Fires]]] = [
+        *((rule.name, rule.printed, rule.fires) for rule in (*CLAIMED, *UNCLAIMED)),
+        ("always fires", "", lambda sheet: np.full(sheet.tests, True)),
+        ("never fires", "", lambda sheet: np.full(sheet.tests, False)),
+    ]
     rows: list[_Row] = []
-    for name, (printed, fires) in rules.items():
-        sheets = (measured, leak, no_leak, drift)
+    for name, printed, fires in rules:
         cells = [cell for sheet in sheets for cell in _format_count(None if sheet is None else fires(sheet))]
         difference = 100.0 * float(fires(leak).mean() - fires(drift).mean())
         rows.append((name, printed or None, *cells, difference))
@@ -116,8 +101,8 @@ def count_rules(measured: DataSheet | None, leak: DataSheet, no_leak: DataSheet,
 def column_tests(sheet: DataSheet) -> list[_Row]:
     """Test each column of a data sheet, a chamber's wavelet detail, for a change with the leak by a sign test.
 
-    Hypothesis of the two-sided sign test: the RMS falls or rises with probability 1/2. Holm's correction covers all ten
-    columns, since Table 5.1 chose among them. Returns rows with the columns `TESTS`, without the source.
+    Holm's correction covers all ten columns, since Table 5.1 chose among them. Returns rows with the columns `TESTS`,
+    without the source.
     """
     rows = []
     for chamber, name in COLUMNS:
@@ -140,21 +125,18 @@ def d1_threshold(sheet: DataSheet, chamber: str, either_side: bool = False) -> f
 
 
 def drift_threshold(drift: DataSheet, chamber: str, detail: str) -> float:
-    """Compute the change of log RMS that drifting parameters alone exceed in 5 % of the tests (`FALSE_ALARMS`).
+    """Compute the change of log RMS that drift alone exceeds in 5 % of the simulated tests (`FALSE_ALARMS`).
 
-    It is the 95 % quantile of the detail's changes in `drift`, the sheet simulated with drifting parameters and no
-    leak. A change is positive if it has the direction that a leak should cause: down for p_A, up for p_B (`DIRECTION`).
+    Positive is the direction that a leak should cause: down for p_A, up for p_B (`DIRECTION`).
     """
     return float(np.quantile(drift.log_change(chamber, detail) * DIRECTION[chamber], 1.0 - FALSE_ALARMS))
 
 
 def count_with_thresholds(measured: DataSheet | None, leak: DataSheet, drift: DataSheet) -> list[_Row]:
-    """Count the leaks that each rule on a single wavelet detail finds if its RMS must change by more than a threshold.
+    """Count the leaks that each rule on a single detail finds if changes of the RMS count only above a threshold.
 
-    The change of the log RMS counts in the direction in which a leak should move it (`DIRECTION`). Without a leak, 5 %
-    of the tests would exceed the threshold. For the `measured` sheet, None if not given, it is `d1_threshold`. For the
-    sheet simulated with a `leak`, it is `drift_threshold` of the sheet simulated with `drift` alone. Returns rows with
-    the columns `THRESHOLDS`.
+    The threshold is `d1_threshold` for the `measured` sheet, None if not given, and `drift_threshold` for the sheet
+    simulated with a `leak`. Returns rows with the columns `THRESHOLDS`.
     """
     rows: list[_Row] = []
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):

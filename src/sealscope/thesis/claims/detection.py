@@ -22,15 +22,12 @@ def detection_claims(context: Context, item: Item) -> tuple[Claim, ...]:
 
 
 def _claim_order(claim: Claim) -> tuple[int, ...]:
-    """Compute the sorting key of a claim: the numbers in its id, such as (5, 4, 1), with 0 for "a", the abstract."""
+    """Return the numbers in a claim's id, such as (5, 4, 1), with 0 for "a", the abstract."""
     return tuple(int(number) for number in re.findall(r"[0-9]+", claim.id.replace("claim-a", "claim-0")))
 
 
 def claims_tables(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the claims of all chapters with their verdicts, and the number of claims with each verdict.
-
-    The claims are those of the items that `item` needs.
-    """
+    """Tabulate the claims of all items that `item` needs, and the number of claims with each verdict."""
     claims = [product for name in item.needs for product in context.product(name) if isinstance(product, Claim)]
     claims.sort(key=_claim_order)
     verdicts = Counter(claim.verdict for claim in claims)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -21,7 +21,7 @@ from sealscope.thesis.chapters.success_rates import DIRECTION, column_tests
 from sealscope.thesis.engine.context import Context
 from sealscope.thesis.engine.products import Claim, ThesisTable
 from sealscope.thesis.engine.texts import judge_claim
-from sealscope.thesis.sheet import APPENDIX_C, DataSheet
+from sealscope.thesis.sheet import APPENDIX_C, GROUPS, DataSheet
 
 NO_SHEET = "the thesis's data sheet was not given"
 #: The details that chapter 5 calls sensitive.
@@ -32,10 +32,10 @@ SENSITIVE = ("d3", "d4", "d3d4")
 class ClaimEvidence:
     """The data by which the claims on detection are judged.
 
-    `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`: the same
-    tests simulated with and without their leak; `drift_sheet`: without a leak but with drifting parameters, each test
-    once or twice; `leak_table`: the runs of `leak_sheet`, one row a test; `test_measures`: measures of the ten
-    simulated tests of chapter 5 by section, such as "5.2a"; `no_leak_measures`: those of test 5.2a without its leak.
+    `measured_sheet`: measured data sheet of Appendix C, None if not given; `leak_sheet`, `no_leak_sheet`,
+    `drift_sheet`: its tests simulated with their leak, without, and with drifting parameters instead; `leak_table`: the
+    runs of `leak_sheet`; `test_measures`: of the ten simulated tests of chapter 5 by section, such as "5.2a";
+    `no_leak_measures`: of test 5.2a without its leak.
     """
 
     measured_sheet: DataSheet | None
@@ -65,63 +65,48 @@ def gather_evidence(context: Context) -> ClaimEvidence:
 Finding = tuple[str, Sequence[bool]]
 
 
-@dataclass(frozen=True)
-class SheetClaim:
-    """A claim that is tested on a data sheet, measured or simulated.
+def judge_on_sheets(
+    evidence: ClaimEvidence,
+    id: str,
+    test: Callable[[DataSheet], Iterable[Finding]],
+    head: str = "",
+    separator: str = "; ",
+    kind: str = "",
+    **values: Any,
+) -> Claim:
+    """Judge a claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
 
     `test`: yields the findings on a sheet; `head`, `separator`: text before and between the texts of the findings;
-    `values`: computes the values of placeholders in the claim's other texts.
+    `kind`: key of the texts in `claims.toml` if claims share them, by default `id`; `values`: values of placeholders
+    in the claim's other texts. Without a measured sheet the claim `cannot be tested`.
     """
 
-    test: Callable[[DataSheet], Iterable[Finding]]
-    head: str = ""
-    separator: str = "; "
-    values: Callable[[ClaimEvidence, DataSheet], Mapping[str, Any]] = lambda evidence, sheet: {}
+    def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
+        """Format all findings on a sheet as one text, and collect the results of all parts of the claim."""
+        texts, parts = zip(*test(sheet), strict=True)
+        return head + separator.join(texts), list(itertools.chain.from_iterable(parts))
 
-    def judge(self, evidence: ClaimEvidence, id: str, kind: str = "") -> Claim:
-        """Judge the claim by the measured data sheet, and state the findings on the measured and the simulated sheet.
-
-        `kind`: key of the texts in `claims.toml` if claims share them, by default `id`. Without a measured sheet the
-        claim `cannot be tested`.
-        """
-
-        def state_findings(sheet: DataSheet) -> tuple[str, list[bool]]:
-            """Return the text of all findings on a sheet, and True or False for each part of the claim."""
-            texts, parts = zip(*self.test(sheet), strict=True)
-            return self.head + self.separator.join(texts), list(itertools.chain.from_iterable(parts))
-
-        measured = evidence.measured_sheet
-        sheet_text, parts = (NO_SHEET, []) if measured is None else state_findings(measured)
-        simulation_text, _ = state_findings(evidence.leak_sheet)
-        values = self.values(evidence, measured or evidence.leak_sheet)  # the texts need numbers in either case
-        return judge_claim(id, parts, kind, sheet=sheet_text, simulation=simulation_text, **values)
+    measured = evidence.measured_sheet
+    sheet_text, parts = (NO_SHEET, []) if measured is None else state_findings(measured)
+    simulation_text, _ = state_findings(evidence.leak_sheet)
+    return judge_claim(id, parts, kind, sheet=sheet_text, simulation=simulation_text, **values)
 
 
 def format_rate(tests: Sequence[bool] | np.ndarray) -> str:
-    """Format the number of tests that passed, as in `34/41 = 82.9 % (68 to 93 %)` with the exact 95 % interval.
-
-    `tests` (n,): True for each test that passed.
-    """
+    """Format the number of tests (n,) that passed, as in `34/41 = 82.9 % (68 to 93 %)` with the exact 95 % interval."""
     k, n = int(np.sum(tests)), len(tests)
     low, high = clopper_pearson(k, n)
     return f"{k}/{n} = {100 * k / n:.1f} % ({100 * low:.0f} to {100 * high:.0f} %)"
 
 
 def holm_p_values(sheet: DataSheet) -> dict[tuple[str, str], float]:
-    """Compute the p-values of sign tests on the columns of a data sheet, corrected by Holm, by (chamber, detail).
-
-    The null hypothesis of each two-sided test is that, with the leak, the RMS rises or falls with equal probability.
-    """
+    """Return the p-values of `column_tests`, corrected by Holm, by (chamber, detail)."""
     # a row begins with chamber and detail, and ends with the corrected p-value and whether it is below 5 %
     return {(str(chamber), str(name)): float(p) for chamber, name, *_, p, _ in column_tests(sheet)}  # type: ignore[arg-type]
 
 
 def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
-    """Return True if the RMS of a wavelet detail changes with the leak significantly and as the thesis states.
-
-    For p_A it must fall in more tests than it rises, for p_B the reverse. The p-value, corrected by Holm, must be below
-    5 % (`holm_p_values`).
-    """
+    """Return True if a detail's RMS moves as the thesis states in most tests, with a p-value below 5 % (Holm)."""
     change = sheet.log_change(chamber, name) * DIRECTION[chamber]  # > 0: in the thesis's direction
     return bool(np.sum(change > 0) > np.sum(change < 0) and holm_p_values(sheet)[chamber, name] < 0.05)
 
@@ -129,28 +114,22 @@ def moves_beyond_chance(sheet: DataSheet, chamber: str, name: str) -> bool:
 def is_correlated(r: float, n: int, controls: int = 0) -> bool:
     """Return True if a correlation coefficient `r` of n points differs from 0 at the 5 % level (two-sided).
 
-    Criterion (Fisher's z): ``|artanh r| sqrt(n - 3 - controls) > 1.96``, with `controls` the number of columns on which
-    both variables were regressed before. Source: Fisher, Metron 3 (1924) 329-332.
+    Fisher's z: ``|artanh r| sqrt(n - 3 - controls) > 1.96``, with `controls` the number of columns on which both
+    variables were regressed before. Source: Fisher, Metron 3 (1924) 329-332.
     """
     z = np.arctanh(np.clip(r, -0.999999, 0.999999))  # clipped, as artanh(1) is infinite
     return bool(abs(z) * np.sqrt(n - 3 - controls) > WITHIN_95)
 
 
 def condition_design() -> Array:
-    """Build the design matrix (tests, commands + 1) of the tests' operating conditions, i.e. command and throttles.
-
-    The columns are indicators of the commands, and last the fraction by which both throttles are closed.
-    """
+    """Build the design matrix (tests, commands + 1): indicators of the commands, and the throttles' closed fraction."""
     commands = sorted({row.command for row in APPENDIX_C})
     indicators = [[float(row.command == command) for command in commands] for row in APPENDIX_C]
     return np.column_stack([np.array(indicators), [row.closed_pct / 100.0 for row in APPENDIX_C]])
 
 
 def partial_correlation(x: Array, y: Array, controls: Array) -> float:
-    """Compute the partial correlation of `x` and `y` (n,), with the effect of `controls` (n, k) removed.
-
-    It is the correlation of the residuals of two least-squares fits, of `x` and of `y` by the columns of `controls`.
-    """
+    """Correlate the residuals of `x` and of `y` (n,) from least-squares fits by the columns of `controls` (n, k)."""
     residuals = [v - controls @ np.linalg.lstsq(controls, v, rcond=None)[0] for v in (x, y)]
     return float(np.corrcoef(residuals[0], residuals[1])[0, 1])
 
@@ -193,12 +172,9 @@ def classify_without_baseline(sheet: DataSheet, leave_out: Literal["test", "cond
     # rows: the leak-free halves of all tests, then the leaking halves
     columns = np.column_stack([np.log(rms).T.ravel() for rms in detail_rms])
     is_leaking = np.repeat([False, True], len(APPENDIX_C))
-    if leave_out == "test":
-        groups: list[object] = [row.number for row in APPENDIX_C]
-    else:
-        groups = [f"{row.command} at {row.closed_pct:g} %" for row in APPENDIX_C]
+    groups = [row.number if leave_out == "test" else GROUPS.index(row.group) for row in APPENDIX_C] * 2  # both halves
     regression = make_pipeline(StandardScaler(), LogisticRegression(C=1.0, tol=1e-9))
-    # groups * 2: one entry for each half of a test
-    cross_validation: dict[str, Any] = {"groups": groups * 2, "cv": LeaveOneGroupOut(), "method": "decision_function"}
-    log_odds = cross_val_predict(regression, columns, is_leaking, **cross_validation)
+    log_odds = cross_val_predict(
+        regression, columns, is_leaking, groups=groups, cv=LeaveOneGroupOut(), method="decision_function"
+    )
     return float(np.mean((log_odds > 0) == is_leaking)), auc(log_odds[~is_leaking], log_odds[is_leaking]).value

@@ -1,8 +1,8 @@
 """Judge the claims of the abstract, chapter 5 and the conclusions on leaks, details and success rates by the sheet.
 
-A function `_test_...` yields the findings on a data sheet: a text, and True or False for each part of the claim. d3d4
-is the product of the wavelet details d3 and d4. A change is "beyond the noise" if it exceeds a limit that noise alone
-exceeds in 5 % of the tests (`d1_threshold`).
+A function `_test_...` yields the findings on a data sheet: the numbers as text, and for each part of the claim whether
+they meet it. d3d4 is the product of the wavelet details d3 and d4. A change is "beyond the noise" if it exceeds a limit
+that noise alone exceeds in 5 % of the tests (`d1_threshold`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -34,13 +33,13 @@ from sealscope.thesis.claims.evidence import (
     SENSITIVE,
     ClaimEvidence,
     Finding,
-    SheetClaim,
     change_design,
     classify_without_baseline,
     condition_design,
     format_rate,
     holm_p_values,
     is_correlated,
+    judge_on_sheets,
     leave_one_out_r2,
     moves_beyond_chance,
     partial_correlation,
@@ -61,11 +60,7 @@ _A_D3, _, _A_D3D4, _, _, _B_D3D4, _BOTH_D3D4 = CLAIMED
 
 
 def _exceeds_noise(sheet: DataSheet, chamber: str, name: str) -> np.ndarray:
-    """Find the tests in which the RMS of a wavelet detail falls (p_A) or rises (p_B) with the leak beyond the noise.
-
-    The change must exceed a limit that noise alone exceeds in 5 % of the tests (`d1_threshold`). Returns a mask
-    (tests,).
-    """
+    """Find the tests (tests,) in which a detail's RMS falls (p_A) or rises (p_B) with the leak beyond the noise."""
     return np.asarray(sheet.log_change(chamber, name) * DIRECTION[chamber] > d1_threshold(sheet, chamber))
 
 
@@ -75,55 +70,49 @@ def _format_controls(evidence: ClaimEvidence, rule: Rule) -> str:
     return f"In simulation the rule fires in {no_leak} with no leak and in {drift} with drift alone"
 
 
-def _rate_claim(rule: Rule, where: str) -> SheetClaim:
-    """Build the claim that a rule of Table 5.1 has the success rate that the thesis prints for it.
+def _judge_rate(evidence: ClaimEvidence, sheet: DataSheet, number: int, rule: Rule) -> Claim:
+    """Judge claim 5.4.`number`, that a rule of Table 5.1 has the success rate that the thesis prints for it.
 
-    `where`: section or figure of the thesis that states the rate.
+    The rate must be within 1 percentage point of a printed one, and higher than by chance: without an effect each of
+    the rule's k details moves in the direction of a leak with probability 1/2, and all of them with 1/2^k. The
+    one-sided binomial p-value must be below 0.05/10. The text states the rates of d3d4 in `sheet`.
     """
-    # without an effect each of the rule's details moves in its direction with probability 1/2
     chance = 0.5 ** len(rule.details)
     printed = [int(rate) for rate in re.findall(r"\d+", rule.printed)]  # [%]; several where the thesis disagrees
 
     def test_rate(sheet: DataSheet) -> Iterator[Finding]:
-        """Test that the rule's success rate is within 1 percentage point of a printed rate, and higher than by chance.
-
-        By chance, a detail moves in the direction of a leak with probability 1/2, and all k details of the rule do so
-        with probability 1/2^k. The one-sided binomial p-value must be below 0.05/10. Yields the rate as text, and the
-        results of both tests.
-        """
+        """Test that the rule's success rate is as printed, and higher than by chance."""
         fires = rule.fires(sheet)
         p = upper_tail(int(fires.sum()), fires.size, chance)
         as_printed = any(abs(100.0 * float(fires.mean()) - rate) <= 1.0 for rate in printed)
         text = f"{format_rate(fires)}; p = {p:.2g} against chance of {100 * chance:g} %"
         yield text, [as_printed, p < 0.05 / 10]  # Bonferroni's correction for ten columns
 
-    def format_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, str]:
-        """Make the values that fill the placeholders of the claim's texts, by name.
-
-        "product" is a remark on the printed rate of d3d4 in both chambers, "" for other rules. "controls" are the
-        rule's false alarms in the simulations of `evidence`.
-        """
+    where, product = f"Fig. 5.{89 + number}", ""  # Figs. 5.90 to 5.95
+    if rule is _BOTH_D3D4:
         rate_A, rate_B = (float(part.fires(sheet).mean()) for part in (_A_D3D4, _B_D3D4))
+        where = "section 5.6"
         product = (
             f"; the printed 65 is near the product of the two printed rates, 0.85 x 0.76 = {0.85 * 0.76:.3f} "
             f"(counted: {rate_A:.3f} x {rate_B:.3f} = {rate_A * rate_B:.3f}), not a count of tests"
         )
-        return {
-            "where": where,
-            "name": rule.name,
-            "rates": " or ".join(f"{rate} %" for rate in printed),
-            "product": product if rule is _BOTH_D3D4 else "",
-            "controls": _format_controls(evidence, rule),
-        }
-
-    return SheetClaim(test_rate, values=format_values)
+    return judge_on_sheets(
+        evidence,
+        f"5.4.{number}",
+        test_rate,
+        kind="5.4",
+        where=where,
+        name=rule.name,
+        rates=" or ".join(f"{rate} %" for rate in printed),
+        product=product,
+        controls=_format_controls(evidence, rule),
+    )
 
 
 def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.7: d3, d4 and d3d4 of p_A rise with the leak, and those of p_B fall, in most tests.
 
-    All other sentences of section 5.6 state the opposite (`DIRECTION`). Yields for each detail of each chamber the
-    number of tests with the claimed change as text, and whether it is more than half.
+    All other sentences of section 5.6 state the opposite (`DIRECTION`).
     """
     for chamber in CHAMBERS:
         for name in SENSITIVE:
@@ -133,21 +122,14 @@ def _test_opposite_moves(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_rates_over_80(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.1: each rule of Table 5.1 detects the leak, that is fires, in more than 80 % of the tests.
-
-    Yields for each rule its rate as text, and whether it exceeds 80 %.
-    """
+    """Test claim 5.6.1: each rule of Table 5.1 detects the leak, that is fires, in more than 80 % of the tests."""
     for rule in CLAIMED:
         fires = rule.fires(sheet)
         yield f"{rule.name} {format_rate(fires)}", [bool(fires.mean() > 0.8)]
 
 
 def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.6.2: at each leak level, the detail d3 of p_A falls beyond the noise in at least 80 % of the tests.
-
-    The fall must exceed a limit that noise alone exceeds in 5 % of the tests. Yields for each level, such as "large",
-    the rate of such falls as text, and True if it is at least 80 %.
-    """
+    """Test claim 5.6.2: at each leak level, d3 of p_A falls beyond the noise in at least 80 % of the tests."""
     exceeds = _exceeds_noise(sheet, "p_A", "d3")
     for level in NOMINAL_LPM:
         level_exceeds = exceeds[[row.level == level for row in APPENDIX_C]]
@@ -157,8 +139,7 @@ def _test_leak_levels(sheet: DataSheet) -> Iterator[Finding]:
 def _test_smallest_leak(sheet: DataSheet, rules: tuple[Rule, ...] = CLAIMED_CELLS) -> Iterator[Finding]:
     """Test claim 5.6.3: in the test with the smallest leak, the rule of each cell of Table 5.1 fires.
 
-    Yields for each of `rules` the changes [%] of the RMS of its details as text, and True if the rule fires. The rule
-    on both chambers is left out by default: it fires if both of its cells do.
+    The rule on both chambers is left out by default: it fires if both of its cells do.
     """
     row = int(np.argmin(mean_leaks()))
     for rule in rules:
@@ -171,7 +152,7 @@ def _test_abstract_rate(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.2: leaks down to 0.0042 L/min are detected in 85 % of the tests, by the RMS of d3d4 of p_A.
 
     This is the detail for which Table 5.1 prints 85 %. Its RMS must fall at the smallest leak, and in at least 85 % of
-    the tests with leaks up to 0.0050 L/min, the four smallest. Yields for both a text, and whether it is met.
+    the tests with leaks up to 0.0050 L/min, the four smallest.
     """
     yield from _test_smallest_leak(sheet, (_A_D3D4,))
     fires = _A_D3D4.fires(sheet)
@@ -184,7 +165,6 @@ def _test_both_chambers(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 6.1.1: the RMS of d3d4 falls in p_A and rises in p_B down to a leak of 0.0048 L/min.
 
     The smallest leak of a test with both changes must be 0.0048 L/min, and over 80 % of all tests must have them.
-    Yields for both conditions a text, and whether it is met.
     """
     fires, leak = _BOTH_D3D4.fires(sheet), mean_leaks()
     min_leak = float(leak[fires].min()) if fires.any() else math.nan
@@ -196,7 +176,6 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim a.1: in each chamber the best wavelet detail reveals the leak in at least 80 % of the tests.
 
     A detail reveals the leak if its RMS falls in p_A, or rises in p_B, beyond the noise; the best does so most often.
-    Yields for each chamber the best detail with its rate as text, and whether the rate is at least 80 %.
     """
     for chamber in CHAMBERS:
         best = max(SENSITIVE, key=lambda name: int(_exceeds_noise(sheet, chamber, name).sum()))
@@ -204,37 +183,25 @@ def _test_identified_leaks(sheet: DataSheet) -> Iterator[Finding]:
         yield f"{chamber}: {best} beyond noise in {format_rate(exceeds)}", [bool(exceeds.mean() >= 0.8)]
 
 
-def _baseline_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format the success of detecting leaks without a healthy baseline for claim a.1; `evidence` is unused.
+def _baseline_texts(sheet: DataSheet) -> dict[str, str]:
+    """Format the success of detecting leaks without a healthy baseline: accuracy and area under the ROC curve.
 
-    Each text has the accuracy and the area under the ROC curve of a cross-validated classifier, with single tests left
-    out of the fit ("tests") or whole operating conditions ("conditions"). Without scikit-learn the texts say only this.
+    The classifier is cross-validated with single tests left out of the fit ("tests"), or whole operating conditions
+    ("conditions"). Without scikit-learn the texts say only this.
     """
     try:
-        pairs = {
-            "tests": classify_without_baseline(sheet, "test"),
-            "conditions": classify_without_baseline(sheet, "condition"),
-        }
+        results = (classify_without_baseline(sheet, "test"), classify_without_baseline(sheet, "condition"))
     except MissingExtra:
         return dict.fromkeys(("tests", "conditions"), "? (needs scikit-learn)")
-    return {name: f"{accuracy:.2f} (AUC {area:.3f})" for name, (accuracy, area) in pairs.items()}
-
-
-def _noise_limit_texts(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Format two rates of the rule that d3 of p_A falls with the leak, by name.
-
-    "controls" are its false alarms in simulations without a leak, and "finds" is the rate of falls beyond the noise in
-    the data sheet.
-    """
-    return {"controls": _format_controls(evidence, _A_D3), "finds": format_rate(_exceeds_noise(sheet, "p_A", "d3"))}
+    tests, conditions = (f"{accuracy:.2f} (AUC {area:.3f})" for accuracy, area in results)
+    return {"tests": tests, "conditions": conditions}
 
 
 def _test_trend(chamber: str, sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.3 (p_A) or 5.5.4 (p_B): each detail's log change is correlated with the mean leak.
 
     The sign must be negative for p_A and positive for p_B. This must hold at the 5 % level for the plain correlation,
-    and for the partial correlation given the operating condition (command and throttles). Yields for each detail both
-    correlations as text, and for each whether it is as claimed.
+    and for the partial correlation given the operating condition (command and throttles).
     """
     leak, conditions, direction = mean_leaks(), condition_design(), DIRECTION[chamber]
     for name in SENSITIVE:
@@ -248,24 +215,11 @@ def _test_trend(chamber: str, sheet: DataSheet) -> Iterator[Finding]:
         yield f"{name}: {raw:+.2f}, at equal condition {given_condition:+.2f}", parts
 
 
-def _prediction_values(evidence: ClaimEvidence, sheet: DataSheet) -> dict[str, Any]:
-    """Compute the accuracy with which two linear regressions predict a test's mean leak, for claims 5.5.3 and 5.5.4.
-
-    Returns the leave-one-out R^2 of the regression on the operating condition ("condition"), and on the log changes of
-    the RMS of both chambers' details ("changes"). `evidence` is unused.
-    """
-    return {
-        "condition": leave_one_out_r2(condition_design(), mean_leaks()),
-        "changes": leave_one_out_r2(change_design(sheet), mean_leaks()),
-    }
-
-
 def _test_sensitive_details(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.1: the wavelet details in Table 5.1 change significantly, and the details left out do not.
 
     d3, d4 and d3d4 must move as the thesis states (`moves_beyond_chance`). For d1 and d2, which the table leaves out,
-    the p-value of the sign test, corrected by Holm, must be at least 0.05. Yields for each detail its change and
-    p-value as text, and whether they are as claimed.
+    the p-value of the sign test, corrected by Holm, must be at least 0.05.
     """
     p = holm_p_values(sheet)
     for rule in (*CLAIMED_CELLS, *UNCLAIMED):
@@ -280,7 +234,7 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
     """Test claim 5.5.2: the product d3d4 has a larger effect size than d3 and than d4, for each chamber.
 
     The effect size is the mean of the log changes of the RMS with the leak over their standard deviation, with falls
-    positive for p_A and rises for p_B. Yields for each chamber the effect sizes as text, and whether d3d4's is largest.
+    positive for p_A and rises for p_B.
     """
     for chamber in CHAMBERS:
         changes = {name: sheet.log_change(chamber, name) * DIRECTION[chamber] for name in SENSITIVE}
@@ -290,10 +244,7 @@ def _test_product_detail(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.6: the log changes of a detail in p_A and in p_B are negatively correlated, at the 5 % level.
-
-    Yields for each detail the correlation as text, and whether it is significantly negative.
-    """
+    """Test claim 5.5.6: the log changes of a detail in p_A and in p_B are negatively correlated, at the 5 % level."""
     for name in SENSITIVE:
         change_A, change_B = (sheet.log_change(chamber, name) for chamber in CHAMBERS)
         r = float(np.corrcoef(change_A, change_B)[0, 1])
@@ -303,10 +254,7 @@ def _test_opposite_chambers(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.5.5: with the leak, the RMS of d3, d4 and d3d4 of p_B rises significantly.
-
-    Yields for each detail the number of rises and the p-value as text, and whether the rise is significant.
-    """
+    """Test claim 5.5.5: with the leak, the RMS of d3, d4 and d3d4 of p_B rises significantly."""
     p = holm_p_values(sheet)
     for name in SENSITIVE:
         n_up = int(np.sum(sheet.log_change("p_B", name) > 0))
@@ -314,11 +262,7 @@ def _test_p_B_rises(sheet: DataSheet) -> Iterator[Finding]:
 
 
 def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
-    """Test claim 5.3.1: with the leak, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B, compared with no leak.
-
-    This must hold in all tests that chapter 5 shows. Yields for each detail of each chamber the number of tests with
-    the claimed change as text, and whether these are all.
-    """
+    """Test claim 5.3.1: in all tests that chapter 5 shows, the RMS of d3, d4 and d3d4 falls in p_A and rises in p_B."""
     for chamber, verb in (("p_A", "falls"), ("p_B", "rises")):
         for name in SENSITIVE:
             moves = sheet.log_change(chamber, name)[_PRINTED_ROWS] * DIRECTION[chamber] > 0
@@ -327,26 +271,6 @@ def _test_printed_rows(sheet: DataSheet) -> Iterator[Finding]:
 
 #: Indices of the sheet's rows whose tests chapter 5 shows.
 _PRINTED_ROWS = sorted({test.condition.number - 1 for test in TESTS.values()})
-_SMALLEST = f"the {mean_leaks().min():g} L/min test: "
-_CORRELATION = "correlation of the change with the mean leak: "
-_CLAIMS: dict[str, SheetClaim] = {
-    "5.3.1": SheetClaim(_test_printed_rows, f"of the {len(_PRINTED_ROWS)} rows: ", ", "),
-    "a.1": SheetClaim(_test_identified_leaks, values=_baseline_texts),
-    "a.2": SheetClaim(_test_abstract_rate, _SMALLEST),
-    "5.5.7": SheetClaim(_test_opposite_moves, f"tests as the sentence says, of {_N_TESTS}: ", ", "),
-    "5.6.1": SheetClaim(_test_rates_over_80, values=_noise_limit_texts),
-    "5.6.2": SheetClaim(_test_leak_levels, "d3 of P_A falls beyond noise: "),
-    "5.6.3": SheetClaim(_test_smallest_leak, _SMALLEST),
-    "6.1.1": SheetClaim(_test_both_chambers, "smallest test that passes d3d4 on both chambers: "),
-    "5.5.1": SheetClaim(
-        _test_sensitive_details, values=lambda evidence, sheet: {"d2": format_rate(UNCLAIMED[1].fires(sheet))}
-    ),
-    "5.5.2": SheetClaim(_test_product_detail, "mean over scatter of the log change, "),
-    "5.5.3": SheetClaim(partial(_test_trend, "p_A"), _CORRELATION, values=_prediction_values),
-    "5.5.4": SheetClaim(partial(_test_trend, "p_B"), _CORRELATION, values=_prediction_values),
-    "5.5.5": SheetClaim(_test_p_B_rises, f"of {_N_TESTS}: ", ", "),
-    "5.5.6": SheetClaim(_test_opposite_chambers),
-}
 
 
 def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
@@ -354,11 +278,29 @@ def claims(evidence: ClaimEvidence) -> Iterator[Claim]:
 
     The claims of `leak_level_claims` and `curve_claims` are left out.
     """
+    judge = partial(judge_on_sheets, evidence)
+    sheet = evidence.measured_sheet or evidence.leak_sheet  # the texts need numbers in either case
     for number, rule in enumerate(CLAIMED, start=1):
-        where = "section 5.6" if rule is _BOTH_D3D4 else f"Fig. 5.{89 + number}"  # Figs. 5.90 to 5.95
-        yield _rate_claim(rule, where).judge(evidence, id=f"5.4.{number}", kind="5.4")
-    for id, claim in _CLAIMS.items():
-        yield claim.judge(evidence, id)
+        yield _judge_rate(evidence, sheet, number, rule)
+    yield judge("5.3.1", _test_printed_rows, f"of the {len(_PRINTED_ROWS)} rows: ", ", ")
+    yield judge("a.1", _test_identified_leaks, **_baseline_texts(sheet))
+    smallest = f"the {mean_leaks().min():g} L/min test: "
+    yield judge("a.2", _test_abstract_rate, smallest)
+    yield judge("5.5.7", _test_opposite_moves, f"tests as the sentence says, of {_N_TESTS}: ", ", ")
+    finds = format_rate(_exceeds_noise(sheet, "p_A", "d3"))
+    yield judge("5.6.1", _test_rates_over_80, controls=_format_controls(evidence, _A_D3), finds=finds)
+    yield judge("5.6.2", _test_leak_levels, "d3 of P_A falls beyond noise: ")
+    yield judge("5.6.3", _test_smallest_leak, smallest)
+    yield judge("6.1.1", _test_both_chambers, "smallest test that passes d3d4 on both chambers: ")
+    yield judge("5.5.1", _test_sensitive_details, d2=format_rate(UNCLAIMED[1].fires(sheet)))
+    yield judge("5.5.2", _test_product_detail, "mean over scatter of the log change, ")
+    # leave-one-out R^2 of the mean leak's regression on the operating condition, and on the changes of the details
+    condition, changes = (leave_one_out_r2(x, mean_leaks()) for x in (condition_design(), change_design(sheet)))
+    for id, chamber in (("5.5.3", "p_A"), ("5.5.4", "p_B")):
+        head = "correlation of the change with the mean leak: "
+        yield judge(id, partial(_test_trend, chamber), head, condition=condition, changes=changes)
+    yield judge("5.5.5", _test_p_B_rises, f"of {_N_TESTS}: ", ", ")
+    yield judge("5.5.6", _test_opposite_chambers)
 
 
 def leak_level_claims() -> Iterator[Claim]:
@@ -418,9 +360,8 @@ def _test_rows(
 def curve_claims(evidence: ClaimEvidence) -> Iterator[Claim]:
     """Judge the claims of chapter 5 that a leak changes the RMS of some wavelet details of a chamber's pressure.
 
-    Some claims state a fall, others any change. The fall or change must exceed the noise in the measured data sheet
-    (`_test_rows`); without this sheet the claim cannot be tested. The texts also state the simulated changes and, for
-    each detail, the threshold that changes due to drifting parameters alone exceed in 5 % of the simulated tests.
+    Some claims state a fall, others any change. It must exceed the noise in the measured data sheet (`_test_rows`).
+    The texts also state the simulated changes, and the changes that drift alone exceeds in 5 % of the simulated tests.
     """
     curves = load_texts("cases.toml")["curves"]
     for number, (section, chamber, names, statement) in enumerate(curves, start=1):

@@ -92,9 +92,9 @@ def reproduce(
 
     `patterns`: selection (`items.select_items`); `quick`: True to simulate less; `jobs`: number of processes, by
     default one per core, 1 for this process only; `sheet`: folder of the measured data sheet; `items`: the list to
-    select from, by default that of `items.toml`; `publish`: function that writes the products as files, None for no
-    files; `progress`: called with the number of finished items, the number of all items that this call makes, and the
-    ids of the items that are being made.
+    select from, by default that of `items.toml`; `publish`: writes the products as files, by default none; `progress`:
+    called with the number of finished items, the number of all items that this call makes, and the ids of the items
+    that are being made.
 
     Results that an earlier call stored in `folder` from the same inputs are reused. A failed item does not stop the
     others, and KeyboardInterrupt leaves all finished items stored.
@@ -109,7 +109,7 @@ def reproduce(
     root = Path(folder)
     sheet_folder = find_sheet(sheet)
     data_sheet, sheet_key = (None, "") if sheet_folder is None else read_sheet(sheet_folder)
-    keys = _item_keys(all_items, sheet_key, quick, is_published=publish is not None)
+    keys = _item_keys(all_items, sheet_key, quick)
     store = make_inner_folder(root, "kept")
     with lock_rows(store, _WHAT):
         stored_rows = read_rows(store, partial(_parse_row, keys), _WHAT, loads)
@@ -121,17 +121,13 @@ def reproduce(
         n_done = 0
 
         def start_jobs(ready: Sequence[str]) -> Iterator[_Job]:
-            """Yield the job of each item in `ready`, and report the item as in work.
-
-            `ready`: ids of items that can be made, because all items they need are finished. A job does not have the
-            products of needed items that failed.
-            """
+            """Yield the job of each item whose id is in `ready`, and report the item as in work."""
             for name in ready:
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
-                needed = {need: statuses[need] for need in waiting[name].needs}
-                products = {need: status.products for need, status in needed.items() if status.state != "failed"}
-                yield waiting[name], keys[name], products
+                item = waiting[name]
+                made_needs = [need for need in item.needs if statuses[need].state != "failed"]
+                yield item, keys[name], {need: statuses[need].products for need in made_needs}
 
         # an item is ready when all items it needs are finished
         order = TopologicalSorter({name: waiting.keys() & item.needs for name, item in waiting.items()})
@@ -165,11 +161,10 @@ def _empty_runs_folder(store: Path) -> Path:
     return runs
 
 
-def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published: bool) -> dict[str, str]:
+def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool) -> dict[str, str]:
     """Compute a digest for each item, by id, that changes with any input of the item's products and files.
 
-    `sheet_key`: digest of the data sheet, "" if not given; `quick`: True if less is simulated; `is_published`: True if
-    files are written.
+    `sheet_key`: digest of the data sheet, "" if not given; `quick`: True if less is simulated.
     """
     by_id = {item.id: item for item in items}
     sources = sources_key()
@@ -180,15 +175,15 @@ def _item_keys(items: Sequence[Item], sheet_key: str, quick: bool, is_published:
         item = by_id[name]
         identity = [item.id, item.title, item.make.__module__, item.make.__qualname__, item.inputs]
         sheet = sheet_key if item.reads_sheet else ""
-        return digest([identity, [*map(item_key, item.needs)], sheet, is_published, quick, sources])
+        return digest([identity, [*map(item_key, item.needs)], sheet, quick, sources])
 
     return {name: item_key(name) for name in by_id}
 
 
 def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
-    """Convert plain values (`tree`) to the stored result of an item, or None if its inputs have changed since.
+    """Convert plain values to the stored result of an item, or None if the item's key is no longer that in `keys`.
 
-    `keys`: present digest of each item's inputs, by id. Raises ValueError if `tree` has another form.
+    Raises ValueError if `tree` has another form.
     """
     if not isinstance(tree, dict):
         raise ValueError("no row")
@@ -196,11 +191,7 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 
 
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
-    """Determine the status of an item before anything is made: "kept", "left out" or "not made".
-
-    It is "left out" if it cannot be made without the data sheet, and `sheet` is None. It is "kept" if its stored result
-    `row` (None for none) has no error, and all files of the result exist in `folder`.
-    """
+    """Determine an item's status before anything is made, from its stored result `row` and the files in `folder`."""
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
     if row is None or row.error or not all(is_file_path(folder / name) for name in row.files):
@@ -211,11 +202,10 @@ def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folde
 def _make_item(
     quick: bool, sheet: DataSheet | None, publish: Publish | None, folder: Path, runs: Path, job: _Job
 ) -> ItemRow:
-    """Make one item (a figure, table or claims) and write its files; return the row to store, with result or error.
+    """Make one item and write its files; return the row to store, with result or error.
 
-    `quick`: True to simulate less; `sheet`: data sheet with the measured tests, None if not given; `publish`: function
-    that writes the files, None for no files; `folder`: folder of the results; `runs`: folder of the simulated runs that
-    all items share; `job`: the item, its key, and the products of the items it needs.
+    `folder`: folder of the results; `runs`: folder of the simulated runs that all items share; the other arguments are
+    those of `reproduce`.
     """
     item, key, needed = job
     context = Context(item.id, item.needs, quick, sheet if item.reads_sheet else None, needed, runs)

@@ -23,14 +23,12 @@ Products = tuple[Product | Claim, ...]
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """The result of one simulated run, which may have failed.
+    """The result of one simulated run, which may have failed: `recording` is then None, and `t`, `outputs` are empty.
 
-    `recording`: None if the run failed; `t` [s], `outputs`: noise-free outputs at the samples (`TRUE_OUTPUTS` in
-    `simulation.simulate`), empty if the run failed; `mean_leak_lpm`: mean leak while open [L/min]; `resolved`: True if
-    the run changed little when the solver's step was halved, False if not or if it failed, None if this was not tested;
-    `step_changes`: changes of states, pressures and details by this halving, in SI units, by the name of the quantity
-    (`compare_trajectories` in `simulation.simulate`), empty if there are none; `diverged`: one-line reason of a failed
-    run, "" for none.
+    `t` [s], `outputs`: noise-free outputs at the samples; `mean_leak_lpm`: mean leak while open [L/min]; `resolved`:
+    True if the run changed little when the solver's step was halved, False if not or if it failed, None if this was
+    not tested; `step_changes`: changes of states, pressures and details by this halving [SI], by name; `diverged`:
+    one-line reason of a failed run, "" for none.
     """
 
     recording: Recording | None
@@ -52,8 +50,7 @@ class SimulatedRun:
 def simulate_run(experiment: Experiment, prove: bool) -> SimulatedRun:
     """Simulate an experiment, and return a failed run as a result instead of raising an error.
 
-    `prove`: True to repeat the run with half the solver's step, and to state in the result if it changed little. A
-    large change does not count as a failure.
+    `prove`: True to repeat the run with half the solver's step; a large change does not count as a failure.
     """
     try:
         simulated = simulate_experiment(replace(experiment, allow_unresolved=True), prove=prove)

@@ -66,8 +66,7 @@ class Item:
         second table of one item; the other arguments are those of `ThesisTable`.
         """
         heads = tuple(columns) or self.columns
-        id, title = self.id + tail, title or self.title
-        return ThesisTable(id, title, heads, tuple(rows), claims=self.claims, resolved=resolved, notes=notes)
+        return ThesisTable(self.id + tail, title or self.title, heads, tuple(rows), self.claims, resolved, notes)
 
 
 _FIELDS = {declared.name for declared in fields(Item)}
@@ -83,10 +82,9 @@ def load_items() -> tuple[Item, ...]:
 
 
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
-    """Yield the items (figures, tables, claims) that a row of `items.toml` with the key `name` describes.
+    """Yield the item `name`, or the items that a function `each` lists, which a row of `items.toml` describes.
 
-    Entries of the row that are not fields of `Item` become its `inputs`. An entry `each` names a function that yields
-    (id, title, inputs) of several items; otherwise the row describes one item with the id `name`.
+    Entries of the row that are not fields of `Item` become its `inputs`.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}
@@ -107,10 +105,9 @@ def _import_function(name: str) -> Any:
 
 
 def select_items(items: Sequence[Item], patterns: Sequence[str]) -> tuple[Item, ...]:
-    """Select items (figures, tables, claims) by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`).
+    """Select items by id (`fig-5.58`), `all`, chapter (`chapter-4`) or wildcards (`fig-5.*`), in the order of `items`.
 
-    The selected items keep the order of `items`. No patterns select all. Raises InputError, with the closest ids, if a
-    pattern matches nothing.
+    No patterns select all. Raises InputError, with the closest ids, if a pattern matches nothing.
     """
     ids = [item.id for item in items]
     selected: set[str] = set()

@@ -79,7 +79,7 @@ class Figure:
     """A figure that reproduces one of the thesis; `id` contains the thesis's number.
 
     `claims`: ids of claims that it supports or refutes; `resolved`: True if all its simulated runs passed the test
-    with half the solver's step, False if one did not, None if nothing was tested. An unresolved figure is marked.
+    with half the solver's step, False if one did not (the figure is then marked), None if nothing was tested.
     """
 
     id: str
@@ -93,11 +93,9 @@ class Figure:
 
 @dataclass(frozen=True, eq=False)
 class ThesisTable:
-    """A table that reproduces one of the thesis, or summarises results.
+    """A table that reproduces one of the thesis, or summarises results; `claims`, `resolved`: as in `Figure`.
 
-    `columns`: heads, with units in brackets; `rows`: texts and numbers, None for an empty cell; `claims`: ids of
-    claims that it supports or refutes; `resolved`: True if all its simulated runs passed the test with half the
-    solver's step, False if one did not, None if nothing was tested.
+    `columns`: heads, with units in brackets; `rows`: texts and numbers, None for an empty cell.
     """
 
     id: str
@@ -130,23 +128,16 @@ class Claim:
     why: str
 
 
-def claim_verdict(tests: Iterable[bool | None]) -> Verdict:
-    """Judge a claim by the results of tests of its parts; None, for a test that cannot be made, is ignored.
-
-    The verdict is "holds" if all tests pass, "does not hold" if none passes, and "holds in part" if only some pass.
-    Without any result it is "cannot be tested".
-    """
-    results = {bool(test) for test in tests if test is not None}
+def claim_verdict(tests: Iterable[bool]) -> Verdict:
+    """Judge a claim by the results of tests of its parts: all, some, none passed, or no test could be made."""
+    results = set(map(bool, tests))
     if len(results) == 1:
         return "holds" if True in results else "does not hold"
     return "holds in part" if results else "cannot be tested"
 
 
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve (x, y) to about `max_points` points: the minimum and maximum of each block of successive points.
-
-    Points after the last whole block are left out. A curve of at most `max_points` points is returned unchanged.
-    """
+    """Thin a curve (x, y) of more than `max_points` points to the minimum and maximum of each whole block of points."""
     if x.size <= max_points:
         return x, y
     block_size = int(np.ceil(2 * x.size / max_points))  # two points of each block

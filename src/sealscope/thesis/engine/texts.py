@@ -10,9 +10,6 @@ from typing import Any
 
 from sealscope.thesis.engine.products import Claim, claim_verdict
 
-#: Tests of a claim that neither the sheet nor a simulation can decide.
-NOT_TESTED: tuple[None, ...] = (None,)
-
 
 @cache
 def load_texts(name: str) -> dict[str, Any]:
@@ -31,13 +28,12 @@ def format_range(values: Iterable[float], unit: str, factor: float = 1.0) -> str
     return f"{min(scaled):+.2f} to {max(scaled):+.2f} {unit}"
 
 
-def judge_claim(id: str, tests: Iterable[bool | None], kind: str = "", /, **values: Any) -> Claim:
+def judge_claim(id: str, tests: Iterable[bool], kind: str = "", /, **values: Any) -> Claim:
     """Judge the claim `id` by the tests of its parts (`claim_verdict`), and fill `values` into its texts.
 
-    A test is True, False, or None if the data cannot decide. The texts are in `claims.toml` under `id`, or under `kind`
-    for claims that share texts. The values `sheet` (what the thesis's data show), `simulation` (what a simulation
-    shows) and `why` (reason for the verdict) replace a whole text; the others fill the placeholders of the same names.
-    These may be named like the first three arguments, which are therefore positional only.
+    Without tests the claim cannot be tested. The texts are in `claims.toml` under `id`, or under `kind` for claims that
+    share texts. The values `sheet`, `simulation` and `why` replace a whole text; the others fill the placeholders of
+    the same names. These may be named as the first three arguments, which are therefore positional only.
     """
     claims = load_texts("claims.toml")
     templates = dict(claims[kind or id])

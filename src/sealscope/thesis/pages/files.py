@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import re
 from collections.abc import Iterable, Sequence
 from dataclasses import astuple, fields
 from itertools import zip_longest
@@ -15,15 +14,12 @@ from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Claim, Figure, Product, ThesisTable
 from sealscope.thesis.pages.plots import draw, drawn_points
 
-_NAME = re.compile(r"[a-z0-9]+([-.][a-z0-9]+)*")
-
 
 def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tuple[str, ...]:
     """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
-    These are `figures/ID.svg` and `figures/ID.png` for each figure, and `tables/ID.csv` for each figure or table.
-    Claims go to `tables/ID.csv` of their item, or to `tables/ID-claims.csv` if the item has a table of this name.
-    Raises ValueError for an id that is not a valid file name.
+    A figure becomes `figures/ID.svg` and `.png`, and `tables/ID.csv`; a table `tables/ID.csv`; an item's claims
+    `tables/ID.csv`, or `tables/ID-claims.csv` beside a table.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
@@ -42,8 +38,6 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
         files.append(name)
 
     for product in products:
-        if not isinstance(product, Claim) and not _NAME.fullmatch(product.id):
-            raise ValueError(f"an id must consist of a-z, 0-9, '.' and '-', got {product.id!r} ({item.id})")
         if isinstance(product, Figure):
             svg, png = draw(product)
             write_bytes(f"figures/{product.id}.svg", svg)
@@ -60,10 +54,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
 
 
 def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
-    """Yield a table of all points that a figure shows: the heads of its columns, then its rows.
-
-    The columns are x and y of each curve, and x, y and value of each image; shorter columns are filled with "".
-    """
+    """Yield the heads, then the rows of a table of a figure's points: x, y of each curve, x, y, value of each image."""
     heads: list[str] = []
     columns: list[list[str]] = []
     for number, panel in enumerate(figure.panels, 1):
@@ -71,7 +62,7 @@ def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
         for curve in panel.curves:
             suffix = ", ".join(text for text in (curve.label, panel_text) if text)
             heads += [f"{panel.x_label}; {suffix}", f"{panel.y_label}; {suffix}"]
-            columns += [[f"{value:.7g}" for value in values] for values in drawn_points(curve, panel.x_range)]
+            columns += [[f"{value:.7g}" for value in values] for values in drawn_points(curve)]
         if panel.image is not None:
             image = panel.image
             heads += [f"{label}; {panel_text}" for label in (panel.x_label, panel.y_label, image.label)]

@@ -7,7 +7,7 @@ from base64 import b64encode
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 from sealscope.reporting import template
 from sealscope.thesis.engine.build import ItemStatus
@@ -29,22 +29,6 @@ _TONES = {"holds": "ok", "holds in part": "open", "does not hold": "leak", "cann
 _MAX_OPEN_ROWS = 45
 
 
-class PageProduct(NamedTuple):
-    """Entry of a figure or table on the page of the reproduction.
-
-    `picture`: the figure as a data URI, "" for a table; `links`: (format, path) of its files; `claims`: claims that
-    it supports or refutes; `search_text`: text in which the page's search looks.
-    """
-
-    id: str
-    heading: str
-    product: Figure | ThesisTable
-    picture: str
-    links: list[tuple[str, str]]
-    claims: list[Claim]
-    search_text: str
-
-
 def write_thesis_page(
     folder: Path, statuses: Sequence[ItemStatus], *, quick: bool = False, sheet: bool = False
 ) -> Path:
@@ -58,7 +42,7 @@ def write_thesis_page(
     for _, product in products:
         if isinstance(product, Claim):
             claims.setdefault(product.id, product)
-    chapters: dict[int, list[PageProduct]] = defaultdict(list)
+    chapters: dict[int, list[dict[str, Any]]] = defaultdict(list)
     products_by_claim: dict[str, list[str]] = defaultdict(list)
     for status, product in products:
         if isinstance(product, Claim) or (isinstance(product, ThesisTable) and status.item.id == "claims"):
@@ -103,8 +87,11 @@ def write_thesis_page(
 
 def _page_product(
     status: ItemStatus, product: Figure | ThesisTable, folder: Path, claims: dict[str, Claim]
-) -> PageProduct:
-    """Build the page's entry of a figure or table from its files in `folder`; `claims`: all claims by id."""
+) -> dict[str, Any]:
+    """Build the template's values for a figure or table from its files in `folder`; `claims`: all claims by id.
+
+    `picture` is the figure as a data URI, "" for a table; `search_text` is the text in which the page's search looks.
+    """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
     # (format, path) of the product's files, which are named by its id
@@ -113,7 +100,15 @@ def _page_product(
     value_names = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
     claim_texts = [f"{claim.id} {claim.claim}" for claim in product_claims]
     text = " ".join([product.id, heading, product.notes, *value_names, *claim_texts])
-    return PageProduct(product.id, heading, product, picture, links, product_claims, text.casefold())
+    return {
+        "id": product.id,
+        "heading": heading,
+        "product": product,
+        "picture": picture,
+        "links": links,  # (format, path) of its files
+        "claims": product_claims,
+        "search_text": text.casefold(),
+    }
 
 
 def _encode_picture(folder: Path, name: str) -> str:

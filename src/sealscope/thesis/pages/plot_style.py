@@ -7,14 +7,9 @@ import tomllib
 from pathlib import Path
 from typing import NamedTuple
 
-from sealscope.thesis.engine.products import Role
-
 
 class Style(NamedTuple):
-    """Line style of all curves with the same role, i.e. meaning: colour, dashes, width [pt], and marker.
-
-    `dashes`: lengths of dashes and gaps in turn, () for a solid line; `filled`: True for a filled marker.
-    """
+    """Line style of all curves with the same role, i.e. meaning; `dashes`: lengths of dashes and gaps, () for solid."""
 
     colour: str
     dashes: tuple[float, ...] = ()
@@ -23,19 +18,17 @@ class Style(NamedTuple):
     filled: bool = True
 
 
-_TABLES = tomllib.loads(Path(__file__).with_name("styles.toml").read_text(encoding="utf-8"))
-_ROWS = {role: {**row, "dashes": tuple(row.get("dashes", ()))} for role, row in _TABLES["roles"].items()}
-STYLES: dict[Role, Style] = {role: Style(**row) for role, row in _ROWS.items()}
-#: Dashes of further curves with the same role in a panel.
-SAME_ROLE = tuple(map(tuple, _TABLES["again"]["dashes"]))
+_ROWS = tomllib.loads(Path(__file__).with_name("styles.toml").read_text(encoding="utf-8"))
+#: Style by role.
+STYLES = {role: Style(**{**row, "dashes": tuple(row.get("dashes", ()))}) for role, row in _ROWS.items()}
 SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 
 
 def caption(figure_id: str, title: str) -> str:
     """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
 
-    A letter at the end of the id, as in "fig-4.2-a", is written "a)", and a word in brackets. The caption is the title
-    alone if the id does not begin with the number of a figure, table or equation.
+    The end of an id such as "fig-4.2-a" is written "a)", or in brackets if it is a word. It is the title alone if the
+    id does not begin with the number of a figure, table or equation.
     """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)

@@ -5,14 +5,13 @@ from __future__ import annotations
 import io
 import textwrap
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.errors import MissingExtra
-from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, Role, thin_curve
-from sealscope.thesis.pages.plot_style import SAME_ROLE, SETTINGS, STYLES, caption, typeset
+from sealscope.thesis.engine.products import Figure, FigureCurve, Panel, thin_curve
+from sealscope.thesis.pages.plot_style import SETTINGS, STYLES, caption, typeset
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -28,20 +27,17 @@ DPI = 200
 _WIDTH = 7.2
 _TOP_MARGIN, _WARNING_HEIGHT, _LEGEND_HEIGHT = 0.03, 0.34, 0.24
 _LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
-#: Number of rows of panels -> height of a row [inch].
+#: Number of panels, one below the other -> height of a panel [inch], smaller for more panels.
 _ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
 _CAPTION_CHARACTERS = 122
-#: Width [characters] of a label's line and margin in a legend, and of all labels above a figure or a panel.
-_LABEL_MARGIN, _MAX_SHARED_CHARACTERS, _MAX_LEGEND_CHARACTERS = 6, 100, 92
+#: Width [characters] of a label's line and margin in a legend, and of all labels above a figure.
+_LABEL_MARGIN, _MAX_SHARED_CHARACTERS = 6, 100
 #: Points to which a line is thinned.
 _MAX_POINTS = 2400
 #: A line with more points is drawn thin and without dashes, as it looks like noise.
 _DENSE_POINTS = 1500
 #: A line with more points is rasterised in an SVG that is too large otherwise.
 _RASTER_POINTS = 300
-#: Estimated size of a point in an SVG [bytes].
-_POINT_BYTES = 15
-_Range = tuple[float, float]
 
 
 def require_drawing() -> None:
@@ -55,7 +51,7 @@ def require_drawing() -> None:
 def draw(figure: Figure) -> tuple[bytes, bytes]:
     """Draw a figure; return it as an SVG file with searchable text, and as a PNG file of `DPI` dots per inch.
 
-    Long curves are rasterised in an SVG that would be too large. Raises MissingExtra if matplotlib is not installed.
+    Raises MissingExtra if matplotlib is not installed.
     """
     require_drawing()
     import matplotlib
@@ -65,12 +61,10 @@ def draw(figure: Figure) -> tuple[bytes, bytes]:
         matplotlib.rcParams.update(matplotlib.rc_params_from_file(SETTINGS, use_default_template=False))
         matplotlib.rcParams["svg.hashsalt"] = figure.id  # equal figures give equal files
         mpl_figure = _draw_figure(figure)
-        long_lines = [line for ax in mpl_figure.axes for line in ax.lines if np.size(line.get_xdata()) > _RASTER_POINTS]
-        is_large = sum(np.size(line.get_xdata()) for line in long_lines) * _POINT_BYTES > MAX_SVG_BYTES
-        svg = b"" if is_large else _render_svg(mpl_figure, figure)
-        if is_large or len(svg) > MAX_SVG_BYTES:
-            for line in long_lines:
-                line.set_rasterized(True)
+        svg = _render_svg(mpl_figure, figure)
+        if len(svg) > MAX_SVG_BYTES:
+            for line in (line for ax in mpl_figure.axes for line in ax.lines):
+                line.set_rasterized(np.size(line.get_xdata()) > _RASTER_POINTS)
             svg = _render_svg(mpl_figure, figure)
         return svg, _render_png(mpl_figure, has_image=any(panel.image is not None for panel in figure.panels))
 
@@ -87,10 +81,7 @@ def _render_svg(mpl_figure: MplFigure, figure: Figure) -> bytes:
 
 
 def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
-    """Render a drawn figure as a PNG file with a palette of 256 colours, which makes it small.
-
-    `has_image`: True if a panel has an image of greys, for which another palette is chosen.
-    """
+    """Render a drawn figure as a PNG file with a palette of 256 colours; `has_image`: True if a panel has an image."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Picture
 
@@ -106,44 +97,33 @@ def _render_png(mpl_figure: MplFigure, *, has_image: bool) -> bytes:
     return out.getvalue()
 
 
-def choose_grid(n_panels: int) -> tuple[int, int]:
-    """Choose the rows and columns of a figure's panels: one column for up to five, two for up to twelve, else three."""
-    columns = 1 if n_panels <= 5 else 2 if n_panels <= 12 else 3
-    return -(-n_panels // columns), columns  # rows rounded up
-
-
 def _draw_figure(figure: Figure) -> MplFigure:
     """Lay out and draw a figure: from top to bottom a warning, the shared legend, the panels, and the caption."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure as MplFigure
 
-    rows, columns = choose_grid(max(1, len(figure.panels)))
-    row_height = _ROW_HEIGHTS.get(rows, 1.35 if columns == 1 else 1.7)  # [inch] with five rows or more
+    rows = len(figure.panels)
     has_shared_legend = _has_shared_legend(figure.panels)
     lines = textwrap.wrap(caption(figure.id, figure.title), _CAPTION_CHARACTERS)
     warning = _WARNING_HEIGHT if figure.resolved is False else 0.0
     footer = _LINE_HEIGHT * len(lines) + _CAPTION_MARGIN
     header = _TOP_MARGIN + warning + (_LEGEND_HEIGHT if has_shared_legend else 0.0)
-    height = rows * row_height + footer + header
+    height = rows * _ROW_HEIGHTS.get(rows, 1.35) + footer + header
     mpl_figure = MplFigure(figsize=(_WIDTH, height), dpi=DPI, layout="constrained")
     FigureCanvasAgg(mpl_figure)  # attaches itself to the figure
     engine: Any = mpl_figure.get_layout_engine()
     # rect: left, bottom, width and height of the area of the panels, as fractions of the figure
     engine.set(rect=(0, footer / height, 1, 1 - (footer + header) / height), h_pad=0.05, w_pad=0.06, hspace=0.03)
-    axes = mpl_figure.subplots(rows, columns, squeeze=False)
+    axes: list[Axes] = mpl_figure.subplots(rows, squeeze=False)[:, 0].tolist()
     have_same_marks = len({panel.marks for panel in figure.panels}) == 1
-    for index, ax in enumerate(axes.flat):
-        if index >= len(figure.panels):
-            ax.set_axis_off()
-            continue
-        panel = figure.panels[index]
-        # marks that all panels share have texts in the first row only
-        _draw_panel(mpl_figure, ax, panel, label_marks=index < columns or not have_same_marks)
+    for ax, panel in zip(axes, figure.panels, strict=True):
+        # marks that all panels share have texts in the first one only
+        _draw_panel(mpl_figure, ax, panel, label_marks=ax is axes[0] or not have_same_marks)
         if not has_shared_legend:
             _add_legend(ax, panel)
     _hide_repeated_x_labels(axes, figure.panels)
     if has_shared_legend:
-        handles, labels = axes.flat[0].get_legend_handles_labels()
+        handles, labels = axes[0].get_legend_handles_labels()
         anchor = (0.5, 1 - (_TOP_MARGIN + warning) / height)
         _thicken_lines(mpl_figure.legend(handles, labels, loc="upper center", bbox_to_anchor=anchor, ncols=len(labels)))
     # positions of texts are fractions of the figure's width and height
@@ -167,14 +147,11 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
         mesh = ax.pcolormesh(image.x, image.y, image.values, cmap="Greys", shading="auto", rasterized=True)
         mpl_figure.colorbar(mesh, ax=ax, label=typeset(image.label), pad=0.01, fraction=0.05)
         ax.grid(False)
-    counts: dict[Role, int] = {}
     for curve in panel.curves:
-        n_before = counts.get(curve.role, 0)
-        counts[curve.role] = n_before + 1
-        _draw_curve(ax, curve, n_before, panel.x_range, is_only=len(panel.curves) == 1)
+        _draw_curve(ax, curve, is_only=len(panel.curves) == 1)
     for x, text in panel.marks:
         ax.axvline(x, color="#1b1f24", linewidth=0.8, dashes=(1.5, 1.5), zorder=4)
-        if text and label_marks:
+        if label_marks:
             ax.annotate(
                 typeset(text), (x, 0.98), xycoords=("data", "axes fraction"), xytext=(2.5, 0), rotation=90,
                 textcoords="offset points", va="top", ha="left", fontsize=6.8, color="#1b1f24", zorder=5,
@@ -198,10 +175,7 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
 
 
 def _use_plain_numbers(axis: Axis) -> None:
-    """Label a logarithmic axis of fewer than four decades with plain numbers such as 0.2, 1 and 50.
-
-    The labels of minor ticks are removed on any axis.
-    """
+    """Label a logarithmic axis of fewer than four decades with plain numbers; remove labels of minor ticks on any."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axis.set_minor_formatter(NullFormatter())
@@ -211,34 +185,20 @@ def _use_plain_numbers(axis: Axis) -> None:
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
 
 
-def drawn_points(curve: FigureCurve, x_range: _Range | None) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points (x, y) of a curve that are drawn.
-
-    A curve of more than `_MAX_POINTS` points is cut to `x_range` plus one point on each side, if its x never decreases.
-    A line is then thinned to about `_MAX_POINTS` points that preserve its peaks.
-    """
-    x, y = np.asarray(curve.x, dtype=np.float64), np.asarray(curve.y, dtype=np.float64)
-    if x_range is not None and x.size > _MAX_POINTS and np.all(np.diff(x) >= 0):
-        first, stop = np.searchsorted(x, sorted(x_range))
-        drawn = slice(max(0, first - 1), stop + 1)
-        x, y = x[drawn], y[drawn]
-    return thin_curve(x, y, _MAX_POINTS) if curve.kind == "line" else (x, y)
+def drawn_points(curve: FigureCurve) -> tuple[np.ndarray, np.ndarray]:
+    """Select the points (x, y) of a curve that are drawn: about `_MAX_POINTS` of a line, which preserve its peaks."""
+    return thin_curve(curve.x, curve.y, _MAX_POINTS) if curve.kind == "line" else (curve.x, curve.y)
 
 
-def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | None, *, is_only: bool) -> None:
-    """Draw a curve into `ax` in the line style of its role.
-
-    `n_before`: number of earlier curves with this role in the panel, which determines the dashes; `is_only`: True for
-    the only curve of a panel, which is drawn as a solid line (role "other") if its role is "reference" (dashed).
-    """
+def _draw_curve(ax: Axes, curve: FigureCurve, *, is_only: bool) -> None:
+    """Draw a curve into `ax` in the line style of its role; the only one of a panel is solid, also as a "reference"."""
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
-    x, y = drawn_points(curve, x_range)
+    x, y = drawn_points(curve)
     is_dense = x.size > _DENSE_POINTS
     width = min(style.width, 0.6) if is_dense else style.width
     line: dict[str, Any] = {"color": style.colour, "linewidth": width, "label": typeset(curve.label)}
-    dashes = style.dashes if n_before == 0 else SAME_ROLE[n_before % len(SAME_ROLE)]
-    if dashes and not is_dense:
-        line["dashes"] = dashes
+    if style.dashes and not is_dense:
+        line["dashes"] = style.dashes
     marker: dict[str, Any] = {"marker": style.marker, "markersize": 4.2, "color": style.colour}
     if style.marker != "x":  # a cross has no face
         marker["markerfacecolor"] = style.colour if style.filled else "white"
@@ -255,25 +215,17 @@ def _draw_curve(ax: Axes, curve: FigureCurve, n_before: int, x_range: _Range | N
 def _has_shared_legend(panels: Sequence[Panel]) -> bool:
     """Return True if several panels have the same two or more curves, whose labels fit on one line."""
     keys = {tuple((curve.label, curve.role, curve.kind) for curve in panel.curves) for panel in panels}
-    labels = [curve.label for curve in panels[0].curves] if panels else []
+    labels = [curve.label for curve in panels[0].curves]
     is_short = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) <= _MAX_SHARED_CHARACTERS
     return len(panels) > 1 and len(keys) == 1 and len(labels) > 1 and is_short
 
 
 def _add_legend(ax: Axes, panel: Panel) -> None:
-    """Add the legend of a panel, above the axes if it fits on one line, else on the right of the axes.
-
-    A panel with a single curve gets no legend if it has no title or if its y axis names the curve.
-    """
-    labels = [curve.label for curve in panel.curves if curve.label]
-    if not labels or (len(panel.curves) == 1 and (not panel.title or labels[0] in panel.y_label)):
-        return
-    n_characters = sum(map(len, labels)) + _LABEL_MARGIN * len(labels) + len(panel.title)
-    if n_characters <= _MAX_LEGEND_CHARACTERS and len(labels) <= 5:
+    """Add the legend of a panel above the axes, unless the title or the y axis names its only curve."""
+    labels = [curve.label for curve in panel.curves]
+    if len(labels) > 1 or (labels and panel.title and labels[0] not in panel.y_label):
         legend = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)
-    else:
-        legend = ax.legend(loc="upper left", bbox_to_anchor=(1.005, 1.02), borderaxespad=0.1)
-    _thicken_lines(legend)
+        _thicken_lines(legend)
 
 
 def _thicken_lines(legend: Legend) -> None:
@@ -282,17 +234,10 @@ def _thicken_lines(legend: Legend) -> None:
         line.set_linewidth(max(1.3, line.get_linewidth()))
 
 
-def _hide_repeated_x_labels(axes: Any, panels: Sequence[Panel]) -> None:
-    """Remove the x labels of all panels but the lowest of each column, if all have the same x axis and none an image.
-
-    `axes` (rows, columns): matplotlib's axes, of which the last ones may be switched off.
-    """
-    visible_axes = [ax for ax in axes.flat if ax.axison]
-    x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in visible_axes}
-    if len(x_axes) != 1 or any(panel.image is not None for panel in panels):
-        return
-    for column in axes.T:
-        for above, below in pairwise(column):
-            if below.axison:
-                above.set_xlabel("")
-                above.tick_params(labelbottom=False)
+def _hide_repeated_x_labels(axes: Sequence[Axes], panels: Sequence[Panel]) -> None:
+    """Remove the x labels of all panels but the lowest, if all have the same x axis and none an image."""
+    x_axes = {(ax.get_xlabel(), tuple(round(end, 9) for end in ax.get_xlim())) for ax in axes}
+    if len(x_axes) == 1 and all(panel.image is None for panel in panels):
+        for ax in axes[:-1]:
+            ax.set_xlabel("")
+            ax.tick_params(labelbottom=False)

@@ -7,10 +7,8 @@ way to understand equations that the thesis states inconsistently.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -57,7 +55,7 @@ CASES: dict[str, tuple[str, float | None]] = {
 
 @dataclass(frozen=True)
 class Reading:
-    """One reading (interpretation) of the throttles' equations, which the thesis states inconsistently or incompletely.
+    """One interpretation of the throttles' equations, which the thesis states inconsistently or incompletely.
 
     `metering`: "meter-out" (the text: the return flow is throttled on both sides) or "literal" (eqs. 4.11, 4.12 as
     printed); `closed_means`: a throttle is closed by a fraction of its "area" (eq. 4.8) or of its "diameter" (the
@@ -77,28 +75,23 @@ class Reading:
         text = f"{metering}, closed by {self.closed_means}, {self.d_line_mm:g} mm"
         return text if self.V_line_cm3 == Reading.V_line_cm3 else f"{text}, V_1 = {self.V_line_cm3:g} cm3"
 
-    def values(self, closed_pct: float | None) -> tuple[tuple[str, str | float], ...]:
-        """Return the rig's parameters, as (dotted name, value), for throttles closed by `closed_pct` [%].
-
-        A closing of 0 means open throttles, None a rig without throttles.
-        """
-        sampling: tuple[tuple[str, str | float], ...] = (("daq.sample_rate", SAMPLE_RATE),)
+    def values(self, closed_pct: float | None) -> dict[str, str | float]:
+        """Return the rig's parameters by name, for throttles closed by `closed_pct` [%], None for no throttles."""
         if closed_pct is None:
-            return sampling
+            return {}
         # these two do not matter to open throttles: readings that differ in them only share a run by equal parameters
         reading = replace(self, metering="meter-out", closed_means="area") if closed_pct == 0 else self
-        return (
-            *sampling,
-            ("line.orifices", "present"),
-            ("line.closed_A", closed_pct / 100.0),
-            ("line.closed_B", closed_pct / 100.0),
-            ("line.metering", reading.metering),
-            ("line.closed_means", reading.closed_means),
-            ("line.d_line", self.d_line_mm * 1e-3),
-            ("line.V_1", self.V_line_cm3 * 1e-6),
-            ("line.V_2", self.V_line_cm3 * 1e-6),
-            ("line.dp_0", DP_0),
-        )
+        return {
+            "line.orifices": "present",
+            "line.closed_A": closed_pct / 100.0,
+            "line.closed_B": closed_pct / 100.0,
+            "line.metering": reading.metering,
+            "line.closed_means": reading.closed_means,
+            "line.d_line": self.d_line_mm * 1e-3,
+            "line.V_1": self.V_line_cm3 * 1e-6,
+            "line.V_2": self.V_line_cm3 * 1e-6,
+            "line.dp_0": DP_0,
+        }
 
 
 DEFAULT_READING = Reading()
@@ -113,15 +106,15 @@ def make_experiment(
     reading: Reading = DEFAULT_READING,
     solver: Solver = "converged",
     duration: float = DURATION,
-    overrides: Mapping[str, str | float] = MappingProxyType({}),
+    **overrides: str | float,
 ) -> Experiment:
     """Build the experiment of a `command` with throttles closed by `closed_pct` [%], None for no throttles.
 
     `reading`: interpretation of the thesis's equations, which sets the rig's parameters; `solver`: "as_published" for
     the thesis's method and step (RK4, 1e-4 s), "converged" for a step chosen by its error; `duration` [s];
-    `overrides`: parameters that replace those of the reading.
+    `overrides`: parameters that replace those of the reading, by dotted name.
     """
-    values = {**dict(reading.values(closed_pct)), **overrides}
+    values = {"daq.sample_rate": SAMPLE_RATE, **reading.values(closed_pct), **overrides}
     experiment = Experiment.of(command=command, duration=duration, set=values)
     return replace(experiment, method="rk4", step=THESIS_STEP) if solver == "as_published" else experiment
 
@@ -129,21 +122,15 @@ def make_experiment(
 def make_drift_experiment(
     reading: Reading, closed_pct: float | None, solver: Solver, **overrides: str | float
 ) -> Experiment:
-    """Build the experiment of 60 s in which the drift of the piston is measured.
-
-    The arguments are those of `make_experiment`; `overrides` replace parameters of the reading.
-    """
+    """Build the experiment of 60 s in which the piston's drift is measured, by arguments of `make_experiment`."""
     overrides = {"daq.sample_rate": _DRIFT_RATE, **overrides}
-    return make_experiment(COMMAND, closed_pct, reading, solver, duration=_DRIFT_DURATION, overrides=overrides)
+    return make_experiment(COMMAND, closed_pct, reading, solver, _DRIFT_DURATION, **overrides)
 
 
 def run_both_solvers(
     context: Context, command: str, closed_pct: float | None, reading: Reading = DEFAULT_READING
 ) -> Runs:
-    """Simulate a command by both solvers, with throttles closed by `closed_pct` [%], None for no throttles.
-
-    `reading`: interpretation of the thesis's equations, which sets the rig's parameters.
-    """
+    """Simulate a command by both solvers; the arguments are those of `make_experiment`."""
     return {solver: context.run(make_experiment(command, closed_pct, reading, solver)) for solver in LABELS}
 
 
@@ -158,7 +145,7 @@ def completed_runs(runs: Runs) -> list[tuple[Solver, str, SimulatedRun]]:
 
 
 def steady_mask(run: SimulatedRun) -> np.ndarray:
-    """Return the mask (n,) of the samples of a run within its steady part, from pi to 2 pi seconds (`STEADY`)."""
+    """Find the samples (n,) of a run within its steady part, from pi to 2 pi seconds (`STEADY`)."""
     return np.asarray((run.t >= STEADY[0]) & (run.t < STEADY[1]))
 
 
@@ -178,16 +165,9 @@ def mean_difference(run: SimulatedRun, first: str, second: str) -> float:
 
 
 def summarise_run(run: SimulatedRun) -> dict[str, float]:
-    """Compute the numbers by which runs are compared from the pressures and flows in the steady part of a run.
+    """Compute the numbers by which runs are compared from pi to 2 pi s (`STEADY`), nan if the run diverged.
 
-    The steady part (`STEADY`) is the time from pi to 2 pi s. All numbers are nan if the run diverged. Pressures in Pa:
-
-    - "range of p_A", "peak of p_A": maximum minus minimum, and maximum, of each pressure;
-    - "lowest pressure": minimum of all pressures;
-    - "mean of p_1 - p_A", "mean of p_2 - p_B": mean drops at the orifices;
-    - "largest drop": largest magnitude of these drops.
-
-    "flow difference" is rms(Q_A - Q_B) / rms(Q_A).
+    Pressures are in Pa; the drops are those at the orifices; "flow difference" is rms(Q_A - Q_B) / rms(Q_A).
     """
     outputs = {name: steady_output(run, name) for name in (*PRESSURES, "Q_A", "Q_B")}
     drops = {"p_1 - p_A": outputs["p_1"] - outputs["p_A"], "p_2 - p_B": outputs["p_2"] - outputs["p_B"]}

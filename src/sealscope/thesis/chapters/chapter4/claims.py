@@ -21,23 +21,11 @@ from sealscope.recordings.chambers import CHAMBERS, PRESSURES
 from sealscope.signals.windows import rms
 from sealscope.simulation.commands import Sine, parse_command
 from sealscope.thesis.chapters.chapter4 import cases
-from sealscope.thesis.chapters.chapter4.cases import (
-    CLOSINGS,
-    COMMAND,
-    COMMANDS,
-    DEFAULT_READING,
-    READINGS,
-    SOLVERS,
-    Reading,
-    Solver,
-    make_experiment,
-    steady_output,
-)
 from sealscope.thesis.chapters.chapter4.friction import falling_friction_limit, friction_at_threshold
 from sealscope.thesis.engine.context import Context, SimulatedRun
 from sealscope.thesis.engine.items import Item
 from sealscope.thesis.engine.products import Cell, Claim, ThesisTable
-from sealscope.thesis.engine.texts import NOT_TESTED, format_note, format_range, judge_claim
+from sealscope.thesis.engine.texts import format_note, format_range, judge_claim
 from sealscope.thesis.sines import sine_fit
 
 #: A change of drift counts if it exceeds this fraction of the drift without orifices.
@@ -50,15 +38,14 @@ _T = TypeVar("_T")
 #: Summaries of runs (`cases.summarise_run`) with several commands or closings.
 Rows = list[dict[str, float]]
 #: The summaries by solver and by interpretation of the throttles' equations.
-RowsByReading = dict[Solver, dict[Reading, Rows]]
+RowsByReading = dict[cases.Solver, dict[cases.Reading, Rows]]
 
 
 def ringing(run: SimulatedRun, window: float = 0.05, after: float = 0.3) -> float:
     """Compute the median peak-to-peak ringing [Pa] of the noise-free p_A after the pump's reversals.
 
     The ringing is p_A minus its moving mean over `window` [s], from `window` to `after` [s] after each reversal of the
-    pump's direction; the mean then contains nothing from before the reversal. Reversals in the first second are left
-    out.
+    pump's direction; the mean then contains nothing from before the reversal.
     """
     rate = 1.0 / float(run.t[1] - run.t[0])
     p_A, omega = run.outputs["p_A"], run.outputs["omega"]
@@ -81,12 +68,12 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
     - 4.5: without noise the pressure p_A does not ring visibly after a reversal.
     - 4.6: without Coulomb friction the drift of the piston changes by more than 1 %.
     """
-    runs = {command: context.run(make_experiment(command, None)) for command in COMMANDS}
+    runs = {command: context.run(cases.make_experiment(command, None)) for command in cases.COMMANDS}
     fits, tests = [], []
     for name, run in runs.items():
         command = parse_command(name)
         assert isinstance(command, Sine)
-        fit = sine_fit(run.t[cases.steady_mask(run)], steady_output(run, "omega"), command.omega)
+        fit = sine_fit(run.t[cases.steady_mask(run)], cases.steady_output(run, "omega"), command.omega)
         amplitude = float(np.abs(fit.amplitudes[0]))
         residual_ratio = rms(fit.residual) / (amplitude / math.sqrt(2.0))
         speed_ratio = amplitude / (command.amplitude * load_rig("thesis").motor.omega_per_volt)
@@ -95,7 +82,7 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
         tests.append(residual_ratio < _MAX_RESIDUAL)
     yield judge_claim("4.2", tests, fits="; ".join(fits))
     spans = "; ".join(f"{name}: {cases.steady_range(run, 'x') * 1e3:.1f} mm peak to peak" for name, run in runs.items())
-    yield judge_claim("4.4", NOT_TESTED, spans=spans)
+    yield judge_claim("4.4", [], spans=spans)
     noise = cases.visible_pressure()
     rings = {name: ringing(run) for name, run in runs.items()}
     text = ", ".join(f"{ring * 1e-3:.1f} kPa ({name})" for name, ring in rings.items())
@@ -103,9 +90,10 @@ def _judge_cases_without_orifices(context: Context) -> Iterator[Claim]:
 
     def drift_mm(**overrides: float) -> float:
         """Compute the drift [mm] of the piston in a run of 60 s, with some of the rig's parameters replaced."""
-        experiment = cases.make_drift_experiment(DEFAULT_READING, closed_pct=None, solver="converged", **overrides)
-        run = context.run(experiment)
-        return 1e3 * cases.piston_drift(run)
+        experiment = cases.make_drift_experiment(
+            cases.DEFAULT_READING, closed_pct=None, solver="converged", **overrides
+        )
+        return 1e3 * cases.piston_drift(context.run(experiment))
 
     # F_pr and F_cfr: Coulomb force without pressure, and its increase with pressure; breakaway is a multiple of both
     baseline = drift_mm()
@@ -120,13 +108,10 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
 
     The runs are all cases of Tables 4.2 and 4.3 for claim 4.1, and two with the gains of the thesis's drive for 4.3.
     """
-    runs = {case: context.run(make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
+    runs = {case: context.run(cases.make_experiment(*case, solver="as_published")) for case in cases.CASES.values()}
 
     def format_largest_change(*, with_throttles: bool) -> str:
-        """Format the largest rms change of a pressure by halving the step, in the cases with or without throttles.
-
-        The text is "diverged" if there is no such change.
-        """
+        """Format the largest rms change of a pressure by halving the step; "diverged" if there is none."""
         # `closed` is None in a case without throttles
         matching_runs = [run for (_, closed), run in runs.items() if (closed is not None) == with_throttles]
         changes = [run.step_changes[name] for run in matching_runs for name in PRESSURES if name in run.step_changes]
@@ -141,13 +126,16 @@ def _judge_step_and_gains(context: Context) -> Iterator[Claim]:
         ("with the drive's voltage and current limits", {}),
         ("without limits", {"motor.V_max": 1e5, "motor.i_max": 1e5}),
     ):
+        gains_and_limits = {**drive_gains, **limits}
         run = context.run(
-            make_experiment(COMMANDS[0], None, solver="as_published", overrides={**drive_gains, **limits})
+            cases.make_experiment(
+                cases.COMMANDS[0], None, cases.DEFAULT_READING, "as_published", cases.DURATION, **gains_and_limits
+            )
         )
         change = f"halving the step moves the speed by {run.step_changes.get('omega', math.nan):.3g} rad/s rms"
         texts.append(f"{name}: {run.diverged or change}")
         tests.append(run.resolved is True)
-    speed_change = runs[COMMANDS[0], None].step_changes.get("omega", math.nan)  # with the rig's gains
+    speed_change = runs[cases.COMMANDS[0], None].step_changes.get("omega", math.nan)  # with the rig's gains
     yield judge_claim("4.3", tests, runs="; ".join(texts), rig_gains=speed_change)
 
 
@@ -161,15 +149,15 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     """
     rig = load_rig("thesis")
     charge = rig.fluid.p_charge * 1e-6  # [MPa]
-    run = context.run(make_experiment(COMMANDS[0], closed_pct=25.0))
-    peaks = [float(steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
+    run = context.run(cases.make_experiment(cases.COMMANDS[0], closed_pct=25.0))
+    peaks = [float(cases.steady_output(run, name).max()) * 1e-6 for name in PRESSURES]
     low, high = min(peaks), max(peaks)
     needed = charge + _PRINTED_PEAK_MPA - high  # charge pressure with which the peaks are as printed
-    yield judge_claim("4.7", NOT_TESTED, low=low, high=high, charge=charge, needed=needed, lift=high - charge)
+    yield judge_claim("4.7", [], low=low, high=high, charge=charge, needed=needed, lift=high - charge)
     open_area, d_line = (3.75 / 5.0) ** 2, rig.line.d_line  # 3.75 mm of 5 mm, printed as 25 % closed
     tests = [math.isclose(open_area, 0.75, rel_tol=0.01), math.isclose(d_line, 5e-3)]
     yield judge_claim("4.13", tests, area=open_area, closed=1 - open_area, d_line=d_line * 1e3)
-    yield from (judge_claim("4.17", NOT_TESTED), judge_claim("4.22", NOT_TESTED))
+    yield from (judge_claim("4.17", []), judge_claim("4.22", []))
     F_pr = rig.friction.F_pr
     jumps = friction_at_threshold(F_pr)
     tests = [math.isclose(force, above, rel_tol=1e-6) for force, above in jumps.values()]
@@ -185,12 +173,8 @@ def _judge_equations_and_tables(context: Context) -> Iterator[Claim]:
     yield judge_claim("4.23", is_free["literal"], sides="; ".join(texts))
 
 
-def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
-    """Format the number of tests that passed, such as "7 of 16 tests pass".
-
-    `tests`: results by interpretation of the throttles' equations. If only some tests passed, the text also names the
-    interpretations under which all of them do.
-    """
+def count_passed(tests: Mapping[cases.Reading, tuple[bool, ...]]) -> str:
+    """Format the number of passed tests; if only some passed, with the interpretations under which all of them do."""
     results = [test for row in tests.values() for test in row]
     passing_readings = [reading.title for reading, row in tests.items() if all(row)]
     text = f"{sum(results)} of {len(results)} tests pass"
@@ -201,62 +185,53 @@ def count_passed(tests: Mapping[Reading, tuple[bool, ...]]) -> str:
 
 def _judge_runs(
     claim_number: int,
-    results: Mapping[Solver, Mapping[Reading, _T]],
+    results: Mapping[cases.Solver, Mapping[cases.Reading, _T]],
     test: Callable[[_T], Iterable[bool]],
     format_results: Callable[[list[_T]], str],
 ) -> Claim:
-    """Judge claim 4.`claim_number` by the runs with the converged solver, under both interpretations of the equations.
+    """Judge claim 4.`claim_number` by the runs with the converged solver, and state the results of both solvers.
 
     `results`: results of the runs by solver and interpretation (`Reading`); `test`: yields True or False for each test
-    on the results under one interpretation; `format_results`: formats the results under all interpretations. The
-    claim's text states the results of both solvers.
+    on the results under one interpretation; `format_results`: formats the results under all interpretations.
     """
-    tests = {
-        solver: {reading: tuple(test(values)) for reading, values in results[solver].items()} for solver in SOLVERS
-    }
-    simulation = "; ".join(
-        f"{cases.LABELS[solver]}: {format_results(list(results[solver].values()))}, {count_passed(tests[solver])}"
-        for solver in SOLVERS
-    )
-    passed = [test_passed for row in tests["converged"].values() for test_passed in row]
+    texts: list[str] = []
+    passed: dict[cases.Solver, Iterable[bool]] = {}
+    for solver in cases.SOLVERS:
+        tests = {reading: tuple(test(values)) for reading, values in results[solver].items()}
+        texts.append(f"{cases.LABELS[solver]}: {format_results(list(results[solver].values()))}, {count_passed(tests)}")
+        passed[solver] = itertools.chain.from_iterable(tests.values())
     noise = cases.visible_pressure() * 1e-3  # [kPa]; many texts state this limit of a visible change
-    return judge_claim(f"4.{claim_number}", passed, simulation=simulation, noise=noise)
+    return judge_claim(f"4.{claim_number}", passed["converged"], simulation="; ".join(texts), noise=noise)
 
 
 def _range_formatter(head: str, values: Callable[[Rows], Iterable[float]]) -> Callable[[list[Rows]], str]:
-    """Build a function that formats the smallest and the largest of some numbers [kPa] over several runs.
+    """Build a function that formats the smallest and the largest of some numbers [kPa] under all interpretations.
 
-    The built function takes a list with the summaries of the runs (`summarise_run`) under each interpretation of the
-    throttles' equations. `values`: computes numbers [Pa] from the summaries under one interpretation; `head`: text
-    before the numbers.
+    `values`: computes the numbers [Pa] from the runs' summaries under one interpretation; `head`: text before them.
     """
     return lambda all_rows: f"{head} {format_range((v for rows in all_rows for v in values(rows)), 'kPa', 1e-3)}"
 
 
 def _changes(rows: Rows, statistic: str, names: Iterable[str] = PRESSURES) -> list[float]:
-    """Compute the change [Pa] of a statistic of each pressure from the first run to every later run.
-
-    `rows`: summaries of the runs (`summarise_run`); `statistic`: "peak" (maximum) or "range" (maximum minus minimum).
-    """
+    """Compute the changes [Pa] of each pressure's `statistic` ("peak" or "range") from the first run to each other."""
     keys = [f"{statistic} of {name}" for name in names]
     return [row[key] - rows[0][key] for row in rows[1:] for key in keys]
 
 
 def _run_cases(context: Context, *commands_and_closings: tuple[str, float]) -> RowsByReading:
-    """Simulate cases under both interpretations of the throttles' equations (`READINGS`), with both solvers.
+    """Simulate cases under all `READINGS` with both solvers, and summarise the runs (`summarise_run`).
 
-    A case is (command, closing [%] of both throttles). Returns, by solver and interpretation, a list with the summary
-    of each case's run (`summarise_run`).
+    A case is (command, closing [%] of both throttles).
     """
     return {
         solver: {
             reading: [
-                cases.summarise_run(context.run(make_experiment(command, closed, reading, solver)))
+                cases.summarise_run(context.run(cases.make_experiment(command, closed, reading, solver)))
                 for command, closed in commands_and_closings
             ]
-            for reading in READINGS
+            for reading in cases.READINGS
         }
-        for solver in SOLVERS
+        for solver in cases.SOLVERS
     }
 
 
@@ -274,7 +249,7 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
     """
     min_visible = cases.visible_pressure()
     # by interpretation: rows[0] is the run with open orifices, rows[1] that with orifices that are 25 % closed
-    opening = _run_cases(context, (COMMANDS[0], 0.0), (COMMANDS[0], 25.0))
+    opening = _run_cases(context, (cases.COMMANDS[0], 0.0), (cases.COMMANDS[0], 25.0))
     drop_1, drop_2, flows = "mean of p_1 - p_A", "mean of p_2 - p_B", "flow difference"  # keys of a run's summary
 
     def peak_and_range_changes(rows: Rows) -> list[float]:
@@ -282,9 +257,8 @@ def _judge_opening(context: Context) -> Iterator[Claim]:
         return _changes(rows, "peak") + _changes(rows, "range")
 
     def format_flow_difference(all_rows: list[Rows]) -> str:
-        """Format the largest rms(Q_A - Q_B) / rms(Q_A) with orifices that are 25 % closed, over all interpretations."""
-        largest = max(rows[1][flows] for rows in all_rows)
-        return f"rms of Q_A - Q_B over rms of Q_A at most {100 * largest:.2f} %"
+        """Format the largest rms(Q_A - Q_B) / rms(Q_A) with orifices that are 25 % closed."""
+        return f"rms of Q_A - Q_B over rms of Q_A at most {100 * max(rows[1][flows] for rows in all_rows):.2f} %"
 
     format_changes = _range_formatter("25 % against open, peaks and ranges", peak_and_range_changes)
     yield _judge_runs(8, opening, lambda rows: np.abs(peak_and_range_changes(rows)) < min_visible, format_changes)
@@ -305,19 +279,16 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
     orifices is visible at each closing (4.21). Changes and drop must exceed a transducer's noise (`visible_pressure`).
     """
     min_visible = cases.visible_pressure()
-    by_command = _run_cases(context, *((command, 50.0) for command in COMMANDS))
-    fast_by_closing = _run_cases(context, *((COMMANDS[2], closed) for closed in CLOSINGS))
-    slow_by_closing = _run_cases(context, *((COMMAND, closed) for closed in CLOSINGS))
+    by_command = _run_cases(context, *((command, 50.0) for command in cases.COMMANDS))
+    fast_by_closing = _run_cases(context, *((cases.COMMANDS[2], closed) for closed in cases.CLOSINGS))
+    slow_by_closing = _run_cases(context, *((cases.COMMAND, closed) for closed in cases.CLOSINGS))
 
     def range_changes(rows: Rows) -> list[float]:
         """Compute the changes of all pressures' ranges [Pa] from the first run to the last."""
         return _changes([rows[0], rows[-1]], "range")
 
     def judge_increase(number: int, runs: RowsByReading, head: str, values: Callable[[Rows], Iterable[float]]) -> Claim:
-        """Judge claim 4.`number`, that numbers [Pa] computed from runs exceed the limit of a visible change.
-
-        `values`: computes the numbers from the summaries of the runs; `head`: text before the numbers.
-        """
+        """Judge claim 4.`number`, that the `values` [Pa] of the runs exceed the limit of a visible change."""
         return _judge_runs(
             number, runs, lambda rows: (value > min_visible for value in values(rows)), _range_formatter(head, values)
         )
@@ -328,13 +299,13 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
 
-    head = f"{COMMANDS[2]} against {COMMANDS[0]}, 50 % closed, ranges"
+    head = f"{cases.COMMANDS[2]} against {cases.COMMANDS[0]}, 50 % closed, ranges"
     yield judge_increase(14, by_command, head, range_changes)
-    head = f"50 and 75 against 25 % closed, {COMMANDS[2]}, peaks"
+    head = f"50 and 75 against 25 % closed, {cases.COMMANDS[2]}, peaks"
     yield judge_increase(15, fast_by_closing, head, lambda rows: _changes(rows, "peak", CHAMBERS))
     format_changes = _range_formatter("75 against 25 % closed, ranges", range_changes)
     yield _judge_runs(16, slow_by_closing, ranges_grow, format_changes)
-    head = f"largest drop at 25, 50, 75 % under {COMMAND}"
+    head = f"largest drop at 25, 50, 75 % under {cases.COMMAND}"
     yield judge_increase(21, slow_by_closing, head, lambda rows: [row["largest drop"] for row in rows])
 
 
@@ -344,24 +315,24 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
     A change of the drift counts if it exceeds 1 % of the drift without orifices.
     """
 
-    def drift(reading: Reading, closed: float | None, solver: Solver) -> float:
+    def drift(reading: cases.Reading, closed: float | None, solver: cases.Solver) -> float:
         """Compute the piston's drift [m] in a long run; `closed`: closing of the orifices [%], None for none."""
         return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
-    drift_without = drift(DEFAULT_READING, None, "converged")
+    drift_without = drift(cases.DEFAULT_READING, None, "converged")
     min_change = DRIFT_FRACTION * abs(drift_without)
     drifts = {
-        solver: {reading: [drift(reading, closed, solver) for closed in CLOSINGS] for reading in READINGS}
-        for solver in SOLVERS
+        solver: {reading: [drift(reading, closed, solver) for closed in cases.CLOSINGS] for reading in cases.READINGS}
+        for solver in cases.SOLVERS
     }
 
     def format_drifts(head: str, rows: list[list[float]]) -> str:
-        """Format the drift [mm] due to the orifices at each closing, as its smallest and largest value over `rows`.
-
-        A row has the drifts [m] under one interpretation of the equations, one for each closing.
-        """
-        parts = (format_range([row[k] - drift_without for row in rows], "mm", 1e3) for k in range(len(CLOSINGS)))
-        texts = (f"{closed:g} % closed {part}" for closed, part in zip(CLOSINGS, parts, strict=True))
+        """Format the drift [mm] due to the orifices at each closing, as its range over all interpretations (`rows`)."""
+        drifts_by_closing = zip(cases.CLOSINGS, zip(*rows, strict=True), strict=True)
+        texts = (
+            f"{closed:g} % closed {format_range([value - drift_without for value in values], 'mm', 1e3)}"
+            for closed, values in drifts_by_closing
+        )
         return f"{head} {', '.join(texts)}"
 
     def differs(row: list[float]) -> Iterator[bool]:
@@ -395,8 +366,8 @@ def claims(context: Context, item: Item) -> tuple[ThesisTable | Claim, ...]:
     judgements = [claim for judge in (*without_orifices, *with_orifices) for claim in judge(context)]
     judgements.sort(key=lambda claim: int(claim.id.rpartition(".")[2]))  # by the number after "4."
     rows: list[tuple[Cell, ...]] = []
-    for reading, solver, closed in itertools.product(READINGS, SOLVERS, (0.0, *CLOSINGS)):
-        run = context.run(make_experiment(COMMAND, closed, reading, solver))
+    for reading, solver, closed in itertools.product(cases.READINGS, cases.SOLVERS, (0.0, *cases.CLOSINGS)):
+        run = context.run(cases.make_experiment(cases.COMMAND, closed, reading, solver))
         numbers = cases.summarise_run(run)
         values = (numbers[name] * factor for name, factor in _TABLE_FACTORS.items())
         cells = (value if math.isfinite(value) else None for value in values)

@@ -33,24 +33,24 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
 
 
 def friction_at_threshold(F_C: float) -> dict[str, tuple[float, float]]:
-    """Compute the friction [N] at the threshold velocity v_th and just above it, by each interpretation of eq. (4.22).
+    """Compute the friction [N] at the threshold velocity v_th and just above it; `F_C`: Coulomb force [N].
 
-    The keys are "continuous", and "literal" for the unbalanced bracket closed at its end. `F_C`: Coulomb force [N].
+    The keys are "continuous", and "literal" for the unbalanced bracket of eq. (4.22) closed at its end.
     """
     v_th = load_rig("thesis").friction.v_th
     velocities = np.array([v_th, math.nextafter(v_th, 1.0)])
     forces = {}
     for name, literal_bracket in (("continuous", False), ("literal", True)):
-        at_threshold, above = stribeck_force(velocities, F_C, literal_bracket=literal_bracket)
-        forces[name] = float(at_threshold), float(above)
+        at_threshold, above = stribeck_force(velocities, F_C, literal_bracket=literal_bracket).tolist()
+        forces[name] = at_threshold, above
     return forces
 
 
 def falling_friction_limit(F_C: float) -> float:
     """Compute the velocity [m/s] up to which friction falls with speed, 0 if never; `F_C` > 0: Coulomb force [N].
 
-    The limit v solves F_v = F_C (K_brk - 1) C_c exp(-C_c v), with the parameters of the thesis's rig: F_v [N s/m]
-    viscous coefficient, K_brk breakaway force over Coulomb force, C_c [s/m] decay of the Stribeck effect.
+    The limit v solves F_v = F_C (K_brk - 1) C_c exp(-C_c v): viscous coefficient F_v [N s/m], breakaway over Coulomb
+    force K_brk, decay of the Stribeck effect C_c [s/m].
     """
     f = load_rig("thesis").friction
     # slope of the Stribeck friction at standstill over that of the viscous friction
@@ -82,11 +82,7 @@ def friction_models_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def stribeck_figure(context: Context, item: Item) -> tuple[Figure, ...]:
-    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22).
-
-    The equation's closing bracket can stand in two places; one of them makes friction continuous at v_th. `context` is
-    not used.
-    """
+    """Draw Fig. 4.3: friction over velocity, its slope, and both interpretations of eq. (4.22); `context` is unused."""
     rig = load_rig("thesis")
     f = rig.friction
     # Coulomb force with both chambers at charge pressure; F_cfr multiplies the sum of the pressures, eq. (4.20)
