@@ -57,7 +57,7 @@ def test_each_family_is_counted_by_hand():
 
 
 def test_the_table_says_which_half_it_is():
-    families = build_tables(judge(ROWS, [NAME]), part="held out")["families"]
+    families = build_tables(judge(ROWS, [NAME]), "L/min", {}, part="held out")["families"]
     assert {line["part"] for line in families} == {"held out"}
     assert {line["family"] for line in families} == {ALL, "hoses", "mass"}
 

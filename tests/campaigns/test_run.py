@@ -168,14 +168,16 @@ def break_some(plan, case, folder=None):
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
+def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path, monkeypatch):
     plan = load_plan(tiny)
     bad = sum(doomed(case) for case in list_cases(plan))
     assert 0 < bad < 16
-    state = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
+    monkeypatch.setattr(campaign, "run_case", break_some)
+    state = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert (state.done, state.failed) == (26, bad)
     again = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert again.failed == bad
+    monkeypatch.undo()
     result = judge_simulated_campaign(plan, tmp_path / "bad")
     assert {row.error for row in result.judgement.failed} == {"the run diverged"}
     outcome = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
@@ -191,7 +193,8 @@ def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatc
     monkeypatch.syspath_prepend(Path(__file__).parent)
     die_on_one = import_module("dying_task").die_on_one
     plan, _ = once
-    state = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
+    monkeypatch.setattr(campaign, "run_case", die_on_one)
+    state = campaign.run(plan, tmp_path / "dead", jobs=2)
     assert (state.done, state.failed) == (26, 1)
     rows = store.read_plan_rows(plan, tmp_path / "dead")
     assert [row.error for row in rows.values() if row.error] == ["the process that ran the record died"]

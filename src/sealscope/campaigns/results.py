@@ -33,7 +33,7 @@ class CampaignResult:
     known: Mapping[str, PriorKnowledge] = field(default_factory=dict)
 
 
-def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
+def prior_knowledge(plan: AnyPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
     A scorer that compares two parts of a record knows the true onset of simulated records, because they are split

@@ -14,7 +14,7 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -258,7 +258,6 @@ def plan_recording(
     find: float | None = None,
     *,
     usual: PlannedDuty = USUAL,
-    duties: Iterable[PlannedDuty] | None = None,
     false_alarm: float = _FALSE_ALARM,
     detection: float = 0.9,
     held: float | None = None,
@@ -266,12 +265,11 @@ def plan_recording(
 ) -> RecordingPlan:
     """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
 
-    All duties (command and load) are compared in recordings of `COMPARISON_SECONDS`. The best duty is then tried for
-    rising `DURATIONS`, from half of the predicted one, until the leak is detected; and likewise for telling it from a
-    leak of the pump.
+    The `usual` duty and all combinations of `COMMANDS` and `LOADS` are compared in recordings of `COMPARISON_SECONDS`.
+    The best is then tried for rising `DURATIONS`, from half of the predicted one, until the leak is detected; and
+    likewise for telling it from a leak of the pump.
 
     - `find`: flow at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
-    - `duties`: duties to compare with the usual one, by default all combinations of `COMMANDS` and `LOADS`
     - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
     - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
       the rig has such valves, and otherwise for no hold
@@ -279,7 +277,7 @@ def plan_recording(
 
     Raises InputError if the usual duty cannot be simulated or judged.
     """
-    choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
+    choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS]
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]
     compared = []
     for k, duty in enumerate(compared_duties):

@@ -16,7 +16,7 @@ import numpy as np
 from sealscope.campaigns.plans.duty import CONTROLLER, FAMILY
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
 from sealscope.control.registry import find_controller_source
-from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.bench.profile import Profile
 
 #: Parameters of a rig that only verdicts use; no simulated record depends on them.
 _PRIORS = frozenset({"pump.G_healthy"})
@@ -68,9 +68,8 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def profile_key(name: str) -> str:
-    """Compute a hash (hex) of the content of a profile (`name` or file), from which machines are drawn."""
-    profile = load_profile(name)
+def profile_key(profile: Profile) -> str:
+    """Compute a hash (hex) of the content of a profile, from which machines are drawn."""
     # the seeds of cases depend on this hash, and so on the profile's name; a renamed profile that must draw the same
     # cases as before states its former name in `seeds`
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
@@ -80,7 +79,7 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
     """Collect the inputs that all records of a plan share: hashes of rig and profile, length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
-        "profile": profile_key(plan.profile) if plan.profile else "",
+        "profile": profile_key(plan.machine_profile) if plan.machine_profile else "",
         "duration_s": plan.duration_s,
         "onset_s": plan.onset_s,
         "seed": plan.seed,
@@ -93,8 +92,9 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     The id of a case depends on those of its own levels only, so its stored row stays valid if another level is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
-    for level in plan.factors.get(FAMILY, ()):
-        digests[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
+    if plan.machine_profile is not None:
+        for level in plan.factors.get(FAMILY, ()):
+            digests[FAMILY][str(level)] = digest(repr(plan.machine_profile.family(str(level))))
     for level in plan.factors.get(CONTROLLER, ()):
         if path := find_controller_source(str(level)):
             digests[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -29,7 +29,6 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.batch.run import refuse_unbatchable, with_leak_coefficient
-from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
 from sealscope.simulation.integrate import MAX_STEP_REFINEMENT, integrate_run, oversampling, steps_per_output
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers
@@ -101,15 +100,14 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
     A row does not depend on the other cases, except as `simulate_batch` states of leakage coefficients that converge
     badly. `threads`: number of threads of the simulation.
     """
-    profile = load_profile(plan.profile) if plan.profile else None
-    choose_step = make_step_chooser(plan, profile)
+    choose_step = make_step_chooser(plan)
     for start in range(0, len(cases), BATCH_SIZE):
         start_time, batch = time.process_time(), cases[start : start + BATCH_SIZE]
         pairs: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in batch:
             try:
-                experiment = experiment_with_flow_leak(plan, case, profile)
+                experiment = experiment_with_flow_leak(plan, case)
                 pairs.append((case, replace(experiment, step=choose_step(case, experiment))))
             except Exception as error:  # a defect of one case must not end the campaign
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
@@ -171,16 +169,13 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
     return sized_experiments
 
 
-def make_step_chooser(
-    plan: SimulatedPlan, profile: Profile | None = None
-) -> Callable[[CampaignCase, Experiment], float]:
+def make_step_chooser(plan: SimulatedPlan) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
     All cases with the same levels of the factors (a cell) share the search. `N_SCOUT_MACHINES` machines are drawn for
     the cell, and on a short run of each, `integrate_run` chooses the longest step that passes its check of the error. A
     case gets the shortest of the steps chosen for machines with the same solver as its own. The step is shortened to
     the longest stable one of the case's machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
-    `profile`: the plan's profile if it is already loaded.
     """
     shared = digest(shared_inputs(plan))
 
@@ -196,7 +191,7 @@ def make_step_chooser(
             seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)  # 15 hex digits: 60 bits
             try:
                 scout = CampaignCase(id="", machine_seed=seed, noise_seed=0, **content)
-                method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout, profile))
+                method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout))
             except SealscopeError:  # this machine cannot follow the cell's command
                 continue
             steps[method] = min(step, steps.get(method, math.inf))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -58,12 +59,10 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
         sizes = [record.size for record in leaky]
         hits = [record.alarm for record in leaky]
         detections = detection_by_size(sizes, hits, confidence)
-        curve = None
-        why = ""
         try:
-            curve = fit_hit_miss(sizes, hits)
+            curve, why = fit_hit_miss(sizes, hits), ""
         except InputError as error:
-            why = str(error)
+            curve, why = None, str(error)
         yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
 
 
@@ -77,9 +76,9 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
         min_score = min((score for score in scores if score is not None), default=None)
         if min_score is None:
             continue
-        by_leak: dict[float, list[float]] = {}
+        by_leak: dict[float, list[float]] = defaultdict(list)
         for record, score in zip(records, scores, strict=True):
-            by_leak.setdefault(record.size, []).append(min_score - 1.0 if score is None else score)
+            by_leak[record.size].append(min_score - 1.0 if score is None else score)
         leak_free = by_leak.pop(0.0, [])
         all_scores = [score for leaky in by_leak.values() for score in leaky]
         for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes

@@ -25,7 +25,6 @@ from sealscope.campaigns.judging.verdicts import (
     drop_other_faults,
     group_by,
 )
-from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import Promise
 
@@ -70,7 +69,6 @@ def judge(
     false_alarm: float = 0.01,
     promise: Promise = "average",
     confidence: float = 0.95,
-    limits: Mapping[str, float] | None = None,
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
@@ -79,22 +77,16 @@ def judge(
     Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Raises
     InputError if there is no row to judge, or too few leak-free rows to set a threshold.
 
-    - `false_alarm`: wanted false-alarm probability
-    - `promise`: "average" if the thresholds keep this probability on average over sets of leak-free records, "bound" if
-      they keep it with the probability `confidence` (`quantile_threshold`)
+    - `false_alarm`, `promise`: wanted false-alarm probability, and how the thresholds keep it (`Promise`)
     - `confidence`: probability for the promise "bound", and confidence level of all intervals
-    - `limits`: thresholds by detector, in place of all fixed and computed ones
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
     - `hours`: operating time of a record [h], None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    thresholds = {} if limits is not None else compute_thresholds(rows, detectors, false_alarm, promise, confidence)
-    if limits is None:
-        scorers = {name: scorer for name in detectors if (scorer := parse_detector_name(name).scorer) is not None}
-        limits = {name: scorer.threshold for name, scorer in scorers.items() if scorer.threshold is not None}
-    verdicts = collect_verdicts(judged, detectors, limits, thresholds)
+    thresholds = compute_thresholds(rows, detectors, false_alarm, promise, confidence)
+    verdicts = collect_verdicts(judged, detectors, thresholds)
     leak_verdicts = drop_other_faults(verdicts)
     alarms = Alarms(verdicts, confidence)
     return Judgement(

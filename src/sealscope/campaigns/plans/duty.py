@@ -11,7 +11,6 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.control.registry import CONTROLLERS, check_controller_name, controller_named, is_installed
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
-from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.experiment import check_target, throttle_values
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
@@ -50,9 +49,8 @@ def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     InputError if a controller is neither installed nor trusted, or cannot be built.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
-    if plan.profile:
-        profile = load_profile(plan.profile)
-        duties = (profile.duty, *(family.duty for family in profile.families))
+    if plan.machine_profile is not None:
+        duties = (plan.machine_profile.duty, *(family.duty for family in plan.machine_profile.families))
         names += [name for duty in duties if duty is not None for name in duty.controllers]
     for name in dict.fromkeys(names):
         if not (trust or is_installed(name)):

@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 from sealscope.evaluation.thresholds import Promise
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS
+from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.units import parse_quantity
 
 Use = Literal["calibrate", "judge"]
@@ -132,9 +133,7 @@ class _Plan(_TomlTable):
     - `name`: name of the plan and of its files; `title`: by default the name; `note`: remark of the author
     - `confidence`: confidence level of all intervals, such as 0.95
     - `place`: path of the plan's file
-    - `false_alarm`: wanted false-alarm probability of each detector
-    - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
-      they keep it with the probability `confidence` (`quantile_threshold`)
+    - `false_alarm`, `promise`: wanted false-alarm probability of each detector, and how thresholds keep it (`Promise`)
     - `detectors`: names in the forms that the module `plans.detectors` lists
     - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
@@ -148,7 +147,7 @@ class _Plan(_TomlTable):
     confidence: Fraction = 0.95
     note: Text = ""
     place: str = ""
-    false_alarm: Fraction = 0.01
+    false_alarm: Annotated[Fraction, Field(ge=1e-15)] = 0.01  # fewer than any number of records can show
     promise: Promise = "average"
     detectors: Names
     unit: Text = "L/min"
@@ -208,7 +207,12 @@ class SimulatedPlan(_Plan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume, by default the simulated one."""
-        return self._load_assumed(self.rig) or self.rig  # is never None here; `or` is for type checkers
+        return self._load_assumed(self.rig) or self.rig  # `or`: for type checkers
+
+    @cached_property
+    def machine_profile(self) -> Profile | None:
+        """The profile from which machines are drawn, None without one."""
+        return load_profile(self.profile) if self.profile else None
 
     @property
     def size(self) -> int:
