@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
 from sealscope.signals.details import Details
-from sealscope.signals.filters import Array, IntArray, require_finite, require_positive_int
+from sealscope.signals.filters import Array, IntArray, require_finite, require_whole
 from sealscope.storage.plain_state import require_count, require_numbers, require_part
 
 WINDOW_SIZE = 1000
@@ -92,12 +92,10 @@ class RmsStream:
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
         """Begin a stream without samples; the class describes the parameters."""
-        self.size = require_positive_int(size, "size", unit=" sample")
-        self.step = require_positive_int(step, "step", unit=" sample")
-        if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
-            raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
+        self.size = require_whole(size, "size", unit=" sample")
+        self.step = require_whole(step, "step", unit=" sample")
         self._piece = math.gcd(self.size, self.step)  # samples in a piece; windows consist of whole pieces
-        self._skip = int(skip)  # samples still to be dropped at the beginning
+        self._skip = require_whole(skip, "skip", 0, " samples")  # samples still to be dropped at the beginning
         self._next_end = int(first) + self.size  # sample number just after the next window
         self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
         self._sums: Array | None = None  # sums of squares of the pieces that coming windows need, (..., pieces)
