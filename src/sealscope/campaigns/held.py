@@ -52,7 +52,7 @@ class PlannedHold(NamedTuple):
     duration: float
     pressure_A: float
     pressure_B: float
-    conductance: float
+    conductance: float = np.inf
 
     @property
     def difference(self) -> float:
@@ -134,7 +134,7 @@ class _HoldDraws:
         self._rig, self._flow = rig, flow
         pressure_B = rig.fluid.p_charge + P_ATM  # absolute
         pressure_A = pressure_B + load / rig.cylinder.A_A
-        self._hold = PlannedHold(duration, pressure_A, pressure_B, conductance=np.inf)  # no leak is found so far
+        self._hold = PlannedHold(duration, pressure_A, pressure_B)
         # the fraction `within` of the probability is reserved for the test for a step within a recording
         self._max_false_alarm = false_alarm * (1.0 - DECISION.questions.within)
         self._max_missed = _N_DRAWS - detection * _N_DRAWS
@@ -147,8 +147,8 @@ class _HoldDraws:
     def detects(self, conductance: float) -> bool:
         """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
 
-        `conductance` [m^3/(s Pa)]: that of the leak. A hold detects it if a leak-free hold would leak as much with less
-        than the allowed false-alarm probability, as estimated from the healthy holds.
+        A hold detects it if a leak-free hold would leak as much with less than the allowed false-alarm probability, as
+        estimated from the healthy holds. `conductance` [m^3/(s Pa)]: that of the leak.
         """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
@@ -161,8 +161,7 @@ class _HoldDraws:
     def with_smallest_leak(self) -> PlannedHold:
         """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        If even the largest leak that is tried (`_TRIED_DECAYS`) is not detected, the hold is returned with the
-        conductance inf.
+        The conductance is inf if even the largest leak that is tried (`_TRIED_DECAYS`) is not detected.
         """
         decay_per_conductance = _decay_rate_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_DECAYS) / decay_per_conductance)  # logarithms of conductances
@@ -188,8 +187,7 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     """Simulate a locked hold with a leak past the piston and with sensor noise, and estimate the leak from it.
 
     `hold`: duration and initial pressures; `conductance` [m^3/(s Pa)]: that of the leak; `flow` [m^3/s]: mean flow of
-    the pump under the usual duty. Returns the summary of a recording with this hold. Its Gram matrix is 0, because the
-    piston does not move.
+    the pump under the usual duty. Returns the summary of a recording with this hold.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors
@@ -211,4 +209,5 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     locked_holds = find_locked_holds((t, p_A, p_B, x), rests=t[1:] >= BEFORE, rate=MAX_RATE)  # intervals at rest
     chambers = HeldChambers(locked_holds, sides, begin=float(t[0]), end=float(t[-1]), charge=hold.pressure_B)
     held = np.array(chambers.leaks)
+    # no Gram matrix of the volume balance: the piston does not move
     return RecordingSums(sums=np.zeros((1, 1, 1)), flow=flow, pressure=hold.difference, held=held)

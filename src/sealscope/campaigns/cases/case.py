@@ -51,11 +51,10 @@ class CaseInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignCase(CaseInputs):
-    """One record to simulate and judge.
+    """One record to simulate and judge, whose seeds and `id` follow from a hash of all its inputs (`list_cases`).
 
     `machine_seed`: seed by which its machine is drawn from the plan's profile; `noise_seed`: seed of the sensors'
-    noise. Seeds and `id` follow from a hash of the record's inputs, of `shared_inputs`, and of the content of the
-    machine family and the controller's file that its levels name.
+    noise.
     """
 
     machine_seed: int
@@ -106,8 +105,7 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
     The records of a group take the combinations of the factors' levels in turn; `replicate` counts the completed turns.
     """
-    combinations = itertools.product(*plan.factors.values())
-    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in combinations]
+    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = shared_inputs(plan)
     digests_by_factor = _level_digests(plan)
     cases = []
@@ -145,15 +143,14 @@ def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     for group in groups:
         positions.append((n_listed[group] + 0.5) / n_total[group])
         n_listed[group] += 1
-    return [cases[k] for k in sorted(range(len(cases)), key=positions.__getitem__)]
+    return [cases[k] for k in np.argsort(positions, kind="stable")]
 
 
 def iter_sources() -> Iterator[Path]:
     """Yield the package's source files on which the result of a record may depend."""
+    left_out = [_PACKAGE / part for part in _NOT_IN_ROWS]
     for path in sorted(_PACKAGE.rglob("*")):
-        name = path.relative_to(_PACKAGE).as_posix()
-        is_left_out = any(f"{name}/".startswith(f"{part}/") for part in _NOT_IN_ROWS)  # "/": whole names only
-        if path.suffix in (".py", ".toml") and not is_left_out:
+        if path.suffix in (".py", ".toml") and not any(path.is_relative_to(part) for part in left_out):
             yield path
 
 

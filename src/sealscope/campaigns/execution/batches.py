@@ -22,7 +22,7 @@ from sealscope.campaigns.cases.scoring import score_details
 from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.campaigns.plans.duty import parse_plan_fault
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.campaigns.plans.scorers import SplitRms, split_bounds
+from sealscope.campaigns.plans.scorers import log_rms_of_squares, split_bounds
 from sealscope.errors import InputError, SealscopeError
 from sealscope.physics.solvers.limits import longest_step
 from sealscope.recordings.chambers import CHAMBERS
@@ -51,11 +51,8 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
 
-    - All detectors must be scorers, which need only the RMS of wavelet details before and after the onset.
-    - No recordings are kept, and both sides of the onset have usable samples.
-    - Each leak has a single law, and no sensor has a fault.
-    - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`). This is
-      tested on the first case of each combination of levels, leak and fault, unless its experiment cannot be built.
+    The rules on single runs (`refuse_unbatchable`) are tested on the first case of each combination of levels, leak and
+    fault.
     """
 
     def refusal(rule: str) -> InputError:
@@ -78,7 +75,6 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
-    # first of equal levels, leak and fault
     first_cases = {repr((case.levels, case.leak_lpm, case.fault)): case for case in reversed(cases)}
     for case in first_cases.values():
         try:
@@ -98,7 +94,7 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
     """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
     A row does not depend on the other cases, except as `simulate_batch` states of leakage coefficients that converge
-    badly. `threads`: number of threads of the simulation.
+    badly.
     """
     choose_step = make_step_chooser(plan)
     for start in range(0, len(cases), BATCH_SIZE):
@@ -130,8 +126,7 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
             # of the three intervals between bounds, 0 and 2 are the two parts, and 1 is the gap between them
             squares = dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True))  # mean squares by chamber
-            split_rms = SplitRms.from_squares(squares, bounds)
-            scores = score_details(split_rms, plan.detectors, plan.views)
+            scores = score_details(log_rms_of_squares(squares, bounds), plan)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
@@ -174,8 +169,8 @@ def make_step_chooser(plan: SimulatedPlan) -> Callable[[CampaignCase, Experiment
 
     All cases with the same levels of the factors (a cell) share the search. `N_SCOUT_MACHINES` machines are drawn for
     the cell, and on a short run of each, `integrate_run` chooses the longest step that passes its check of the error. A
-    case gets the shortest of the steps chosen for machines with the same solver as its own. The step is shortened to
-    the longest stable one of the case's machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
+    case gets the shortest of the steps chosen for machines with its own solver, shortened to the longest stable one of
+    its machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
     """
     shared = digest(shared_inputs(plan))
 
@@ -198,13 +193,9 @@ def make_step_chooser(plan: SimulatedPlan) -> Callable[[CampaignCase, Experiment
         return steps
 
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
-        """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step.
-
-        If no machine drawn for the cell has the case's solver, the step is chosen on the case's experiment.
-        """
-        method = choose_method(experiment.rig, experiment.method)
-        step = cell_steps(*case.levels.items()).get(method)
-        if step is None:
+        """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step."""
+        step = cell_steps(*case.levels.items()).get(choose_method(experiment.rig, experiment.method))
+        if step is None:  # no machine drawn for the cell has the case's solver
             _, step = _choose_method_and_step(experiment)
         stable_step = longest_step(loaded_rig_numbers(experiment.rig, experiment.load))
         limit = max(stable_step, LONGEST_STEP / MAX_STEP_REFINEMENT)

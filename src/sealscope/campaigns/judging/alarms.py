@@ -61,19 +61,18 @@ class AlarmFractions:
 
 @dataclass(frozen=True)
 class Alarms:
-    """The verdicts of all detectors, with methods that summarise the alarms among them.
-
-    `confidence`: confidence level of the intervals of all fractions.
-    """
+    """The verdicts of all detectors, whose alarms are counted with intervals at the level `confidence`."""
 
     verdicts: Verdicts
     confidence: float
 
     def _with_references(self) -> Verdicts:
         """Collect the verdicts of all detectors, and of two references that always or never raise an alarm."""
-        rows = [record.row for record in next(iter(self.verdicts.values()), ())]  # the same for all detectors
-        references = {name: [JudgedRow(row, verdict, None) for row in rows]
-                      for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
+        records = next(iter(self.verdicts.values()))  # the same for all detectors
+        references = {
+            name: [JudgedRow(record.row, verdict, None) for record in records]
+            for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))
+        }
         return {**self.verdicts, **references}
 
     def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
@@ -117,9 +116,8 @@ class Alarms:
     def by_family(self) -> Iterator[AlarmFractions]:
         """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-        A family is a group of machines that a plan's profile defines. The results of all families together come first.
-        A size that occurs with several laws also has a result for all laws together, and leak-free records have only
-        this result. Records with faults other than a leak are left out.
+        The results of all families together come first. A size that occurs with several laws also has a result for all
+        laws together, and leak-free records have only this result. Records with faults other than a leak are left out.
         """
         for name, records in drop_other_faults(self.verdicts).items():
             members = (record for record in records if FAMILY in record.row.levels)
@@ -142,11 +140,10 @@ class Alarms:
         """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
         statements = [(record, record.statement) for record in group if record.statement is not None]
         intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
-        names_cause = [
+        n_named = sum(
             record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
             for record, statement in statements
-        ]
-        without_statement = [False] * (len(group) - len(statements))  # these records name no cause
+        )
         return AlarmFractions(
             detector=detector,
             alarms=self._proportion(record.alarm for record in group),
@@ -154,7 +151,7 @@ class Alarms:
             coverage=self._proportion(
                 interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None
             ),
-            named=self._proportion(names_cause + without_statement) if statements else None,
+            named=proportion(n_named, len(group), self.confidence) if statements else None,
             failed=sum(record.row.error is not None for record in group),
             **group_fields,
         )

@@ -32,10 +32,7 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Return a file name unchanged; raise ValueError if it is not a valid one.
-
-    A valid name has at most `_MAX_NAME_LENGTH` letters, digits, '-', '_' and '.', and does not start with '.'.
-    """
+    """Return a file name unchanged; raise ValueError if it is not a valid one."""
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(
             f"must have at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.', and not begin with '.'"
@@ -44,10 +41,7 @@ def _validate_file_name(name: str) -> str:
 
 
 def _validate_pattern(pattern: str) -> str:
-    """Return a pattern of file names, such as "day*/*.csv", if it is valid; else raise ValueError.
-
-    A pattern must be a relative path without "..". One component of the path may be `**`, for any subfolders.
-    """
+    """Return a pattern of file names, such as "day*/*.csv", unchanged; raise ValueError if it is not a valid one."""
     parts = Path(pattern).parts
     if not parts or Path(pattern).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
@@ -74,10 +68,7 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the name of a view (a set of channels); raise ValueError if it is empty, or has "@" or outer blanks.
-
-    In a detector's name, such as "diagnose @ pressures", "@" precedes the name of a view.
-    """
+    """Return the name of a view (set of channels) unchanged; raise ValueError if empty, or with "@" or outer blanks."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -159,7 +150,7 @@ class _Plan(_TomlTable):
     def _load_assumed(self, default: Rig | None) -> Rig | None:
         """Load the rig that detectors assume: `assume` or, if that is None, `default`, with the values `assume_set`.
 
-        If both are None, the values change the rig `thesis`; if there are no values either, the result is None.
+        If both are None, the values change the rig `thesis`; without values the result is None then.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -257,7 +248,7 @@ class RecordedPlan(_Plan):
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """The rig that detectors may assume, or None if the plan states neither a rig nor values to replace."""
+        """The rig that detectors may assume, None if the plan states none."""
         return self._load_assumed(default=None)
 
 

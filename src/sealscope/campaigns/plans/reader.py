@@ -11,16 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns.plans.detectors import DIAGNOSE, WATCH, check_detector, parse_detector_name
-from sealscope.campaigns.plans.duty import (
-    CLOSED,
-    COMMAND,
-    CONTROLLER,
-    FAMILY,
-    LOAD,
-    check_duty,
-    parse_plan_fault,
-    parse_throttle_values,
-)
+from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, FAMILY, check_level, parse_plan_fault
 from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.diagnose import check_probability
 from sealscope.errors import InputError
@@ -160,7 +151,7 @@ def _check_factors(plan: SimulatedPlan) -> None:
         if len({repr(level) for level in levels}) < len(levels):
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
         for level in levels:
-            _check_entry(f"factors.{name}", plan.place, partial(_check_level, plan, name, level))
+            _check_entry(f"factors.{name}", plan.place, partial(check_level, plan, name, level))
     cells = math.prod(map(len, plan.factors.values()))
     if cells > MAX_CELLS:
         raise InputError(f"factors: their levels must make at most {MAX_CELLS} cells, got {cells} ({plan.place})")
@@ -181,18 +172,6 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
         return plan.factors.get(COMMAND, (str(DEFAULT_COMMAND),))
     profiles = [profile.of_family(str(family)) for family in plan.factors.get(FAMILY, ())] or [profile]
     return tuple(command for family_profile in profiles for command in family_profile.duty.commands)
-
-
-def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
-    """Check that `level` is a valid value of the factor `name`; raise InputError otherwise."""
-    if name == FAMILY:
-        if plan.machine_profile is None:
-            raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
-        plan.machine_profile.family(str(level))
-    elif name in (COMMAND, CONTROLLER, LOAD):
-        check_duty(name, level, plan.rig, plan.duration_s)
-    else:  # a parameter of the rig, or the closed fraction of its throttles; raises for an invalid value
-        plan.rig.with_overrides(parse_throttle_values(level) if name == CLOSED else {name: level})
 
 
 def _check_records(plan: SimulatedPlan) -> None:
