@@ -34,10 +34,12 @@ def run(
 ) -> store.CampaignProgress:
     """Run the cases of a plan that have no result in `folder` yet, and return the campaign's progress.
 
-    `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
-    address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
-    numbers of cases done, of all cases, and of failed ones; `batch`: True to simulate cases side by side, with `jobs`
-    threads, instead; `trust`: True to run controllers that the plan names by file or module, whose code may be hostile.
+    - `jobs`: number of processes (`process_count`), 1 for this process only
+    - `cluster`: address of a Dask scheduler to use instead
+    - `retry`: True to run failed cases again
+    - `progress`: called with the numbers of cases done, of all cases, and of failed ones
+    - `batch`: True to simulate cases side by side, with `jobs` threads, instead
+    - `trust`: True to run controllers that the plan names by file or module, whose code may be hostile
 
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
     and for a plan that batches cannot run.

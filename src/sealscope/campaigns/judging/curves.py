@@ -18,20 +18,15 @@ class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
     `sizes`: detected fraction at each tested size; `curve`: logistic curve fitted to hits and misses, None if it cannot
-    be fitted, for the reason `why`; `proven`: smallest tested size such that, for it and for all larger ones, the lower
-    confidence bound of the detected fraction is at least 90 %; inf if there is none.
+    be fitted; `description`: method of the fit, or the reason why there is no curve; `proven`: smallest size from which
+    on detection is proven (`proven_size`), inf if there is none.
     """
 
     detector: str
     sizes: tuple[SizeDetection, ...]
     curve: HitMiss | None
-    why: str
+    description: str
     proven: float
-
-    @property
-    def description(self) -> str:
-        """Name of the method by which the curve was fitted, or the reason why there is no curve."""
-        return self.curve.estimator if self.curve else self.why
 
 
 @dataclass(frozen=True)
@@ -47,26 +42,24 @@ class SizeRoc:
     area: Area
 
 
-def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks.
-
-    Each result holds a fitted curve, or the reason why none can be fitted.
-    """
+def iter_pods(verdicts: Verdicts) -> Iterator[DetectorPod]:
+    """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks."""
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:
             continue
         sizes = [record.size for record in leaky]
         hits = [record.alarm for record in leaky]
-        detections = detection_by_size(sizes, hits, confidence)
+        detections = detection_by_size(sizes, hits)
         try:
-            curve, why = fit_hit_miss(sizes, hits), ""
+            curve = fit_hit_miss(sizes, hits)
+            description: str = curve.estimator
         except InputError as error:
-            curve, why = None, str(error)
-        yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
+            curve, description = None, str(error)
+        yield DetectorPod(name, tuple(detections), curve, description, proven_size(detections))
 
 
-def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
+def iter_rocs(verdicts: Verdicts) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
     A record without a score is ranked below all others. A curve needs at least two records with a leak and two without.
@@ -83,4 +76,4 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
         all_scores = [score for leaky in by_leak.values() for score in leaky]
         for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes
             if min(len(leak_free), len(leaky)) > 1:
-                yield SizeRoc(name, size, roc_curve(leak_free, leaky, confidence), auc(leak_free, leaky, confidence))
+                yield SizeRoc(name, size, roc_curve(leak_free, leaky), auc(leak_free, leaky))

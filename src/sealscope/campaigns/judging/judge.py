@@ -9,7 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.alarms import AlarmFractions, Alarms
+from sealscope.campaigns.judging.alarms import (
+    AlarmFractions,
+    add_references,
+    alarms_by_cell,
+    alarms_by_family,
+    alarms_by_fault,
+    alarms_by_size,
+)
 from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc, iter_pods, iter_rocs
 from sealscope.campaigns.judging.statements import (
     NamedCauses,
@@ -26,7 +33,6 @@ from sealscope.campaigns.judging.verdicts import (
     group_by,
 )
 from sealscope.errors import InputError
-from sealscope.evaluation.thresholds import Promise
 
 
 @dataclass(frozen=True)
@@ -67,43 +73,42 @@ def judge(
     detectors: Sequence[str],
     *,
     false_alarm: float = 0.01,
-    promise: Promise = "average",
-    confidence: float = 0.95,
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
     """Collect all detectors' verdicts on the rows (results of records) with `use` "judge", and compute statistics.
 
-    Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Raises
-    InputError if there is no row to judge, or too few leak-free rows to set a threshold.
+    Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Records
+    with a fault other than a leak count only in `causes` and `faults`. In `table`, `overall` and `faults` the detectors
+    are followed by two references, which always or never raise an alarm. Raises InputError if there is no row to judge,
+    or too few leak-free rows to set a threshold.
 
-    - `false_alarm`, `promise`: wanted false-alarm probability, and how the thresholds keep it (`Promise`)
-    - `confidence`: probability for the promise "bound", and confidence level of all intervals
+    - `false_alarm`: false-alarm probability that the thresholds keep on average over sets of leak-free records
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
     - `hours`: operating time of a record [h], None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    thresholds = compute_thresholds(rows, detectors, false_alarm, promise, confidence)
+    thresholds = compute_thresholds(rows, detectors, false_alarm)
     verdicts = collect_verdicts(judged, detectors, thresholds)
     leak_verdicts = drop_other_faults(verdicts)
-    alarms = Alarms(verdicts, confidence)
+    compared_verdicts = add_references(leak_verdicts)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(alarms.by_size(hours)),
-        overall=tuple(alarms.by_size(hours, pooled=True)),
-        onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s, confidence)),
-        flows=tuple(flow_errors(leak_verdicts, confidence)),
-        causes=tuple(iter_cause_confusions(verdicts, confidence)),
-        pods=tuple(iter_pods(leak_verdicts, confidence)),
-        rocs=tuple(iter_rocs(leak_verdicts, confidence)),
-        cells=tuple(alarms.by_cell()),
-        faults=tuple(alarms.by_fault()),
-        families=tuple(alarms.by_family()),
+        table=tuple(alarms_by_size(compared_verdicts, hours)),
+        overall=tuple(alarms_by_size(compared_verdicts, hours, pooled=True)),
+        onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s)),
+        flows=tuple(flow_errors(leak_verdicts)),
+        causes=tuple(iter_cause_confusions(verdicts)),
+        pods=tuple(iter_pods(leak_verdicts)),
+        rocs=tuple(iter_rocs(leak_verdicts)),
+        cells=tuple(alarms_by_cell(leak_verdicts)),
+        faults=tuple(alarms_by_fault(add_references(verdicts))),
+        families=tuple(alarms_by_family(leak_verdicts)),
         achieved_flows=_achieved_flows([row for row in judged if not row.fault]),
     )
 
