@@ -42,6 +42,11 @@ _N_DRAWS, _N_BISECTIONS = 5, 8
 _TRIED_DECAYS = (1e-4, 10.0)
 
 
+def leak_flow_lpm(conductance: float, pressure: float) -> float | None:
+    """Convert a leak's conductance [m^3/(s Pa)] to its flow [L/min] at a pressure difference [Pa]; None for inf."""
+    return conductance * pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+
+
 class PlannedHold(NamedTuple):
     """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
@@ -59,29 +64,21 @@ class PlannedHold(NamedTuple):
         """Pressure difference across the piston at the beginning of the hold [Pa]."""
         return self.pressure_A - self.pressure_B
 
-    @property
-    def finds_a_leak(self) -> bool:
-        """True if some leak is found with the wanted probability, i.e. `conductance` is finite."""
-        return bool(np.isfinite(self.conductance))
-
-    def _lpm(self, difference: float) -> float:
-        """Compute the flow [L/min] of the smallest leak at a pressure difference [Pa] across the piston."""
-        return self.conductance * difference / LITRE_PER_MINUTE
-
     def as_dict(self) -> dict[str, Any]:
         """Convert the hold to plain JSON values; the smallest leak is a flow [L/min] at the initial p_A - p_B."""
         return {
             "duration_s": self.duration,
             "pressure_A_Pa": self.pressure_A,
             "pressure_B_Pa": self.pressure_B,
-            "smallest_leak_lpm": self._lpm(self.difference) if self.finds_a_leak else None,
+            "smallest_leak_lpm": leak_flow_lpm(self.conductance, self.difference),
             "separates": "piston from pump and rod seals",
             "healthy_days": N_HEALTHY,
         }
 
     def text(self, stated_pressure: float) -> str:
         """Format the planned hold as text, with the smallest leak's flow at the difference `stated_pressure` [Pa]."""
-        found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
+        flow = leak_flow_lpm(self.conductance, stated_pressure)
+        found = "no leak, however large" if flow is None else f"{flow:.2g} L/min"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
             "  or a locked hold: press the piston against a stop, shut the valves, stop the motor; "

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.campaigns.held import PlannedHold, has_shut_off, plan_hold
+from sealscope.campaigns.held import PlannedHold, has_shut_off, leak_flow_lpm, plan_hold
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
@@ -33,7 +33,7 @@ from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
-from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+from sealscope.units import parse_quantity
 
 _FALSE_ALARM: float = DECISION.false_alarm.probability
 #: Commands and constant loads that are tried in addition to the machine's usual duty.
@@ -102,8 +102,8 @@ class RecordingPlan(NamedTuple):
         return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Convert a leakage conductance [m^3/(s Pa)] to the leak flow [L/min] at the usual pressure; None for inf."""
-        return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+        """Compute the flow [L/min] of a leak with a conductance [m^3/(s Pa)] at the usual pressure; None for inf."""
+        return leak_flow_lpm(conductance, self.usual_pressure)
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""

@@ -112,16 +112,12 @@ def _diagnose_in_parallel(
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
     """Diagnose files in parallel processes; yield a pair (messages, dated diagnoses) for each file, in their order.
 
-    `work`: `_iter_dated_diagnoses` with its options. The messages are the text that it printed on standard error. On a
-    single core, one pair contains all files.
+    `work`: `_iter_dated_diagnoses` with its options. The messages are the text that it printed on standard error.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
-    jobs = min(cores(), len(files))
-    if jobs == 1:
-        yield "", work(files)
-        return
-    for file, result in iter_results_in_order(jobs, partial(_run_collecting_messages, work), files):
+    task = partial(_run_collecting_messages, work)
+    for file, result in iter_results_in_order(min(cores(), len(files)), task, files):
         yield result or (f"sealscope: the process that diagnosed {file} died\n", [None])
 
 

@@ -239,7 +239,7 @@ class HitMiss:
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0: a divisor below
+        width = float(np.abs(x - log_size).max())
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 
 
@@ -251,12 +251,11 @@ def _exp_size(log_size: float) -> float:
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised. If
-    the size separates hits from misses, the likelihood has no finite maximum, and Firth's penalised likelihood is used,
-    also in `HitMiss.size_bound`; `HitMiss.estimator` names the method. The curve goes to 0 for small leaks, as it does
-    not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
-    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
-    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised, or
+    Firth's penalised likelihood if the size separates hits from misses, as the likelihood has no finite maximum then.
+    The curve goes to 0 for small leaks, as it does not include the false-alarm rate. Raises InputError for a single
+    size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi
+    10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
     x, is_hit = np.log(leaks), np.asarray(hits, dtype=bool)
     if is_hit.all() or not is_hit.any():
@@ -268,23 +267,21 @@ def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     firth = _is_separated(n, k)
     # centred and scaled for the fit, so that the unit of the size does not matter
     centre, half_range = float(values.mean()), float(np.ptp(values)) / 2.0
-    design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
-    beta = _fit_coefficients(design, n, k, firth=firth)
-    # intercept and slope over ln(size), from those over the scaled logarithm
-    unscale = np.array([[1.0, -centre / half_range], [0.0, 1.0 / half_range]])
-    covariance = unscale @ np.linalg.inv(_information(design, n, design @ beta)) @ unscale.T
-    intercept, slope = (float(b) for b in unscale @ beta)
-    unscaled_design = np.column_stack([np.ones(values.size), values])
+    scaled_design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
+    scaled_intercept, scaled_slope = _fit_coefficients(scaled_design, n, k, firth=firth).tolist()
+    slope = scaled_slope / half_range
+    intercept = scaled_intercept - slope * centre
+    design, eta = np.column_stack([np.ones(values.size), values]), intercept + slope * values
     # with slope 0 Firth's penalty is ln(p(1 - p)) + constant, which acts as one more hit and one more miss
     n_added = 1.0 if firth else 0.0
     null_eta = np.full(n.size, _log_odds((k.sum() + n_added) / (n.sum() + 2.0 * n_added)))
     return HitMiss(
         intercept=intercept,
         slope=slope,
-        covariance=covariance,
+        covariance=np.asarray(np.linalg.inv(_information(design, n, eta)), dtype=np.float64),
         estimator="firth" if firth else "maximum likelihood",
-        log_likelihood=_log_likelihood(unscaled_design, n, k, intercept + slope * values, firth=firth),
-        null=_log_likelihood(unscaled_design, n, k, null_eta, firth=firth),
+        log_likelihood=_log_likelihood(design, n, k, eta, firth=firth),
+        null=_log_likelihood(design, n, k, null_eta, firth=firth),
         size=np.exp(values),
         tested=n,
         hits=k,

@@ -166,11 +166,14 @@ class RmsStream:
         stream._n_unused = require_count(state, "ahead")
         if rest is None and sums is None:  # saved before the first block
             return stream
-        leading_axes = np.shape(rest)[:-1]
-        if rest is None or sums is None or leading_axes != np.shape(sums)[:-1]:
+        try:
+            rest_shape, sums_shape = np.shape(rest), np.shape(sums)
+        except ValueError:  # rows of different lengths
+            rest_shape = sums_shape = ()
+        if not rest_shape or not sums_shape or rest_shape[:-1] != sums_shape[:-1]:
             raise InputError("saved state must have rest and sums of the same leading axes, got others")
-        stream._rest = require_numbers(state, "rest", np.shape(rest))
-        stream._sums = require_numbers(state, "sums", np.shape(sums))
+        stream._rest = require_numbers(state, "rest", rest_shape)
+        stream._sums = require_numbers(state, "sums", sums_shape)
         return stream
 
 

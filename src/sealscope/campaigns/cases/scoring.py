@@ -9,7 +9,7 @@ from pathlib import Path
 
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import case_experiment
-from sealscope.campaigns.cases.row import CaseRow, Scores, Statement, error_text, ranking_score
+from sealscope.campaigns.cases.row import CaseRow, Scores, Statement, error_text
 from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.plans.scorers import LogRms, split_log_rms
@@ -78,7 +78,7 @@ def judge_record(
                 evidence = case.evidence(detector.base)
             statement = Statement.from_evidence(evidence)
             statements[detector.name] = statement
-            score = _score_over_threshold(statement) if detector.base == DIAGNOSE else ranking_score(statement)
+            score = _score_over_threshold(statement) if detector.base == DIAGNOSE else statement.ranking_score
             scores[detector.name] = (score, statement.onset_s)
     return scores, statements
 
@@ -100,9 +100,9 @@ def _score_over_threshold(statement: Statement) -> float | None:
     """Compute the score of `diagnose` relative to its threshold: their ratio, or difference for a threshold <= 0.
 
     This makes records comparable, although the verdict of each may come from another detector with another scale.
-    Returns None if there is no threshold or no score for ranking (`ranking_score`).
+    Returns None if there is no threshold or no score for ranking.
     """
-    score, threshold = ranking_score(statement), statement.threshold
+    score, threshold = statement.ranking_score, statement.threshold
     if score is None or threshold is None:
         return None
     return score / threshold if threshold > 0 else score - threshold

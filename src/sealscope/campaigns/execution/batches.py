@@ -75,6 +75,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
+    # reversed: of equal cases the first remains
     first_cases = {repr((case.levels, case.leak_lpm, case.fault)): case for case in reversed(cases)}
     for case in first_cases.values():
         try:

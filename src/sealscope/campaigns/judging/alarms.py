@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sealscope.campaigns.cases.row import expected_cause, matches_cause, named_cause
+from sealscope.campaigns.cases.row import expected_cause, matches_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.campaigns.plans.duty import FAMILY
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
@@ -131,18 +131,17 @@ def _fraction(flags: Iterable[bool]) -> Proportion:
 
 def _summarise(detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
     """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
-    statements = [(record, record.statement) for record in group if record.statement is not None]
-    intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
-    n_named = sum(
-        record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
-        for record, statement in statements
+    statements = [(record.flow_lpm, record.statement) for record in group if record.statement is not None]
+    intervals = [(flow, statement.leak_interval_lpm) for flow, statement in statements]
+    names_fault = (
+        record.alarm and matches_cause(record.named_cause, expected_cause(record.row.fault)) for record in group
     )
     return AlarmFractions(
         detector=detector,
         alarms=_fraction(record.alarm for record in group),
         cannot_tell=_fraction(record.verdict == CANNOT_TELL for record in group),
         coverage=_fraction(interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None),
-        named=proportion(n_named, len(group)) if statements else None,
+        named=_fraction(names_fault) if statements else None,
         failed=sum(record.row.error is not None for record in group),
         **group_fields,
     )

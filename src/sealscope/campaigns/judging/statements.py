@@ -12,7 +12,6 @@ from sealscope.campaigns.cases.row import (
     Statement,
     expected_cause,
     matches_cause,
-    named_cause,
 )
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.evaluation.binomial import Proportion, proportion
@@ -101,10 +100,7 @@ def iter_cause_confusions(verdicts: Verdicts) -> Iterator[NamedCauses]:
         truth = [_true_cause(record) for record in single_cause_records]
         # rows of the matrix: the true causes, then causes that are only named
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
-        named_causes = [
-            CANNOT_TELL if record.statement is None else named_cause(record.statement)
-            for record in single_cause_records
-        ]
+        named_causes = [record.named_cause for record in single_cause_records]
         causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})
         covered = proportion(sum(map(matches_cause, named_causes, truth)), len(truth))
         yield NamedCauses(name, confusion_matrix(truth, named_causes, causes), covered)

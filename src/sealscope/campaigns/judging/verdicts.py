@@ -37,6 +37,11 @@ class JudgedRow(NamedTuple):
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
+    def named_cause(self) -> str:
+        """Cause that the detector names (`Statement.named_cause`), "cannot tell" without a statement."""
+        return CANNOT_TELL if self.statement is None else self.statement.named_cause
+
+    @property
     def alarm(self) -> bool:
         """True if the detector's verdict on the record is `leak`."""
         return self.verdict == "leak"
