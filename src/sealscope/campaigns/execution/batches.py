@@ -160,7 +160,7 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
         G, C = (coefficient, 0.0) if experiment.leaks[0].law == "laminar" else (0.0, coefficient)
         limit = longest_step(loaded_rig_numbers(experiment.rig, experiment.load), G, C)
         if experiment.step is not None and experiment.step > limit:
-            experiment = replace(experiment, step=dividing_step(experiment.rate * oversampling(experiment), limit))
+            experiment = replace(experiment, step=_dividing_step(experiment, limit))
         sized_experiments[k] = experiment
     return sized_experiments
 
@@ -200,13 +200,14 @@ def make_step_chooser(plan: SimulatedPlan) -> Callable[[CampaignCase, Experiment
             _, step = _choose_method_and_step(experiment)
         stable_step = longest_step(loaded_rig_numbers(experiment.rig, experiment.load))
         limit = max(stable_step, LONGEST_STEP / MAX_STEP_REFINEMENT)
-        return step if step <= limit else dividing_step(experiment.rate * oversampling(experiment), limit)
+        return step if step <= limit else _dividing_step(experiment, limit)
 
     return choose_step
 
 
-def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step [s] <= `limit` [s] that divides the interval 1/`rate` [s] into equal parts."""
+def _dividing_step(experiment: Experiment, limit: float) -> float:
+    """Compute the longest step [s] <= `limit` [s] that divides the time between a run's outputs into equal parts."""
+    rate = experiment.rate * oversampling(experiment)
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 

@@ -55,11 +55,6 @@ class CampaignProgress:
     failed: int
     seconds: float | None
 
-    @property
-    def complete(self) -> bool:
-        """True if every record of the plan has been run."""
-        return self.done == self.records
-
 
 def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
     """Collect the inputs on which all rows (results) of a campaign depend, as plain JSON values.

@@ -1,4 +1,4 @@
-"""Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
+"""Check the levels (values) of a plan's factors, its controllers and its faults, and parse them.
 
 A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` or `--load`.
 """
