@@ -82,15 +82,8 @@ def declared_option(name: str, *, option: str = "", several: bool = False, **set
 
 RigOption = Annotated[str, declared_option("rig", autocompletion=complete_rigs)]
 RigArgument = Annotated[str, Argument(help=_ARGUMENT_TEXTS["rig"], autocompletion=complete_rigs)]
-AssumeOption = Annotated[
-    str | None,
-    Option(
-        "--rig",
-        metavar="NAME|FILE",
-        help="What is assumed of the machine: a rig by name, or a TOML file; by default the thesis's.",
-        autocompletion=complete_rigs,
-    ),
-]
+_ASSUMED = "What is assumed of the machine: a rig by name, or a TOML file; by default the thesis's."
+AssumeOption = Annotated[str | None, Option("--rig", metavar="NAME|FILE", help=_ASSUMED, autocompletion=complete_rigs)]
 _AREA = "Area of the piston, '633 mm^2', from which L/min is computed; twice for sides A and B."
 AreaOption = Annotated[list[str] | None, Option("--area", metavar="AREA[unit]", help=_AREA)]
 _DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', from which L/min is computed if no area is stated."
@@ -101,16 +94,11 @@ SetOption = Annotated[
     list[str] | None,
     declared_option("set", several=True, metavar="NAME=VALUE[unit]", autocompletion=make_completion(_override_names)),
 ]
-MapOption = Annotated[
-    list[str] | None,
-    Option(
-        "--map",
-        metavar="CHANNEL=COLUMN",
-        help="Take a channel from a column, with its unit if neither the file nor the name has one: p_A=PG_1[psi], "
-        "x=#4[mm], or from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, "
-        "also beside others.",
-    ),
-]
+_MAP = (
+    "Take a channel from a column, with its unit if neither the file nor the name has one: p_A=PG_1[psi], x=#4[mm], or "
+    "from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, also beside others."
+)
+MapOption = Annotated[list[str] | None, Option("--map", metavar="CHANNEL=COLUMN", help=_MAP)]
 RateOption = Annotated[float | None, Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
 JoinOption = Annotated[bool, Option("--join", help="The files are parts of a single run: join them by their clocks.")]
 _BASELINE = "Leak-free recordings of the same machine."
@@ -267,9 +255,8 @@ def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]
         "rig": RigOption,
         "set": SetOption,
         "x_0": Annotated[str, declared_option("x_0", option="--start-position")],
-    }
-    special_options |= {
-        name: Annotated[list[str] | None, declared_option(name, several=True)] for name in ("leak", "fault")
+        "leak": Annotated[list[str] | None, declared_option("leak", several=True)],
+        "fault": Annotated[list[str] | None, declared_option("fault", several=True)],
     }
     options = []
     for argument in fields(Arguments):

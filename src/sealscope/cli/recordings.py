@@ -38,6 +38,8 @@ _FAIL_ON = (
     "End with status 3 where a file has this verdict, or a leak of this level (monitor, plan, repair) against --limit "
     "or worse; repeat."
 )
+_PAGE = "The page (.html, .pdf) or its card (.png), or a folder for several files."
+_SAVE_MAP = "Write the map into the file of --rig, for later calls."
 _EVERY = (
     "Cut a long log into parts of this length (1h): TARGET is a new folder for them, of NetCDF files. A text log of "
     "any size is read in bounded memory; `sealscope trend` takes the parts."
@@ -221,9 +223,7 @@ def _run_collecting_messages(
 @opt.with_machine_options()
 def report(
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings to report on.")],
-    output: Annotated[
-        Path, Option("--output", "-o", help="The page (.html, .pdf) or its card (.png), or a folder for several files.")
-    ],
+    output: Annotated[Path, Option("--output", "-o", help=_PAGE)],
     stated: opt.StatedMachine,  # built from the options that the decorator adds
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
@@ -316,9 +316,7 @@ def inspect(
     rate: opt.RateOption = None,
     join: opt.JoinOption = False,
     rig: opt.AssumeOption = None,
-    save_map: Annotated[
-        bool, Option("--save-map", help="Write the map into the file of --rig, for later calls.")
-    ] = False,
+    save_map: Annotated[bool, Option("--save-map", help=_SAVE_MAP)] = False,
 ) -> None:
     """Show the content of a file and its defects; columns without a map are recognised by their names."""
     from sealscope.parameters.load import save_channel_map
