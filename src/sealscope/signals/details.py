@@ -116,11 +116,7 @@ def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "s
 
 
 def details(
-    signal: ArrayLike,
-    *,
-    wavelet: str = "db8",
-    levels: int = 4,
-    transform: Transform = "stationary",
+    signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary"
 ) -> Details:
     """Compute the wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 

@@ -6,13 +6,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from sealscope.campaigns.cases.row import (
-    NO_CAUSE,
-    PISTON_LEAK,
-    Statement,
-    expected_cause,
-    matches_cause,
-)
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, Statement, expected_cause, matches_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.evaluation.binomial import Proportion, proportion
 from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
