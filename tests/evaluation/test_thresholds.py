@@ -15,11 +15,33 @@ from sealscope.evaluation.thresholds import quantile_threshold, records_needed
 distinct = st.lists(st.integers(-10_000, 10_000), min_size=25, max_size=120, unique=True)
 
 
-@pytest.mark.parametrize(("false_alarm", "n"), [(0.01, 99), (0.05, 19), (0.3, 3), (0.9, 1)])
-def test_the_fewest_records_make_the_highest_score_the_threshold(false_alarm, n):
-    assert records_needed(false_alarm) == n
-    assert quantile_threshold(range(n), false_alarm).rank == 1
-    assert math.floor(false_alarm * n) == 0  # one record less: no score is high enough
+@pytest.mark.parametrize(
+    ("false_alarm", "confidence", "n"),
+    [
+        (0.05, 0.95, 59),
+        (0.01, 0.95, 299),
+        (0.10, 0.90, 22),
+        (0.01, 0.99, 459),
+        (0.01, 0.50, 69),
+        (0.01, None, 99),
+        (0.05, None, 19),
+        (0.3, None, 3),
+    ],
+)
+def test_wilks_s_numbers(false_alarm, confidence, n):
+    """Wilks, Ann. Math. Stat. 12 (1941) 91-96; the one-sided number 59 for 95/95 is that of reactor safety (Guba, Makai
+    and Pal, Reliab. Eng. Syst. Saf. 80 (2003) 217-232)."""
+    promise = "average" if confidence is None else "bound"
+    assert records_needed(false_alarm, confidence or 0.95, promise) == n
+    assert quantile_threshold(range(n), false_alarm, confidence or 0.95, promise).rank == 1
+
+
+@settings(deadline=None)
+@given(st.floats(1e-4, 0.6), st.floats(0.01, 0.999))
+def test_the_fewest_records_are_those_of_the_beta_distribution(false_alarm, confidence):
+    n = records_needed(false_alarm, confidence, "bound")
+    assert stats.beta.cdf(false_alarm, 1, n) >= confidence * (1 - 1e-9)
+    assert n == 1 or stats.beta.cdf(false_alarm, 1, n - 1) < confidence * (1 + 1e-9)
 
 
 def at_most(threshold, false_alarm):
@@ -33,6 +55,9 @@ def test_the_rank_by_hand():
     assert (result.value, result.rank, result.n) == (190.0, 10, 199)
     assert result.expected == pytest.approx(0.05)
     assert np.count_nonzero(scores > result.value) == 9
+    sure = quantile_threshold(scores, 0.05, promise="bound")
+    assert sure.rank == 5
+    assert at_most(sure, 0.05) >= 0.95 > at_most(result, 0.05)
 
 
 def test_the_true_probability_is_beta_distributed():
@@ -46,6 +71,12 @@ def test_the_true_probability_is_beta_distributed():
     assert true.var() == pytest.approx(k * (n + 1 - k) / ((n + 1) ** 2 * (n + 2)), rel=0.1)
     assert np.mean((result[0].low <= true) & (true <= result[0].high)) == pytest.approx(0.9, abs=0.02)
     assert np.mean(true <= 0.05) == pytest.approx(at_most(result[0], 0.05), abs=0.03)
+
+
+def test_the_bound_is_held_as_often_as_promised():
+    rng = np.random.default_rng(3)
+    true = np.array([1.0 - quantile_threshold(rng.random(150), 0.05, 0.9, "bound").value for _ in range(1500)])
+    assert 0.885 <= np.mean(true <= 0.05) <= 0.96
 
 
 @settings(deadline=None)

@@ -58,8 +58,9 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
     judgement = judge(
-        rows, plan.detectors, false_alarm=plan.false_alarm, onset_s=plan.onset_s, hours=plan.duration_s / 3600.0
-    )
+        rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence,
+        onset_s=plan.onset_s, hours=plan.duration_s / 3600.0,
+    )  # fmt: skip
     mode = str(store.read_head(folder).get("mode", store.RUN_BY_RUN))
     return CampaignResult(plan, rows, plan.size - len(rows), judgement, prior_knowledge(plan), mode)
 
@@ -69,7 +70,9 @@ def judge_recorded_campaign(
 ) -> CampaignResult:
     """Judge the recordings in a folder with the detectors of a plan; `progress` is called after each recording."""
     rows = judge_recordings(plan, folder, progress)
-    judgement = judge(rows, plan.detectors, false_alarm=plan.false_alarm)
+    judgement = judge(
+        rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence
+    )
     return CampaignResult(plan, tuple(rows), missing=0, judgement=judgement, known=prior_knowledge(plan))
 
 

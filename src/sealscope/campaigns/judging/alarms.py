@@ -69,7 +69,9 @@ def add_references(verdicts: Verdicts) -> Verdicts:
     return {**verdicts, **references}
 
 
-def alarms_by_size(verdicts: Verdicts, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
+def alarms_by_size(
+    verdicts: Verdicts, confidence: float, hours: float | None, pooled: bool = False
+) -> Iterator[AlarmFractions]:
     """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
     The size is the planned mean flow. If all records are leak-free, each detector has one result: 0 alarms of 0
@@ -78,33 +80,35 @@ def alarms_by_size(verdicts: Verdicts, hours: float | None, pooled: bool = False
     for name, records in verdicts.items():
         leak_free = [record for record in records if not record.size]
         leaky = [record for record in records if record.size]
-        false_alarm = _fraction(record.alarm for record in leak_free) if leak_free else None
-        per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n) if false_alarm and hours else None
+        false_alarm = _fraction((record.alarm for record in leak_free), confidence) if leak_free else None
+        per_hour = None
+        if false_alarm and hours:
+            per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, confidence)
         groups = group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size)
         for size, group in groups.items():
-            fractions = _summarise(name, group, leak_lpm=size)
-            detected = fractions.alarms if leaky else _fraction(())  # 0 of 0
+            fractions = _summarise(name, group, confidence, leak_lpm=size)
+            detected = fractions.alarms if leaky else _fraction((), confidence)  # 0 of 0
             yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
 
-def alarms_by_cell(verdicts: Verdicts) -> Iterator[AlarmFractions]:
+def alarms_by_cell(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
     """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels."""
     for name, records in verdicts.items():
         # levels as text, since mixed types cannot be sorted
         cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
         for (size, _), group in cells.items():
-            yield _summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
+            yield _summarise(name, group, confidence, leak_lpm=size, levels=dict(group[0].row.levels))
 
 
-def alarms_by_fault(verdicts: Verdicts) -> Iterator[AlarmFractions]:
+def alarms_by_fault(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
     """Yield each detector's fraction of alarms for each fault without a piston leak."""
     for name, records in verdicts.items():
         faulty = (record for record in records if record.row.fault and record.size == 0)
         for fault, group in group_by(faulty, lambda record: record.row.fault).items():
-            yield _summarise(name, group, fault=fault)
+            yield _summarise(name, group, confidence, fault=fault)
 
 
-def alarms_by_family(verdicts: Verdicts) -> Iterator[AlarmFractions]:
+def alarms_by_family(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
     """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
     The results of all families together come first. A size that occurs with several laws also has a result for all laws
@@ -120,16 +124,16 @@ def alarms_by_family(verdicts: Verdicts) -> Iterator[AlarmFractions]:
                 laws = group_by(group, lambda record: record.row.law) if size else {}  # size 0: leak-free
                 by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}
                 for law, law_records in by_law.items():
-                    yield _summarise(name, law_records, family=family, leak_lpm=size, law=law)
+                    yield _summarise(name, law_records, confidence, family=family, leak_lpm=size, law=law)
 
 
-def _fraction(flags: Iterable[bool]) -> Proportion:
+def _fraction(flags: Iterable[bool], confidence: float) -> Proportion:
     """Compute the fraction of flags that are True, with its confidence interval."""
     values = list(flags)
-    return proportion(sum(values), len(values))
+    return proportion(sum(values), len(values), confidence)
 
 
-def _summarise(detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
+def _summarise(detector: str, group: Sequence[JudgedRow], confidence: float, **group_fields: Any) -> AlarmFractions:
     """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
     statements = [(record.flow_lpm, record.statement) for record in group if record.statement is not None]
     intervals = [(flow, statement.leak_interval_lpm) for flow, statement in statements]
@@ -138,10 +142,12 @@ def _summarise(detector: str, group: Sequence[JudgedRow], **group_fields: Any) -
     )
     return AlarmFractions(
         detector=detector,
-        alarms=_fraction(record.alarm for record in group),
-        cannot_tell=_fraction(record.verdict == CANNOT_TELL for record in group),
-        coverage=_fraction(interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None),
-        named=_fraction(names_fault) if statements else None,
+        alarms=_fraction((record.alarm for record in group), confidence),
+        cannot_tell=_fraction((record.verdict == CANNOT_TELL for record in group), confidence),
+        coverage=_fraction(
+            (interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None), confidence
+        ),
+        named=_fraction(names_fault, confidence) if statements else None,
         failed=sum(record.row.error is not None for record in group),
         **group_fields,
     )

@@ -42,7 +42,7 @@ class SizeRoc:
     area: Area
 
 
-def iter_pods(verdicts: Verdicts) -> Iterator[DetectorPod]:
+def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
     """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks."""
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
@@ -50,7 +50,7 @@ def iter_pods(verdicts: Verdicts) -> Iterator[DetectorPod]:
             continue
         sizes = [record.size for record in leaky]
         hits = [record.alarm for record in leaky]
-        detections = detection_by_size(sizes, hits)
+        detections = detection_by_size(sizes, hits, confidence)
         try:
             curve = fit_hit_miss(sizes, hits)
             description: str = curve.estimator
@@ -59,7 +59,7 @@ def iter_pods(verdicts: Verdicts) -> Iterator[DetectorPod]:
         yield DetectorPod(name, tuple(detections), curve, description, proven_size(detections))
 
 
-def iter_rocs(verdicts: Verdicts) -> Iterator[SizeRoc]:
+def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
     """Yield ROC curves of each detector that has scores: for all leaks together, and for each planned mean flow.
 
     A record without a score is ranked below all others. A curve needs at least two records with a leak and two without.
@@ -76,4 +76,4 @@ def iter_rocs(verdicts: Verdicts) -> Iterator[SizeRoc]:
         all_scores = [score for leaky in by_leak.values() for score in leaky]
         for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes
             if min(len(leak_free), len(leaky)) > 1:
-                yield SizeRoc(name, size, roc_curve(leak_free, leaky), auc(leak_free, leaky))
+                yield SizeRoc(name, size, roc_curve(leak_free, leaky, confidence), auc(leak_free, leaky, confidence))

@@ -33,6 +33,7 @@ from sealscope.campaigns.judging.verdicts import (
     group_by,
 )
 from sealscope.errors import InputError
+from sealscope.evaluation.thresholds import Promise
 
 
 @dataclass(frozen=True)
@@ -73,6 +74,8 @@ def judge(
     detectors: Sequence[str],
     *,
     false_alarm: float = 0.01,
+    promise: Promise = "average",
+    confidence: float = 0.95,
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
@@ -83,14 +86,15 @@ def judge(
     are followed by two references, which always or never raise an alarm. Raises InputError if there is no row to judge,
     or too few leak-free rows to set a threshold.
 
-    - `false_alarm`: false-alarm probability that the thresholds keep on average over sets of leak-free records
+    - `false_alarm`, `promise`: wanted false-alarm probability, and how the thresholds keep it (`Promise`)
+    - `confidence`: probability for the promise "bound", and confidence level of all intervals
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
     - `hours`: operating time of a record [h], None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    thresholds = compute_thresholds(rows, detectors, false_alarm)
+    thresholds = compute_thresholds(rows, detectors, false_alarm, promise, confidence)
     verdicts = collect_verdicts(judged, detectors, thresholds)
     leak_verdicts = drop_other_faults(verdicts)
     compared_verdicts = add_references(leak_verdicts)
@@ -99,16 +103,16 @@ def judge(
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(alarms_by_size(compared_verdicts, hours)),
-        overall=tuple(alarms_by_size(compared_verdicts, hours, pooled=True)),
-        onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s)),
-        flows=tuple(flow_errors(leak_verdicts)),
-        causes=tuple(iter_cause_confusions(verdicts)),
-        pods=tuple(iter_pods(leak_verdicts)),
-        rocs=tuple(iter_rocs(leak_verdicts)),
-        cells=tuple(alarms_by_cell(leak_verdicts)),
-        faults=tuple(alarms_by_fault(add_references(verdicts))),
-        families=tuple(alarms_by_family(leak_verdicts)),
+        table=tuple(alarms_by_size(compared_verdicts, confidence, hours)),
+        overall=tuple(alarms_by_size(compared_verdicts, confidence, hours, pooled=True)),
+        onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s, confidence)),
+        flows=tuple(flow_errors(leak_verdicts, confidence)),
+        causes=tuple(iter_cause_confusions(verdicts, confidence)),
+        pods=tuple(iter_pods(leak_verdicts, confidence)),
+        rocs=tuple(iter_rocs(leak_verdicts, confidence)),
+        cells=tuple(alarms_by_cell(leak_verdicts, confidence)),
+        faults=tuple(alarms_by_fault(add_references(verdicts), confidence)),
+        families=tuple(alarms_by_family(leak_verdicts, confidence)),
         achieved_flows=_achieved_flows([row for row in judged if not row.fault]),
     )
 

@@ -39,7 +39,7 @@ class NamedCauses:
     covered: Proportion
 
 
-def onset_errors(verdicts: Verdicts, onset_s: float) -> Iterator[StatedErrors]:
+def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
     Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks.
@@ -51,15 +51,15 @@ def onset_errors(verdicts: Verdicts, onset_s: float) -> Iterator[StatedErrors]:
             if record.alarm and statement.onset_s is not None
         ]
         if size > 0 and estimates:
-            yield StatedErrors(name, size, _errors(estimates))
+            yield StatedErrors(name, size, _errors(estimates, confidence))
 
 
-def flow_errors(verdicts: Verdicts) -> Iterator[StatedErrors]:
+def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors of the leak flows [L/min] that detectors state, by detector and planned mean flow (`size`)."""
     for name, size, group in _iter_stating(verdicts):
         estimates = [(statement.leak_lpm, record.flow_lpm, statement.leak_interval_lpm) for record, statement in group]
         if any(flow is not None for flow, _, _ in estimates):
-            yield StatedErrors(name, size, _errors(estimates))
+            yield StatedErrors(name, size, _errors(estimates, confidence))
 
 
 def _iter_stating(verdicts: Verdicts) -> Iterator[tuple[str, float, list[tuple[JudgedRow, Statement]]]]:
@@ -70,17 +70,19 @@ def _iter_stating(verdicts: Verdicts) -> Iterator[tuple[str, float, list[tuple[J
             yield name, size, group
 
 
-def _errors(estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]]) -> EstimateErrors:
+def _errors(
+    estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]], confidence: float
+) -> EstimateErrors:
     """Compute the errors of estimates, given as (estimate or None, true value, interval or None) of each record."""
     numbers = [
         (math.nan if value is None else value, true_value, *(interval or (math.nan, math.nan)))
         for value, true_value, interval in estimates
     ]
     values, true_values, low, high = zip(*numbers, strict=True)
-    return estimate_errors(values, true_values, low, high)
+    return estimate_errors(values, true_values, low, high, confidence)
 
 
-def iter_cause_confusions(verdicts: Verdicts) -> Iterator[NamedCauses]:
+def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
     """Yield the confusion matrix of true and named causes for each detector that names causes.
 
     A record with a leak and another fault has two true causes and is left out. A record without a result counts as
@@ -96,8 +98,8 @@ def iter_cause_confusions(verdicts: Verdicts) -> Iterator[NamedCauses]:
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
         named_causes = [record.named_cause for record in single_cause_records]
         causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})
-        covered = proportion(sum(map(matches_cause, named_causes, truth)), len(truth))
-        yield NamedCauses(name, confusion_matrix(truth, named_causes, causes), covered)
+        covered = proportion(sum(map(matches_cause, named_causes, truth)), len(truth), confidence)
+        yield NamedCauses(name, confusion_matrix(truth, named_causes, causes, confidence), covered)
 
 
 def _true_cause(record: JudgedRow) -> str:

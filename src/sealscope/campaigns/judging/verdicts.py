@@ -9,7 +9,7 @@ from sealscope.campaigns.cases.row import CaseRow, Statement, duty_label
 from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.errors import InputError
 from sealscope.evaluation.table import CANNOT_TELL
-from sealscope.evaluation.thresholds import Threshold, quantile_threshold, records_needed
+from sealscope.evaluation.thresholds import Promise, Threshold, quantile_threshold, records_needed
 
 _T = TypeVar("_T")
 #: Thresholds by (detector, duty), each set from leak-free records of that duty (`duty_label`).
@@ -51,18 +51,20 @@ class JudgedRow(NamedTuple):
 Verdicts: TypeAlias = Mapping[str, Sequence[JudgedRow]]
 
 
-def compute_thresholds(rows: Iterable[CaseRow], detectors: Sequence[str], false_alarm: float) -> Thresholds:
+def compute_thresholds(
+    rows: Iterable[CaseRow], detectors: Sequence[str], false_alarm: float, promise: Promise, confidence: float
+) -> Thresholds:
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free records.
 
-    A record without a score, which raises no alarm, counts as the lowest score of its duty. Raises InputError if a
-    scorer needs a threshold and no duty has enough records.
+    A record without a score, which raises no alarm, counts as the lowest score of its duty. The last three arguments
+    are those of `judge`. Raises InputError if a scorer needs a threshold and no duty has enough records.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
     for row in rows:
         if row.use == "calibrate" and row.error is None:
             leak_free.setdefault(duty_label(row.levels), []).append(row)
-    needed = records_needed(false_alarm)
+    needed = records_needed(false_alarm, confidence, promise)
     max_rows = max(map(len, leak_free.values()), default=0)
     if scorers and max_rows < needed:
         raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {max_rows}")
@@ -72,7 +74,7 @@ def compute_thresholds(rows: Iterable[CaseRow], detectors: Sequence[str], false_
             scores = [score for row in group if (score := row.score(name)) is not None]
             if scores and len(group) >= needed:
                 scores += [min(scores)] * (len(group) - len(scores))  # for the records without a score
-                thresholds[name, duty] = quantile_threshold(scores, false_alarm)
+                thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds
 
 

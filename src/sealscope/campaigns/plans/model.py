@@ -10,10 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
+from sealscope.evaluation.thresholds import Promise
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS
 from sealscope.simulation.bench.profile import Profile, load_profile
@@ -74,6 +75,7 @@ def _validate_view_name(name: str) -> str:
 
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Fraction = Annotated[Number, Field(gt=0, lt=1)]
 Count = Annotated[int, Field(strict=True, ge=0)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(pattern=r"^[^\n]*$")]
@@ -121,7 +123,8 @@ class _Plan(_TomlTable):
 
     - `name`: name of the plan and of its files; `title`: by default the name; `note`: remark of the author
     - `place`: path of the plan's file
-    - `false_alarm`: wanted false-alarm probability of each detector
+    - `confidence`: confidence level of all intervals, such as 0.95
+    - `false_alarm`, `promise`: wanted false-alarm probability of each detector, and how thresholds keep it (`Promise`)
     - `detectors`: names in the forms that the module `plans.detectors` lists
     - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
@@ -132,11 +135,11 @@ class _Plan(_TomlTable):
 
     name: FileName
     title: Text = ""
-    #: Confidence level of all intervals.
-    confidence: ClassVar[float] = 0.95
+    confidence: Fraction = 0.95
     note: Text = ""
     place: str = ""
-    false_alarm: Annotated[Number, Field(ge=1e-15, lt=1)] = 0.01  # no number of records shows a smaller one
+    false_alarm: Annotated[Fraction, Field(ge=1e-15)] = 0.01  # no number of records shows a smaller one
+    promise: Promise = "average"
     detectors: Names
     unit: Text = "L/min"
     views: Mapping[Annotated[str, AfterValidator(_validate_view_name)], Channels] = field(default_factory=dict)

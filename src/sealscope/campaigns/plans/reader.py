@@ -194,7 +194,7 @@ def _check_records(plan: SimulatedPlan) -> None:
     if not any(parse_detector_name(name).needs_threshold for name in plan.detectors):
         return
     count = sum(group.count for group in plan.records if group.use == "calibrate")
-    needed = records_needed(plan.false_alarm)
+    needed = records_needed(plan.false_alarm, plan.confidence, plan.promise)
     n_commands = len(plan.factors.get(COMMAND, ("",)))  # 1 without this factor
     if count < needed * n_commands:
         per_command = f" ({needed} for each of {n_commands} commands)" if n_commands > 1 else ""
