@@ -13,7 +13,7 @@ from typing import get_args
 
 import pytest
 
-from sealscope.campaigns.cases.row import CaseRow, expected_cause, ranking_score
+from sealscope.campaigns.cases.row import CaseRow, Statement, expected_cause
 from sealscope.campaigns.execution import run as campaign
 from sealscope.campaigns.execution.store import read_rows
 from sealscope.campaigns.judging.judge import judge
@@ -160,7 +160,7 @@ def test_the_fused_verdict_is_that_of_diagnose(plan, done):
             said = row.statements[key]
             assert (said.verdict, said.cause, said.onset_s) == (outcome.verdict, outcome.cause, outcome.onset_s)
             assert said.score == pytest.approx(outcome.score)
-            if ranking_score(said) is not None:
+            if said.ranking_score is not None:
                 beyond = (
                     outcome.score / outcome.threshold if outcome.threshold > 0 else outcome.score - outcome.threshold
                 )
@@ -297,8 +297,8 @@ def test_channels_restrict_those_that_name_no_view(plan, tmp_path):
 
 
 def row(number, verdict, leak=0.0, fault="", cause=None, use="judge", **stated):
-    said = Evidence(verdict, "", 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
-    scores = {"watcher": (ranking_score(said), said.onset_s)}
+    said = Statement(verdict, 4.0 if verdict == "leak" else 1.0, 3.0, cause=cause, **stated)
+    scores = {"watcher": (said.ranking_score, said.onset_s)}
     inputs = {"id": f"{number:04x}", "use": use, "leak_lpm": leak, "fault": fault, "levels": {}, "replicate": number}
     return CaseRow(**inputs, flow_lpm=leak, scores=scores, statements={"watcher": said})
 

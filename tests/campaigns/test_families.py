@@ -6,12 +6,11 @@ import pytest
 
 from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.machines import case_leaks
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, Statement
 from sealscope.campaigns.judging.alarms import ALL, ANY_LAW
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.judging.tables import build_tables
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.reporting.campaign.page_tables import page_tables
 
 from ..refusals import refusal
@@ -20,10 +19,10 @@ NAME = "diagnose"
 
 
 def row(number, family, verdict, leak=0.0, law="laminar", interval=None, error=None):
-    evidence = Evidence(verdict, "", 1.0, 2.0, leak_lpm=leak, leak_interval_lpm=interval)
+    statement = Statement(verdict, 1.0, 2.0, leak_lpm=leak, leak_interval_lpm=interval)
     return CaseRow(
         id=f"{number:016x}", use="judge", leak_lpm=leak, fault="", levels={"family": family}, replicate=number,
-        flow_lpm=leak, statements={} if error else {NAME: evidence}, scores={} if error else {NAME: (1.0, None)},
+        flow_lpm=leak, statements={} if error else {NAME: statement}, scores={} if error else {NAME: (1.0, None)},
         law=law, error=error,
     )  # fmt: skip
 
@@ -57,7 +56,7 @@ def test_each_family_is_counted_by_hand():
 
 
 def test_the_table_says_which_half_it_is():
-    families = build_tables(judge(ROWS, [NAME]), part="held out")["families"]
+    families = build_tables(judge(ROWS, [NAME]), "L/min", {}, part="held out")["families"]
     assert {line["part"] for line in families} == {"held out"}
     assert {line["family"] for line in families} == {ALL, "hoses", "mass"}
 

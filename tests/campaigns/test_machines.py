@@ -11,6 +11,7 @@ from sealscope.campaigns.cases.scoring import run_case
 from sealscope.campaigns.plans.duty import parse_plan_fault, parse_throttle_values
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.simulation.bench import profile
+from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.simulate import simulate_experiment
 
 from ..refusals import refusal
@@ -77,8 +78,8 @@ def test_a_profile_is_known_by_what_it_says(tmp_path):
     copy, other = tmp_path / "copy.toml", tmp_path / "other.toml"
     copy.write_text(text, encoding="utf-8")
     other.write_text(text.replace("[550, 800]", "[551, 800]"), encoding="utf-8")
-    assert profile_key(str(copy)) == profile_key("bench")
-    assert profile_key(str(other)) != profile_key("bench")
+    assert profile_key(load_profile(copy)) == profile_key(load_profile("bench"))
+    assert profile_key(load_profile(other)) != profile_key(load_profile("bench"))
 
 
 def test_a_profile_beside_the_plan_is_found(text, tmp_path):

@@ -46,7 +46,7 @@ def once(tiny, finished_tiny):
 def test_processes_make_the_same_bytes(once, tmp_path):
     plan, expected = once
     assert {"records.csv", "table.csv", "pod.csv", "cells.csv", "thresholds.csv"} <= set(expected)
-    assert campaign.run(plan, tmp_path / "two", jobs=2).complete
+    assert campaign.run(plan, tmp_path / "two", jobs=2).done == 26
     assert files_of(plan, tmp_path / "two") == expected
 
 
@@ -82,7 +82,7 @@ def test_killed_twice_it_goes_on_to_the_same_bytes(once, tiny, tmp_path):
     before = store.read_progress(plan, folder)
     assert 12 <= before.done < 26
     reported = []
-    assert campaign.run(plan, folder, jobs=2, progress=lambda *words: reported.append(words)).complete
+    assert campaign.run(plan, folder, jobs=2, progress=lambda *words: reported.append(words)).done == 26
     assert reported[0] == (before.done, 26, 0)
     assert files_of(plan, folder) == expected
     ids = [json.loads(line)["id"] for line in (folder / ROWS).read_bytes().splitlines()]
@@ -139,7 +139,7 @@ def test_on_a_cluster_the_same_bytes(once, tmp_path):
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None, silence_logs=50
     ) as cluster:
-        assert campaign.run(plan, tmp_path / "cluster", cluster=cluster.scheduler_address).complete
+        assert campaign.run(plan, tmp_path / "cluster", cluster=cluster.scheduler_address).done == 26
     assert files_of(plan, tmp_path / "cluster") == expected
 
 
@@ -168,14 +168,16 @@ def break_some(plan, case, folder=None):
 
 @pytest.mark.slow
 @pytest.mark.long
-def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path):
+def test_a_failed_case_is_a_row_with_its_error(tiny, tmp_path, monkeypatch):
     plan = load_plan(tiny)
     bad = sum(doomed(case) for case in list_cases(plan))
     assert 0 < bad < 16
-    state = campaign.run(plan, tmp_path / "bad", jobs=1, task=break_some)
+    monkeypatch.setattr(campaign, "run_case", break_some)
+    state = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert (state.done, state.failed) == (26, bad)
     again = campaign.run(plan, tmp_path / "bad", jobs=1)
     assert again.failed == bad
+    monkeypatch.undo()
     result = judge_simulated_campaign(plan, tmp_path / "bad")
     assert {row.error for row in result.judgement.failed} == {"the run diverged"}
     outcome = [row for row in result.judgement.table if row.detector == "d3 of p_A changed"]
@@ -191,7 +193,8 @@ def test_a_case_that_kills_its_process_costs_no_other(once, tmp_path, monkeypatc
     monkeypatch.syspath_prepend(Path(__file__).parent)
     die_on_one = import_module("dying_task").die_on_one
     plan, _ = once
-    state = campaign.run(plan, tmp_path / "dead", jobs=2, task=die_on_one)
+    monkeypatch.setattr(campaign, "run_case", die_on_one)
+    state = campaign.run(plan, tmp_path / "dead", jobs=2)
     assert (state.done, state.failed) == (26, 1)
     rows = store.read_plan_rows(plan, tmp_path / "dead")
     assert [row.error for row in rows.values() if row.error] == ["the process that ran the record died"]
@@ -251,7 +254,7 @@ def test_another_detector_is_added_to_what_is_there(finished_tiny, text, tmp_pat
     more.write_text(text.replace('"d3 of p_A changed"', '"d4 of p_A changed"'), encoding="utf-8")
     assert store.read_progress(load_plan(more), folder).done == 0
     campaign.run(load_plan(more), folder, jobs=1)
-    assert store.read_progress(load_plan(more), folder).complete
+    assert store.read_progress(load_plan(more), folder).done == 26
 
 
 def test_two_at_once_are_refused(tiny, tmp_path):

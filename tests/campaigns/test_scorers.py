@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.campaigns.plans.scorers import SCORERS, SplitRms
+from sealscope.campaigns.plans.scorers import SCORERS, split_log_rms
 from sealscope.recordings.recording import Recording
 
 
@@ -20,19 +20,19 @@ def noise_record(seed, n):
 
 
 def middle(recording):
-    return SplitRms.from_recording(recording, float(recording.t[0]) + recording.duration / 2)
+    return split_log_rms(recording, float(recording.t[0]) + recording.duration / 2)
 
 
 def score(name, recording):
-    return SCORERS[name].score(middle(recording))
+    return SCORERS[name].score(middle(recording), recording.channels)
 
 
 def test_every_scorer_is_finite_or_none():
     long, short = middle(noise_record(1, 4000)), middle(noise_record(2, 100))
     for name, scorer in SCORERS.items():
         assert scorer.name == name and scorer.description
-        assert math.isfinite(scorer.score(long))
-        assert scorer.score(short) is None
+        assert math.isfinite(scorer.score(long, ("p_A", "p_B")))
+        assert scorer.score(short, ("p_A", "p_B")) is None
         assert (scorer.threshold == 0.0) == name.startswith("sign rule")
 
 
@@ -65,8 +65,8 @@ def test_nothing_beyond_the_split_is_seen_before_it():
     def with_burst(at):
         burst = plain["p_A"].copy()
         burst[at : at + 100] += 50.0 * (-1.0) ** np.arange(100)
-        return middle(replace(plain, channels={**plain.channels, "p_A": burst})).log_rms["p_A"]
+        return middle(replace(plain, channels={**plain.channels, "p_A": burst}))["p_A"]
 
-    before = middle(plain).log_rms["p_A"]
+    before = middle(plain)["p_A"]
     assert np.array_equal(before[0], with_burst(4000)[0])
     assert with_burst(4400)[1][0] > before[1][0] + 0.5

@@ -65,8 +65,9 @@ def test_the_shortest_recording_that_finds_it_is_planned(
     monkeypatch: pytest.MonkeyPatch, rig: Rig, minute: DetectableLeak
 ) -> None:
     monkeypatch.setattr(smallest, "DURATIONS", (30.0, 45.0, 60.0))
+    monkeypatch.setattr(smallest, "COMMANDS", ())
     wanted = 1.1 * minute.conductance * minute.pressure
-    plan = plan_recording(rig, wanted, usual=DUTY, duties=[])
+    plan = plan_recording(rig, wanted, usual=DUTY)
     assert plan.finds and 30.0 <= plan.for_detection.duration <= 60.0
     lines = plan.text().splitlines()
     assert lines[0].startswith(f"{wanted / LITRE_PER_MINUTE:.2g} L/min") and "3 sin(4t) for" in lines[0]
@@ -78,7 +79,9 @@ def test_the_shortest_recording_that_finds_it_is_planned(
 @pytest.mark.slow
 def test_a_leak_that_no_recording_finds_is_said_so(monkeypatch: pytest.MonkeyPatch, rig: Rig) -> None:
     monkeypatch.setattr(smallest, "DURATIONS", (20.0,))
-    plan = plan_recording(rig, 1e-12, usual=DUTY, duties=[PlannedDuty("11 sin(4t)")])
+    monkeypatch.setattr(smallest, "COMMANDS", ("11 sin(4t)",))
+    monkeypatch.setattr(smallest, "LOADS", ("",))
+    plan = plan_recording(rig, 1e-12, usual=DUTY)
     assert not plan.finds and "not found; the best is 3 sin(4t) for 20 s" in plan.text()
     assert "must stay within +-10 V" in plan.compared[1].note and plan.as_dict()["compared"][1]["pressure_Pa"] is None
     assert f"left out: 11 sin(4t): {plan.compared[1].note}" in " ".join(plan.text().split())  # nothing is cut
@@ -94,4 +97,4 @@ def test_what_is_no_command_is_refused(rig: Rig) -> None:
     with refusal("command", "voltage"):
         duty_experiment(rig, PlannedDuty("position 20 mm sin(2t)"), 20.0)
     with refusal("duty", "balance"):
-        plan_recording(rig, usual=PlannedDuty("11 sin(4t)"), duties=[])
+        plan_recording(rig, usual=PlannedDuty("11 sin(4t)"))

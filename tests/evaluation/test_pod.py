@@ -37,7 +37,7 @@ def test_the_challenger_s_o_rings():
     assert fit.estimator == "maximum likelihood"
     assert math.log(fit.a50) == pytest.approx(15.0429 / 0.232163, abs=1e-3)
     assert math.log(fit.a90) == pytest.approx((15.0429 + math.log(9)) / 0.232163, abs=1e-3)
-    assert 1 - fit.detection(math.exp(31.0))[0] == pytest.approx(0.9996, abs=5e-5)
+    assert 1 - fit.detection(math.exp(31.0)) == pytest.approx(0.9996, abs=5e-5)
 
 
 def test_without_a_rise_there_is_no_bound():
@@ -71,7 +71,7 @@ def test_the_bound_is_that_of_the_band_on_many_records():
     assert fit.a90 == pytest.approx(0.009, rel=0.05)
     assert fit.a90 < fit.a90_95 < 1.1 * fit.a90
     low, _ = fit.detection_band(fit.a90_95, 0.90)
-    assert low[0] == pytest.approx(0.9, abs=1e-3)
+    assert low == pytest.approx(0.9, abs=1e-3)
 
 
 @pytest.mark.slow
@@ -98,7 +98,7 @@ def test_sizes_rise_with_probability_and_confidence(seed):
     assert fit.a50 < fit.a90
     assert fit.a90 <= fit.size_bound(0.9, 0.8) <= fit.a90_95 <= fit.size_bound(0.95)
     assert np.all(np.diff(fit.detection(SIZES)) > 0)
-    assert fit.detection(fit.a90)[0] == pytest.approx(0.9)
+    assert fit.detection(fit.a90) == pytest.approx(0.9)
 
 
 def test_firth_s_fit_is_half_a_count_more_in_a_table_of_two_sizes():

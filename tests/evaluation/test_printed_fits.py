@@ -46,7 +46,7 @@ def test_the_fiducial_limits_of_a_printed_logit_analysis():
         (0.02, (-0.75158, -0.11175, 0.12404)),
         (0.03, (-0.62018, -0.04212, 0.17265)),
     ):
-        limits = [brentq(lambda at, end=end, p=p: fit.detection_band(10**at)[end][0] - p, -4, 2) for end in (1, 0)]
+        limits = [brentq(lambda at, end=end, p=p: fit.detection_band(10**at)[end] - p, -4, 2) for end in (1, 0)]
         assert [limits[0], math.log10(fit.size_at(p)), limits[1]] == pytest.approx(printed, abs=6e-6)
 
 

@@ -17,6 +17,7 @@ from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 
@@ -362,7 +363,8 @@ def campaigns(folder: Path) -> Use:
 
     def work() -> None:
         store.read_progress(plan, given)
-        run(plan, given, jobs=1, task=_unmade)
+        with mock.patch("sealscope.campaigns.execution.run.run_case", _unmade):
+            run(plan, given, jobs=1)
         result = judge_simulated_campaign(plan, given)
         write_result(result, given)
         campaign_text(result)

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.campaigns.cases.row import CaseRow
+from sealscope.campaigns.cases.row import CaseRow, Statement
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import CampaignResult, prior_knowledge
@@ -129,7 +129,7 @@ def campaign_result(tmp_path_factory):
 
     def row(number: int, score: float, leak: float = 0.0, fault: str = "", cause: str | None = None) -> CaseRow:
         verdict = "leak" if score > 3.0 else "no leak"
-        said = Evidence(verdict, "", score, 3.0, cause=cause if verdict == "leak" else None)
+        said = Statement(verdict, score, 3.0, cause=cause if verdict == "leak" else None)
         return CaseRow(
             id=f"{number:016x}",
             use="judge",

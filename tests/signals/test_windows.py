@@ -163,5 +163,6 @@ def test_bad_input_is_one_clear_line():
         stream.update(1.0)
     with refusal("'size'"):
         RmsStream.from_state({})
-    with refusal("axes"):
-        RmsStream.from_state({**stream.state_dict(), "sums": None})
+    for wrong in ({"sums": None}, {"rest": 1.0, "sums": 2.0}, {"rest": [[1.0], [2.0, 3.0]]}):
+        with refusal("axes"):
+            RmsStream.from_state({**stream.state_dict(), **wrong})

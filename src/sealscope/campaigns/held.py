@@ -42,6 +42,11 @@ _N_DRAWS, _N_BISECTIONS = 5, 8
 _TRIED_DECAYS = (1e-4, 10.0)
 
 
+def leak_flow_lpm(conductance: float, pressure: float) -> float | None:
+    """Convert a leak's conductance [m^3/(s Pa)] to its flow [L/min] at a pressure difference [Pa]; None for inf."""
+    return conductance * pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+
+
 class PlannedHold(NamedTuple):
     """A locked hold, in which valves shut the cylinder off from its pump, and the smallest piston leak that it finds.
 
@@ -52,21 +57,12 @@ class PlannedHold(NamedTuple):
     duration: float
     pressure_A: float
     pressure_B: float
-    conductance: float
+    conductance: float = np.inf
 
     @property
     def difference(self) -> float:
         """Pressure difference across the piston at the beginning of the hold [Pa]."""
         return self.pressure_A - self.pressure_B
-
-    @property
-    def finds_a_leak(self) -> bool:
-        """True if some leak is found with the wanted probability, i.e. `conductance` is finite."""
-        return bool(np.isfinite(self.conductance))
-
-    def _lpm(self, difference: float) -> float:
-        """Compute the flow [L/min] of the smallest leak at a pressure difference [Pa] across the piston."""
-        return self.conductance * difference / LITRE_PER_MINUTE
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the hold to plain JSON values; the smallest leak is a flow [L/min] at the initial p_A - p_B."""
@@ -74,14 +70,15 @@ class PlannedHold(NamedTuple):
             "duration_s": self.duration,
             "pressure_A_Pa": self.pressure_A,
             "pressure_B_Pa": self.pressure_B,
-            "smallest_leak_lpm": self._lpm(self.difference) if self.finds_a_leak else None,
+            "smallest_leak_lpm": leak_flow_lpm(self.conductance, self.difference),
             "separates": "piston from pump and rod seals",
             "healthy_days": N_HEALTHY,
         }
 
     def text(self, stated_pressure: float) -> str:
         """Format the planned hold as text, with the smallest leak's flow at the difference `stated_pressure` [Pa]."""
-        found = f"{self._lpm(stated_pressure):.2g} L/min" if self.finds_a_leak else "no leak, however large"
+        flow = leak_flow_lpm(self.conductance, stated_pressure)
+        found = "no leak, however large" if flow is None else f"{flow:.2g} L/min"
         high, low = self.pressure_A / 1e6, self.pressure_B / 1e6
         return (
             "  or a locked hold: press the piston against a stop, shut the valves, stop the motor; "
@@ -134,7 +131,7 @@ class _HoldDraws:
         self._rig, self._flow = rig, flow
         pressure_B = rig.fluid.p_charge + P_ATM  # absolute
         pressure_A = pressure_B + load / rig.cylinder.A_A
-        self._hold = PlannedHold(duration, pressure_A, pressure_B, conductance=np.inf)  # no leak is found so far
+        self._hold = PlannedHold(duration, pressure_A, pressure_B)
         # the fraction `within` of the probability is reserved for the test for a step within a recording
         self._max_false_alarm = false_alarm * (1.0 - DECISION.questions.within)
         self._max_missed = _N_DRAWS - detection * _N_DRAWS
@@ -147,8 +144,8 @@ class _HoldDraws:
     def detects(self, conductance: float) -> bool:
         """Return True if at least the fraction `detection` of `_N_DRAWS` simulated holds detects a leak.
 
-        `conductance` [m^3/(s Pa)]: that of the leak. A hold detects it if a leak-free hold would leak as much with less
-        than the allowed false-alarm probability, as estimated from the healthy holds.
+        A hold detects it if a leak-free hold would leak as much with less than the allowed false-alarm probability, as
+        estimated from the healthy holds. `conductance` [m^3/(s Pa)]: that of the leak.
         """
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
@@ -161,8 +158,7 @@ class _HoldDraws:
     def with_smallest_leak(self) -> PlannedHold:
         """Find by bisection the smallest leak that the hold detects; return the hold with the leak's conductance.
 
-        If even the largest leak that is tried (`_TRIED_DECAYS`) is not detected, the hold is returned with the
-        conductance inf.
+        The conductance is inf if even the largest leak that is tried (`_TRIED_DECAYS`) is not detected.
         """
         decay_per_conductance = _decay_rate_per_conductance(self._rig) * self._hold.duration
         low, high = np.log(np.array(_TRIED_DECAYS) / decay_per_conductance)  # logarithms of conductances
@@ -188,8 +184,7 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     """Simulate a locked hold with a leak past the piston and with sensor noise, and estimate the leak from it.
 
     `hold`: duration and initial pressures; `conductance` [m^3/(s Pa)]: that of the leak; `flow` [m^3/s]: mean flow of
-    the pump under the usual duty. Returns the summary of a recording with this hold. Its Gram matrix is 0, because the
-    piston does not move.
+    the pump under the usual duty. Returns the summary of a recording with this hold.
     """
     random = np.random.default_rng(seed)
     cylinder, sensors = rig.cylinder, rig.sensors
@@ -211,4 +206,5 @@ def draw_hold(rig: Rig, hold: PlannedHold, conductance: float, flow: float, seed
     locked_holds = find_locked_holds((t, p_A, p_B, x), rests=t[1:] >= BEFORE, rate=MAX_RATE)  # intervals at rest
     chambers = HeldChambers(locked_holds, sides, begin=float(t[0]), end=float(t[-1]), charge=hold.pressure_B)
     held = np.array(chambers.leaks)
+    # no Gram matrix of the volume balance: the piston does not move
     return RecordingSums(sums=np.zeros((1, 1, 1)), flow=flow, pressure=hold.difference, held=held)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from sealscope.campaigns.cases.recordings import ProgressCallback, judge_recordings
@@ -21,34 +21,31 @@ from sealscope.storage.folders import make_folder
 class CampaignResult:
     """A campaign and its results.
 
-    `missing`: number of the plan's records without a row; `judgement`: statistics of the verdicts; `mode`: how a
-    simulated campaign was run, "" for recordings; `known`: by detector, the information that it was given.
+    `missing`: number of the plan's records without a row; `judgement`: statistics of the verdicts; `known`: by
+    detector, the information that it was given; `mode`: how a simulated campaign was run, "" for recordings.
     """
 
     plan: AnyPlan
     rows: tuple[CaseRow, ...]
     missing: int
     judgement: Judgement
+    known: Mapping[str, PriorKnowledge]
     mode: str = ""
-    known: Mapping[str, PriorKnowledge] = field(default_factory=dict)
 
 
-def prior_knowledge(plan: SimulatedPlan | RecordedPlan) -> dict[str, PriorKnowledge]:
+def prior_knowledge(plan: AnyPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
     A scorer that compares two parts of a record knows the true onset of simulated records, because they are split
     there. Detectors that are not scorers assume the plan's rig.
     """
-    is_simulated = isinstance(plan, SimulatedPlan)
-    rig = "" if plan.assumed is None else plan.assumed.name
     knowledge = {}
     for name in plan.detectors:
         detector = parse_detector_name(name)
-        knowledge[name] = PriorKnowledge(
-            onset=is_simulated and detector.scorer is not None and detector.scorer.compares_parts,
-            channels=tuple(plan.views.get(detector.view, ALL_CHANNELS)),
-            rig=rig if detector.scorer is None else "",
-        )
+        knows_onset = isinstance(plan, SimulatedPlan) and detector.scorer is not None and detector.scorer.compares_parts
+        rig = plan.assumed if detector.scorer is None else None
+        channels = plan.views.get(detector.view, ALL_CHANNELS)
+        knowledge[name] = PriorKnowledge(knows_onset, channels, "" if rig is None else rig.name)
     return knowledge
 
 
@@ -60,13 +57,12 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
     rows = tuple(store.read_plan_rows(plan, folder).values())
     if not rows:
         raise InputError(f"a campaign must have rows to report on, got none; run it first ({folder})")
-    head = store.read_head(folder) or {}  # rows without a head are refused above
     judgement = judge(
         rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence,
         onset_s=plan.onset_s, hours=plan.duration_s / 3600.0,
     )  # fmt: skip
-    mode = str(head.get("mode", store.RUN_BY_RUN))
-    return CampaignResult(plan, rows, plan.size - len(rows), judgement, mode=mode, known=prior_knowledge(plan))
+    mode = str(store.read_head(folder).get("mode", store.RUN_BY_RUN))
+    return CampaignResult(plan, rows, plan.size - len(rows), judgement, prior_knowledge(plan), mode)
 
 
 def judge_recorded_campaign(
@@ -76,7 +72,7 @@ def judge_recorded_campaign(
     rows = judge_recordings(plan, folder, progress)
     judgement = judge(
         rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence
-    )  # fmt: skip
+    )
     return CampaignResult(plan, tuple(rows), missing=0, judgement=judgement, known=prior_knowledge(plan))
 
 

@@ -14,12 +14,12 @@ both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.campaigns.held import PlannedHold, has_shut_off, plan_hold
+from sealscope.campaigns.held import PlannedHold, has_shut_off, leak_flow_lpm, plan_hold
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
@@ -33,7 +33,7 @@ from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
-from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+from sealscope.units import parse_quantity
 
 _FALSE_ALARM: float = DECISION.false_alarm.probability
 #: Commands and constant loads that are tried in addition to the machine's usual duty.
@@ -47,7 +47,7 @@ _MAX_CENTRING_SECONDS = 1000.0
 
 
 class PlannedDuty(NamedTuple):
-    """The duty of a planned recording: its command, a text such as '3 sin(4t)' [V], and its load, '2 kN' or ""."""
+    """The duty of a recording: its command, a text such as '3 sin(4t)' [V], and its load, such as '2 kN', or ""."""
 
     command: str
     load: str = ""
@@ -56,27 +56,22 @@ class PlannedDuty(NamedTuple):
         return self.command + (f" under {self.load}" if self.load else "")
 
 
-USUAL = PlannedDuty(COMMANDS[0])
-
-
 class DetectableLeak(NamedTuple):
-    """The smallest leaks that are detected with the wanted probability in recordings of one duty and duration.
+    """The smallest leaks that are detected with the wanted probability in recordings of one duty and `duration` [s].
 
-    - `duration` [s]
     - `conductance` [m^3/(s Pa)]: smallest step of the leak's conductance that is detected, inf if none is
     - `separable` [m^3/(s Pa)]: smallest step that can also be told from a step of the pump's leakage, inf if none can
-    - `pressure` [Pa]: mean |p_A - p_B|
+    - `pressure` [Pa], `flow` [m^3/s]: mean |p_A - p_B|, and mean flow of the pump
     - `note`: reason why the numbers could not be computed, "" if they could
-    - `flow` [m^3/s]: mean flow of the pump
     """
 
     duty: PlannedDuty
     duration: float
-    conductance: float
-    separable: float
-    pressure: float
-    note: str = ""
+    conductance: float = np.inf
+    separable: float = np.inf
+    pressure: float = np.nan
     flow: float = 0.0
+    note: str = ""
 
 
 class RecordingPlan(NamedTuple):
@@ -107,14 +102,14 @@ class RecordingPlan(NamedTuple):
         return self.target is None or self.for_detection.conductance <= self.target
 
     def lpm(self, conductance: float) -> float | None:
-        """Convert a leakage conductance [m^3/(s Pa)] to the leak flow [L/min] at the usual pressure; None for inf."""
-        return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
+        """Compute the flow [L/min] of a leak with a conductance [m^3/(s Pa)] at the usual pressure; None for inf."""
+        return leak_flow_lpm(conductance, self.usual_pressure)
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
 
         def leak_dict(leak: DetectableLeak) -> dict[str, Any]:
-            """Convert the smallest leaks under one duty to JSON values; infinite numbers become None."""
+            """Convert the smallest leaks under one duty to JSON values."""
             return {
                 **leak.duty._asdict(),
                 "duration_s": leak.duration,
@@ -154,17 +149,17 @@ class RecordingPlan(NamedTuple):
             *([] if self.hold is None else [self.hold.text(self.usual_pressure)]),
             f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
-        comparable = [row for row in self.compared if not row.note]
         lines += [
             f"  {row.duty!s:<34}{self._format_flow(row.conductance):>14}{self._format_flow(row.separable):>18}"
-            for row in comparable
+            for row in self.compared
+            if not row.note
         ]
-        notes = [row for row in self.compared if row.note]  # the first is printed
-        lines += [paragraph(f"left out: {row.duty}: {row.note}", head="  ", indent=4) for row in notes[:1]]
+        failed = [row for row in self.compared if row.note]  # the first is printed
+        lines += [paragraph(f"left out: {row.duty}: {row.note}", head="  ", indent=4) for row in failed[:1]]
         return "\n".join(lines)
 
     def _format_flow(self, conductance: float) -> str:
-        """Format the leak flow [L/min] of a conductance [m^3/(s Pa)] at the usual pressure; '-' if it is infinite."""
+        """Format the result of `lpm`; '-' if the leak is infinite."""
         flow = self.lpm(conductance)
         return "-" if flow is None else f"{flow:.2g} L/min"
 
@@ -197,9 +192,8 @@ def detectable_leak(
             recording = simulate_experiment(duty_experiment(rig, duty, duration, seed)).recording
             steps.append(_detectable_steps(recording, rig, false_alarm, detection))
     except SealscopeError as error:
-        return DetectableLeak(duty, duration, conductance=np.inf, separable=np.inf, pressure=np.nan, note=str(error))
-    step, separable, pressure, flow = (float(np.median(values)) for values in zip(*steps, strict=True))
-    return DetectableLeak(duty, duration, step, separable, pressure, flow=flow)
+        return DetectableLeak(duty, duration, note=str(error))
+    return DetectableLeak(duty, duration, *np.median(steps, axis=0).tolist())
 
 
 def _detectable_steps(
@@ -207,9 +201,8 @@ def _detectable_steps(
 ) -> tuple[float, float, float, float]:
     """Compute from a leak-free recording the smallest step of the leakage conductance that would be detected.
 
-    Returns this step and the smallest one that can be told from a step of the pump's leakage [m^3/(s Pa)], the mean
-    |p_A - p_B| [Pa], and the mean flow of the pump [m^3/s]. `false_alarm`, `detection`: probability of an alarm without
-    and with the leak. Raises InputError if the volume balance cannot be computed.
+    Returns `conductance`, `separable`, `pressure` and `flow` of `DetectableLeak`. Raises InputError if the volume
+    balance cannot be computed.
     """
     detector = VolumeBalance(rig)
     if reason := detector.usable(recording):
@@ -232,9 +225,8 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
 
     It is sqrt(I_11 / (I_11 - I_12^2 / I_22)), with the Fisher information I (2, 2) of the leak's step (1) and the
     pump's step (2), both at the middle block of the recording, given the unknown constant coefficients of the volume
-    balance. `blocks`: Gram matrices of the balance's columns, one for each block of time; `columns`: for each equation
-    of the balance, the roles of its columns. The factor is inf if the balance has several equations or no column for
-    the pump's leakage, or if the two steps cannot be told apart.
+    balance. `columns`: for each equation of the balance, the roles of its columns. The factor is inf if the balance has
+    several equations or no column for the pump's leakage, or if the two steps cannot be told apart.
     """
     roles = columns[0]
     if PUMP not in roles.names or len(columns) > 1:
@@ -257,8 +249,7 @@ def plan_recording(
     rig: Rig,
     find: float | None = None,
     *,
-    usual: PlannedDuty = USUAL,
-    duties: Iterable[PlannedDuty] | None = None,
+    usual: PlannedDuty,
     false_alarm: float = _FALSE_ALARM,
     detection: float = 0.9,
     held: float | None = None,
@@ -266,12 +257,11 @@ def plan_recording(
 ) -> RecordingPlan:
     """Find the shortest recording that detects a leak with a flow of `find` [m^3/s].
 
-    All duties (command and load) are compared in recordings of `COMPARISON_SECONDS`. The best duty is then tried for
-    rising `DURATIONS`, from half of the predicted one, until the leak is detected; and likewise for telling it from a
-    leak of the pump.
+    The `usual` duty and all combinations of `COMMANDS` and `LOADS` are compared in recordings of `COMPARISON_SECONDS`.
+    The best is then tried for rising `DURATIONS`, from half of the predicted one, until the leak is detected; and
+    likewise for telling it from a leak of the pump.
 
     - `find`: flow at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
-    - `duties`: duties to compare with the usual one, by default all combinations of `COMMANDS` and `LOADS`
     - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
     - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
       the rig has such valves, and otherwise for no hold
@@ -279,7 +269,7 @@ def plan_recording(
 
     Raises InputError if the usual duty cannot be simulated or judged.
     """
-    choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS] if duties is None else list(duties)
+    choices = [PlannedDuty(command, load) for load in LOADS for command in COMMANDS]
     compared_duties = [usual, *(duty for duty in choices if duty != usual)]
     compared = []
     for k, duty in enumerate(compared_duties):

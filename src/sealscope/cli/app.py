@@ -75,17 +75,16 @@ def _root(
 def normalise_arguments(arguments: Sequence[str]) -> list[str]:
     """Rearrange the arguments of a call to the form that typer understands.
 
-    `-v` is moved to the beginning, the place of options of all commands, once; `--baseline` is repeated before each
-    baseline (`_spread_baselines`); and `monitor FILE` becomes `monitor run FILE`. Raises InputError if no file follows
-    `--baseline`.
+    `-v` is moved to the beginning, the place of options of all commands; `--baseline` is repeated before each baseline
+    (`_spread_baselines`); and `monitor FILE` becomes `monitor run FILE`.
     """
     end = list(arguments).index("--") if "--" in arguments else len(arguments)  # after `--` there are no options
-    verbose = [argument for argument in arguments[:end] if argument in ("-v", "--verbose")]
     without_verbose = [argument for argument in arguments[:end] if argument not in ("-v", "--verbose")]
+    verbose = ["-v"] if len(without_verbose) < end else []
     remaining = _spread_baselines(without_verbose, arguments[end:])
     if remaining[:1] == ["monitor"] and len(remaining) > 1 and remaining[1] not in monitoring.COMMANDS:
         remaining.insert(1, "run")  # `sealscope monitor FILE`
-    return [*verbose[:1], *remaining]
+    return [*verbose, *remaining]
 
 
 def _spread_baselines(arguments: Sequence[str], operands: Sequence[str]) -> list[str]:
@@ -99,33 +98,31 @@ def _spread_baselines(arguments: Sequence[str], operands: Sequence[str]) -> list
         return [*arguments, *operands]
     baselines: list[list[str]] = []  # the files after each `--baseline`
     remaining: list[str] = []  # all other arguments
-    in_baseline = False
+    group = remaining  # the list to which the present argument belongs
     for argument in arguments[1:]:
         if argument == "--baseline":
-            baselines.append([])
-            in_baseline = True
+            group = []
+            baselines.append(group)
             continue
         if argument != "-" and argument.startswith("-"):  # the next option ends the baselines; `-` is standard input
-            in_baseline = False
-        if in_baseline:
-            baselines[-1].append(argument)
-        else:
-            remaining.append(argument)
+            group = remaining
+        group.append(argument)
     remaining += operands
     if not all(baselines):
         raise InputError("--baseline must be followed by one file or more, got none")
     command = _click_command().commands[arguments[0]]
     # find out whether there are files among the remaining arguments; wrong options raise no error here
     files = command.make_context(arguments[0], list(remaining), resilient_parsing=True).params["files"]
-    used_groups = baselines if files else [group[:1] for group in baselines]
-    options = [argument for group in used_groups for name in group for argument in ("--baseline", name)]
-    moved_files = [] if files else [name for group in baselines for name in group[1:]]
-    return [arguments[0], *options, *moved_files, *remaining]
+    if not files:
+        remaining = [name for group in baselines for name in group[1:]] + remaining
+        baselines = [group[:1] for group in baselines]
+    options = [argument for group in baselines for name in group for argument in ("--baseline", name)]
+    return [arguments[0], *options, *remaining]
 
 
 @cache
 def _click_command() -> Any:
-    """Build the click command of the whole command line; later calls return the same object."""
+    """Build the click command of the whole command line."""
     return typer.main.get_command(app)
 
 

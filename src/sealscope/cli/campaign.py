@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from sealscope.campaigns.cases.recordings import ProgressCallback
     from sealscope.campaigns.execution.store import CampaignProgress
     from sealscope.campaigns.plans.model import AnyPlan
-    from sealscope.campaigns.results import CampaignResult
 
 campaign = Typer(
     name="campaign",
@@ -109,10 +108,7 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Choose the folder of a campaign: `stated` or, if that is None, `sealscope-campaigns/NAME`.
-
-    Raises InputError if this default folder, or the folder that contains it, is a link.
-    """
+    """Choose the folder of a campaign: `stated` or, if that is None, `sealscope-campaigns/NAME`, but no link."""
     if stated is not None:
         return stated
     folder = Path("sealscope-campaigns") / plan.name
@@ -123,10 +119,7 @@ def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
 
 
 def _format_progress(state: CampaignProgress) -> str:
-    """Format the numbers of records done and failed, the processor time of a record, and that of all remaining ones.
-
-    The times are left out while no record has a result.
-    """
+    """Format the numbers of records done and failed, the processor time of a record, and that of all remaining ones."""
     text = f"records: {state.done} of {state.records} done"
     if state.failed:
         text += f", {state.failed} of them failed"
@@ -146,15 +139,24 @@ def _show_progress() -> Iterator[ProgressCallback]:
 
 
 def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
-    """Write the tables and the page of a campaign, print its main table, and return the number of failed records.
+    """Judge a campaign, write its tables and its page, print its main table; return the number of failed records.
 
-    The first five failed records are also printed, on standard error. `folder`: the campaign's folder, into which the
-    files are written; `data`: folder of the recordings, None for a simulated plan.
+    `folder`: the campaign's folder, with the results of a simulated plan, into which the files are written; `data`:
+    folder of the recordings, None for a simulated plan.
     """
-    from sealscope.campaigns.results import write_result
+    from sealscope.campaigns.plans.model import SimulatedPlan
+    from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign, write_result
     from sealscope.reporting.campaign.page import PAGE, campaign_text, write_campaign_page
 
-    result = _load_result(plan, folder, data)
+    if isinstance(plan, SimulatedPlan):
+        result = judge_simulated_campaign(plan, folder)
+    elif data is None:
+        raise InputError("the plan needs recordings: give their folder with --data")
+    elif not data.is_dir():
+        raise InputError(f"--data must be the folder of recordings, got {data}")
+    else:
+        with _show_progress() as progress:
+            result = judge_recorded_campaign(plan, data, progress)
     files = write_result(result, folder)
     write_campaign_page(result, folder / PAGE, [path.name for path in files])
     echo(campaign_text(result))
@@ -162,21 +164,3 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
         opt.complain(f"record {row.id} failed: {row.error}")
     echo(f"tables: {folder}\npage:   {folder / PAGE}")
     return len(result.judgement.failed)
-
-
-def _load_result(plan: AnyPlan, folder: Path, data: Path | None) -> CampaignResult:
-    """Judge a campaign by the results of a simulated plan in `folder`, or by the recordings in the folder `data`.
-
-    Raises InputError if the recordings are needed but `data` is None or not a folder.
-    """
-    from sealscope.campaigns.plans.model import SimulatedPlan
-    from sealscope.campaigns.results import judge_recorded_campaign, judge_simulated_campaign
-
-    if isinstance(plan, SimulatedPlan):
-        return judge_simulated_campaign(plan, folder)
-    if data is None:
-        raise InputError("the plan needs recordings: give their folder with --data")
-    if not data.is_dir():
-        raise InputError(f"--data must be the folder of recordings, got {data}")
-    with _show_progress() as progress:
-        return judge_recorded_campaign(plan, data, progress)

@@ -6,35 +6,25 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Argument, Option
 
 from sealscope.cli.options import StatedMachine, check_folder, say, with_machine_options
 from sealscope.errors import InputError
 
+_FILES = "Healthy recordings of the machine, or a folder of them."
+_ADD = "Add recordings that are confirmed healthy to the machine's file; the old one is kept (.bak)."
+_KEEP = "Keep recordings that look leaking compared with the others; else they are left out."
+_SINCE = "With --add: forget recordings before DATE, as after a repair."
+
 
 @with_machine_options("rig", "area", "displacement", "maps", "rate", "limit")
 def commission(
-    files: Annotated[
-        list[Path], typer.Argument(metavar="FILE...", help="Healthy recordings of the machine, or a folder of them.")
-    ],
-    output: Annotated[Path, typer.Option("--output", "-o", help="The machine's file to write (.toml).")],
+    files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],
+    output: Annotated[Path, Option("--output", "-o", help="The machine's file to write (.toml).")],
     stated: StatedMachine,  # built from the options that the decorator adds
-    add: Annotated[
-        bool,
-        typer.Option(
-            "--add", help="Add recordings that are confirmed healthy to the machine's file; the old one is kept (.bak)."
-        ),
-    ] = False,
-    keep: Annotated[
-        bool,
-        typer.Option(
-            "--keep", help="Keep recordings that look leaking compared with the others; else they are left out."
-        ),
-    ] = False,
-    since: Annotated[
-        str | None,
-        typer.Option("--since", metavar="DATE", help="With --add: forget recordings before DATE, as after a repair."),
-    ] = None,
+    add: Annotated[bool, Option("--add", help=_ADD)] = False,
+    keep: Annotated[bool, Option("--keep", help=_KEEP)] = False,
+    since: Annotated[str | None, Option("--since", metavar="DATE", help=_SINCE)] = None,
 ) -> None:
     """Learn a machine once from healthy recordings: its model terms, sensors, scatter and smallest detectable leak.
 

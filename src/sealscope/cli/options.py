@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from enum import StrEnum
 from functools import partial, wraps
 from inspect import Parameter
@@ -36,6 +36,8 @@ T = TypeVar("T")
 FAILED_ON = 3
 #: Name of standard input in place of a file.
 STANDARD_INPUT = Path("-")
+#: Help text of each argument of `Experiment.of`.
+_ARGUMENT_TEXTS: dict[str, str] = {argument.name: argument.metadata["text"] for argument in fields(Arguments)}
 _log = logging.getLogger(__name__)
 
 
@@ -50,7 +52,7 @@ def make_completion(names: Callable[[], Iterable[str]]) -> Callable[[str], list[
 
 
 def _rig_names() -> Sequence[str]:
-    """List the names of the packaged rigs, for completion by the shell."""
+    """List the names of the packaged rigs."""
     from sealscope.parameters import rig_names
 
     return rig_names()
@@ -74,26 +76,14 @@ def declared_option(name: str, *, option: str = "", several: bool = False, **set
 
     `option`: flag, by default from `name`; `several`: True if repeatable; `settings`: arguments of `typer.Option`.
     """
-    text = _argument_text(name) + (" Repeat for several." if several else "")
+    text = _ARGUMENT_TEXTS[name] + (" Repeat for several." if several else "")
     return Option(option or f"--{name.replace('_', '-')}", help=text, **settings)
 
 
-def _argument_text(name: str) -> str:
-    """Return the help text of the argument `name` of `Experiment.of`."""
-    return str(Arguments.__dataclass_fields__[name].metadata["text"])
-
-
 RigOption = Annotated[str, declared_option("rig", autocompletion=complete_rigs)]
-RigArgument = Annotated[str, Argument(help=_argument_text("rig"), autocompletion=complete_rigs)]
-AssumeOption = Annotated[
-    str | None,
-    Option(
-        "--rig",
-        metavar="NAME|FILE",
-        help="What is assumed of the machine: a rig by name, or a TOML file; by default the thesis's.",
-        autocompletion=complete_rigs,
-    ),
-]
+RigArgument = Annotated[str, Argument(help=_ARGUMENT_TEXTS["rig"], autocompletion=complete_rigs)]
+_ASSUMED = "What is assumed of the machine: a rig by name, or a TOML file; by default the thesis's."
+AssumeOption = Annotated[str | None, Option("--rig", metavar="NAME|FILE", help=_ASSUMED, autocompletion=complete_rigs)]
 _AREA = "Area of the piston, '633 mm^2', from which L/min is computed; twice for sides A and B."
 AreaOption = Annotated[list[str] | None, Option("--area", metavar="AREA[unit]", help=_AREA)]
 _DISPLACEMENT = "Displacement of the pump, '4.9 cm^3/rev', from which L/min is computed if no area is stated."
@@ -104,16 +94,11 @@ SetOption = Annotated[
     list[str] | None,
     declared_option("set", several=True, metavar="NAME=VALUE[unit]", autocompletion=make_completion(_override_names)),
 ]
-MapOption = Annotated[
-    list[str] | None,
-    Option(
-        "--map",
-        metavar="CHANNEL=COLUMN",
-        help="Take a channel from a column, with its unit if neither the file nor the name has one: p_A=PG_1[psi], "
-        "x=#4[mm], or from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, "
-        "also beside others.",
-    ),
-]
+_MAP = (
+    "Take a channel from a column, with its unit if neither the file nor the name has one: p_A=PG_1[psi], x=#4[mm], or "
+    "from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, also beside others."
+)
+MapOption = Annotated[list[str] | None, Option("--map", metavar="CHANNEL=COLUMN", help=_MAP)]
 RateOption = Annotated[float | None, Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
 JoinOption = Annotated[bool, Option("--join", help="The files are parts of a single run: join them by their clocks.")]
 _BASELINE = "Leak-free recordings of the same machine."
@@ -137,13 +122,11 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 class StatedMachine:
     """The machine that the options of a call describe, and the way to read its files.
 
-    - `commissioned`: the machine of the option `--machine`, which determines everything else.
-    - `channel_map`, `rate`: columns of the channels and sampling rate [Hz] for reading files.
-    - `rig`: known or assumed parameters of the machine.
-    - `limit`: leak from which the machine must be repaired, as text such as "5 mL/min".
-    - `baseline`: leak-free recordings of the machine.
-
-    Without its option, an attribute is None or empty.
+    - `commissioned`: the machine of the option `--machine`, which determines everything else
+    - `channel_map`, `rate`: columns of the channels and sampling rate [Hz] for reading files
+    - `rig`: known or assumed parameters of the machine
+    - `limit`: leak from which the machine must be repaired, as text such as "5 mL/min"
+    - `baseline`: leak-free recordings of the machine
     """
 
     commissioned: CommissionedMachine | None = None
@@ -167,7 +150,7 @@ class StatedMachine:
     ) -> StatedMachine:
         """Build the machine from the values of a command's options, which the types of the parameters declare.
 
-        Raises InputError for an invalid option, and for any other option together with `--machine`.
+        Raises InputError for an invalid option, and for another option together with `machine`.
         """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
@@ -193,7 +176,7 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """Channel map in the rig's file, i.e. the column of each channel; empty without a rig or if `--map` is used."""
+        """Channel map in the rig's file; empty without a rig or if `--map` is used."""
         return {} if self.rig is None or self.channel_map else self.rig.channel_map
 
     @property
@@ -202,12 +185,7 @@ class StatedMachine:
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
-        """Read the recording in a file, or on standard input for the file `-`.
-
-        If the machine is commissioned, the channel map and rate in its file apply, otherwise the options of the call.
-        Without `--map`, the rig's map is used for files that have the columns it names. Raises UnreadableFile, also for
-        a folder.
-        """
+        """Read the recording in a file, or on standard input for the file `-`; raise UnreadableFile for a folder."""
         if self.commissioned is None and file.is_dir():
             remedy = "name its files, or state its machine by --machine"
             raise UnreadableFile(f"a recording must be a file, got a folder: {remedy} ({file})")
@@ -237,8 +215,8 @@ class StatedMachine:
     def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
 
-        `joined`: the files are parts of a single recording: yield only the first file, with the joined recording, or
-        with None if a part is unreadable.
+        `joined`: the files are parts of a single recording, so only the first is yielded, with the joined recording or,
+        if a part is unreadable, None.
         """
         recordings = ((file, attempt(file, partial(self.read, file))) for file in files)
         if not joined:
@@ -251,48 +229,38 @@ class StatedMachine:
         yield files[0], join(parts, names=[file.name for file in files]) if is_complete else None
 
     def diagnose(self, recording: Recording, baseline: Sequence[Recording], file: Path, **settings: Any) -> Diagnosis:
-        """Diagnose a recording of this machine, compared with the healthy recordings `baseline`, which may be empty.
+        """Diagnose a recording, compared with the healthy recordings in the machine's file or, without one, `baseline`.
 
-        A commissioned machine is compared with the healthy recordings in its file instead. `file`: name in the
-        diagnosis; `settings`: more arguments of `diagnose`.
+        `file`: name in the diagnosis; `settings`: more arguments of `diagnose`.
         """
-        from dataclasses import replace
-
         from sealscope.diagnosis.diagnose import diagnose
 
         if self.commissioned is not None:
-            diagnosis = self.commissioned.diagnose(recording, **settings)
-            return replace(diagnosis, file=str(file))
+            return replace(self.commissioned.diagnose(recording, **settings), file=str(file))
         return diagnose(recording, baseline, rig=self.rig, limit=self.limit, file=file, **settings)
 
 
 def with_machine_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Build a decorator that replaces the parameter `stated` of a command by the options of a machine.
+    """Build a decorator that replaces the parameter `stated` of a command, a `StatedMachine`, by options of a machine.
 
-    The command gets the `StatedMachine` that these options describe. `names`: the options, given as names of parameters
-    of `StatedMachine.of`; by default all.
+    `names`: the options, as names of parameters of `StatedMachine.of`; by default all.
     """
     options = inspect.signature(StatedMachine.of, eval_str=True).parameters
     return _replace_parameter("stated", StatedMachine.of, [options[name] for name in names or options])
 
 
 def with_experiment_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`.
-
-    The command gets the experiment that these options describe. The argument `drifts` is left out, as it cannot be
-    written as text.
-    """
+    """Replace the parameter `experiment` of a command by an option for each argument of `Experiment.of`."""
     special_options = {  # those with completion, with a flag of another name, or repeatable
         "rig": RigOption,
         "set": SetOption,
         "x_0": Annotated[str, declared_option("x_0", option="--start-position")],
-    }
-    special_options |= {
-        name: Annotated[list[str] | None, declared_option(name, several=True)] for name in ("leak", "fault")
+        "leak": Annotated[list[str] | None, declared_option("leak", several=True)],
+        "fault": Annotated[list[str] | None, declared_option("fault", several=True)],
     }
     options = []
     for argument in fields(Arguments):
-        if argument.name == "drifts":
+        if argument.name == "drifts":  # cannot be written as text
             continue
         # a number may be given with a unit, so its option is a text
         default = f"{argument.default:g}" if isinstance(argument.default, float) else argument.default
@@ -340,10 +308,7 @@ def _replace_parameter(
 
 
 def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options.
-
-    `area`: text of the piston area, or of those of sides A and B. Raises InputError for an invalid option.
-    """
+    """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options."""
     from sealscope.diagnosis.verdict.machine import unstated_rig
     from sealscope.parameters import load_rig
     from sealscope.units import parse_quantity
@@ -398,10 +363,7 @@ def say(text: str) -> None:
 
 
 def say_wrapped(text: str, head: str = "") -> None:
-    """Print `head` and a paragraph on standard output, wrapped at 80 columns.
-
-    Lines after the first are indented by the length of `head`, or by 2 if it is empty.
-    """
+    """Print `head` and a paragraph on standard output, wrapped at 80 columns, with later lines indented."""
     say(paragraph(text, head, indent=len(head) or 2))
 
 

@@ -14,6 +14,7 @@ from typer import Argument, Option, Typer, echo
 from sealscope.cli.options import write_text
 from sealscope.errors import InputError
 
+_FOLDER = "New folder for the package; by default the name with dashes."
 _HELP = "Detectors of your own; `plugin new NAME` writes a distribution to begin with."
 plugin = Typer(name="plugin", help=_HELP, callback=lambda: None)
 
@@ -21,9 +22,7 @@ plugin = Typer(name="plugin", help=_HELP, callback=lambda: None)
 @plugin.command()
 def new(
     name: Annotated[str, Argument(help="Name of the detector in plain words, e.g. 'stroke time'.")],
-    folder: Annotated[
-        Path | None, Option("--output", "-o", help="New folder for the package; by default the name with dashes.")
-    ] = None,
+    folder: Annotated[Path | None, Option("--output", "-o", help=_FOLDER)] = None,
 ) -> None:
     """Write a package with a detector of your own: code that runs, its tests, and a campaign plan to evaluate it."""
     from sealscope.storage.folders import make_folder

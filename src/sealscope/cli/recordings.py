@@ -38,6 +38,8 @@ _FAIL_ON = (
     "End with status 3 where a file has this verdict, or a leak of this level (monitor, plan, repair) against --limit "
     "or worse; repeat."
 )
+_PAGE = "The page (.html, .pdf) or its card (.png), or a folder for several files."
+_SAVE_MAP = "Write the map into the file of --rig, for later calls."
 _EVERY = (
     "Cut a long log into parts of this length (1h): TARGET is a new folder for them, of NetCDF files. A text log of "
     "any size is read in bounded memory; `sealscope trend` takes the parts."
@@ -112,20 +114,12 @@ def _diagnose_in_parallel(
 ) -> Iterator[tuple[str, Iterable[DatedDiagnosis | None]]]:
     """Diagnose files in parallel processes; yield a pair (messages, dated diagnoses) for each file, in their order.
 
-    `work`: function that yields a dated diagnosis, (start, diagnosis), of each file, None for an unreadable one. The
-    messages are the text that it printed on standard error. If the process of a file dies, its diagnoses are [None]. On
-    a single core, one pair contains all files.
+    `work`: `_iter_dated_diagnoses` with its options. The messages are the text that it printed on standard error.
     """
     from sealscope.campaigns.execution.workers import cores, iter_results_in_order
 
-    jobs = min(cores(), len(files))
-    if jobs == 1:
-        yield "", work(files)
-        return
-    # each process gets a list of one file at a time
-    for (file,), result in iter_results_in_order(
-        jobs, partial(_run_collecting_messages, work), [[file] for file in files]
-    ):
+    task = partial(_run_collecting_messages, work)
+    for file, result in iter_results_in_order(min(cores(), len(files)), task, files):
         yield result or (f"sealscope: the process that diagnosed {file} died\n", [None])
 
 
@@ -133,7 +127,7 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
     """Format a diagnosis for printing.
 
     `form`: "jsonl" for a JSON object, "short" for a short text, "line" for its first line, "whole" for a text with all
-    methods, or "table" for a line with the start `start_s` of the recording [s since 1970], None if unknown.
+    methods, or "table" for a line with the start `start_s` of the recording [s since 1970].
     """
     from sealscope.reporting.messages import diagnosis_text, short_text, table_line
 
@@ -147,17 +141,15 @@ def _format_diagnosis(diagnosis: Diagnosis, form: str, start_s: float | None) ->
 
 def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
     """Return True if a diagnosis meets a `reason` to fail: a verdict, or the lowest level of severity (`--fail-on`)."""
-    level = None if diagnosis.severity is None else diagnosis.severity.level
-    if reason in _LEVELS:  # in rising order
-        return level in _LEVELS[_LEVELS.index(reason) :]
-    return reason == diagnosis.verdict
+    if reason not in _LEVELS:
+        return reason == diagnosis.verdict
+    return diagnosis.severity is not None and diagnosis.severity.level in _LEVELS[_LEVELS.index(reason) :]
 
 
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
     """Return True if files look like recordings of one machine over time.
 
-    At least `_MIN_SERIES_FILES` files are needed. Their names must differ only in numbers, and their `starts` [s] must
-    be known and lie an hour or more apart.
+    Their names must differ only in numbers, and their `starts` [s] must be known and lie an hour or more apart.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -181,8 +173,8 @@ def _iter_diagnoses(
 
     If a baseline, i.e. a leak-free recording for comparison, cannot be read, an additional None is yielded first, so
     that the call counts as incomplete. A file never serves as its own baseline. `joined`: True if the files are parts
-    of a single recording; `settings`: further arguments of `sealscope.diagnose`. Raises InputError if the only baseline
-    of a file is the file itself, and UnreadableFile if no baseline can be read.
+    of a single recording; `settings`: further arguments of `StatedMachine.diagnose`. Raises InputError if the only
+    baseline of a file is the file itself, and UnreadableFile if no baseline can be read.
     """
     baseline = machine.baseline
     for file in files:
@@ -206,10 +198,7 @@ def _iter_diagnoses(
 
 
 def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[DatedDiagnosis | None]:
-    """Yield (start, diagnosis) of each recording, or None if the file cannot be read or diagnosed.
-
-    The start is in seconds since 1970, or None if unknown. `options`: arguments of `_iter_diagnoses`.
-    """
+    """Yield start and diagnosis of each recording, or None if it has none; `options`: as of `_iter_diagnoses`."""
     for result in _iter_diagnoses(files, **options):
         yield None if result is None else (_start_seconds(result), result.diagnosis)
 
@@ -223,20 +212,18 @@ def _start_seconds(result: DiagnosedRecording) -> float | None:
 
 
 def _run_collecting_messages(
-    work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], files: Sequence[Path]
+    work: Callable[[Sequence[Path]], Iterator[DatedDiagnosis | None]], file: Path
 ) -> tuple[str, list[DatedDiagnosis | None]]:
-    """Diagnose files by the function `work`; return its text on standard error, and what it yields for each file."""
+    """Diagnose a file by the function `work`; return its text on standard error, and what it yields for the file."""
     with redirect_stderr(StringIO()) as messages:
-        dated_diagnoses = list(work(files))
+        dated_diagnoses = list(work([file]))
     return messages.getvalue(), dated_diagnoses
 
 
 @opt.with_machine_options()
 def report(
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings to report on.")],
-    output: Annotated[
-        Path, Option("--output", "-o", help="The page (.html, .pdf) or its card (.png), or a folder for several files.")
-    ],
+    output: Annotated[Path, Option("--output", "-o", help=_PAGE)],
     stated: opt.StatedMachine,  # built from the options that the decorator adds
     join: opt.JoinOption = False,
     false_alarm: opt.FalseAlarmOption = opt.FALSE_ALARM_PROBABILITY,
@@ -295,8 +282,8 @@ def report(
 def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: Path, false_alarm: float) -> None:
     """Write the page of a commissioned machine, with its newest verdict and all its recordings over time.
 
-    `files`: recordings and folders of them; `false_alarm`: probability of the verdict `leak` for a leak-free recording.
-    Raises UnreadableFile if no recording can be read and diagnosed, and ends with the exit status 1 if some cannot.
+    `files`: recordings and folders of them. Raises UnreadableFile if no recording can be read and diagnosed, and ends
+    with the exit status 1 if some cannot.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
     from sealscope.paragraphs import format_count
@@ -329,9 +316,7 @@ def inspect(
     rate: opt.RateOption = None,
     join: opt.JoinOption = False,
     rig: opt.AssumeOption = None,
-    save_map: Annotated[
-        bool, Option("--save-map", help="Write the map into the file of --rig, for later calls.")
-    ] = False,
+    save_map: Annotated[bool, Option("--save-map", help=_SAVE_MAP)] = False,
 ) -> None:
     """Show the content of a file and its defects; columns without a map are recognised by their names."""
     from sealscope.parameters.load import save_channel_map
@@ -365,8 +350,8 @@ def inspect(
 def _resolve_map(channel_map: ChannelMap, files: Sequence[Path], recording: Recording) -> dict[str, str]:
     """Return the column of each channel in `channel_map`; `auto` is replaced by the columns that it found by name.
 
-    `recording`: read by this map from one file, or joined from several. With `auto` the result is empty if it was
-    converted from another file: it then states that file's columns, and its own have the channels' names.
+    `recording`: read by this map from `files`. With `auto` the result is empty if it was converted from another file:
+    it then states that file's columns, and its own have the channels' names.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 

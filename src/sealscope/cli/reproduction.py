@@ -22,18 +22,16 @@ def _item_names() -> list[str]:
     return ["all", *groups, *(item.id for item in items)]
 
 
+_complete_items = opt.make_completion(_item_names)
+_OUTPUT = "Folder of the results; a later call resumes there."
 _ID = "What to reproduce: ids such as fig-5.58, all, chapter-4, or wildcards such as 'fig-5.*'."
 
 
 def reproduce(
-    ids: Annotated[
-        list[str] | None, Argument(metavar="[ID...]", help=_ID, autocompletion=opt.make_completion(_item_names))
-    ] = None,
+    ids: Annotated[list[str] | None, Argument(metavar="[ID...]", help=_ID, autocompletion=_complete_items)] = None,
     listing: Annotated[bool, Option("--list", help="List the items, and what each needs.")] = False,
     quick: Annotated[bool, Option("--quick", help="Fewer and shorter simulations.")] = False,
-    output: Annotated[Path, Option("--output", "-o", help="Folder of the results; a later call resumes there.")] = Path(
-        "sealscope-thesis"
-    ),
+    output: Annotated[Path, Option("--output", "-o", help=_OUTPUT)] = Path("sealscope-thesis"),
     sheet: opt.SheetOption = None,
     jobs: opt.JobsOption = None,
 ) -> None:

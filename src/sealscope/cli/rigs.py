@@ -94,13 +94,11 @@ def _parse_size(text: str | None, si_unit: str, default_unit: str, option: str, 
     """Parse the text of an option to a number in `si_unit`; a text without a unit is in `default_unit`.
 
     If `text` is missing and a `label` is stated, the user is asked for the value at the terminal, with this label.
-    Raises InputError if the text does not begin with a finite number, or has a unit of another dimension.
     """
     from sealscope.units import parse_quantity
 
     if not text:
         text = str(prompt(f"{label} [{default_unit}]")) if label else ""
-
     with suppress(ValueError):  # a text with a unit, which `float` refuses, stays unchanged
         text = f"{float(text)}[{default_unit}]"
     return parse_quantity(text, si_unit, name=option)

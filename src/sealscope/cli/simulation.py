@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 _PROVE = "Halve the step and report how far everything moves; fail if too far."
 _FMU = "Record this unit (.fmu, a program that runs with your rights) instead of the rig, by the rig's instruments."
+_FOLDER = "Folder for the recordings and the page."
 _MAP = "The unit's own name of a channel or an input; repeat."
 
 
@@ -109,9 +110,7 @@ def parameters(
 
 def demo(
     context: Context,
-    folder: Annotated[Path, Option("--output", "-o", help="Folder for the recordings and the page.")] = Path(
-        "sealscope-demo"
-    ),
+    folder: Annotated[Path, Option("--output", "-o", help=_FOLDER)] = Path("sealscope-demo"),
     seed: opt.SeedOption = 1,
 ) -> None:
     """Commission a simulated machine on five healthy recordings, then judge a healthy and a leaking one.

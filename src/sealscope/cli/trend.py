@@ -98,7 +98,7 @@ def trend(
 def _count_known(readings: Sequence[LeakReading], machine: CommissionedMachine) -> int:
     """Count the first `readings`, in the order of their dates, whose recordings the machine's file lists as healthy.
 
-    The count ends at the first one not listed. Recordings without a date come first, and copies count once.
+    Recordings without a date come first, and copies count once.
     """
     known = {recording.digest for recording in machine.healthy}
     by_date = sorted(readings, key=lambda reading: -math.inf if reading.start is None else reading.start)

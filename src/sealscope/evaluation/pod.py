@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from sealscope.errors import InputError
 from sealscope.evaluation.binomial import Proportion, lower_bound, proportion
-from sealscope.evaluation.checks import Array, as_flags, as_probability, as_sizes
+from sealscope.recordings.channels import Array
 
 #: The search for a bound ends, and the bound is infinite, if a step exceeds this many ranges of the sizes' logarithms.
 _MAX_SPANS = 1e4
@@ -35,14 +35,13 @@ class SizeDetection:
 def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: float = 0.95) -> list[SizeDetection]:
     """Compute the proportion of detected leaks of each size, in the order of rising size, with confidence bounds.
 
-    `leaks` (n,): sizes in any unit; `hits` (n,): True for the detected leaks. Raises InputError for a size <= 0.
+    `leaks` (n,): sizes > 0 in any unit; `hits` (n,): True for the detected leaks.
     """
-    sizes = as_sizes(leaks)
-    is_hit = as_flags(hits, sizes.size, "hits")
+    sizes, is_hit = np.asarray(leaks), np.asarray(hits, dtype=bool)
     rows = []
     for size in np.unique(sizes):
         hits_at_size = is_hit[sizes == size]
-        k, n = int(hits_at_size.sum()), int(hits_at_size.size)
+        k, n = int(hits_at_size.sum()), hits_at_size.size
         rows.append(SizeDetection(float(size), proportion(k, n, confidence), lower_bound(k, n, confidence)))
     return rows
 
@@ -50,14 +49,13 @@ def detection_by_size(leaks: npt.ArrayLike, hits: npt.ArrayLike, confidence: flo
 def proven_size(rows: list[SizeDetection], detection: float = 0.9) -> float:
     """Find the smallest tested size such that this and all larger tested sizes are proven to be detected.
 
-    `rows`: proportion of detected leaks of each size. A size is proven if the lower confidence bound of its proportion
-    is at least `detection`; the confidence applies to each size separately. For example, 29 hits of 29 prove 90 % at
-    95 % confidence: this is a90/95 without a model. Returns infinity if the largest size is not proven. Source: Clopper
-    and Pearson (1934), doi 10.1093/biomet/26.4.404.
+    `rows`: proportion of detected leaks of each size, in rising order. A size is proven if the lower confidence bound
+    of its proportion is at least `detection`; the confidence applies to each size separately. For example, 29 hits of
+    29 prove 90 % at 95 % confidence: this is a90/95 without a model. Returns infinity if the largest size is not
+    proven. Source: Clopper and Pearson (1934), doi 10.1093/biomet/26.4.404.
     """
-    as_probability(detection, "the probability of detection")
     proven = math.inf
-    for row in sorted(rows, key=lambda row: -row.size):
+    for row in reversed(rows):
         if row.lower < detection:
             break
         proven = row.size
@@ -133,19 +131,12 @@ def _is_separated(n: Array, k: Array) -> bool:
 class HitMiss:
     """A logistic curve fitted to hits and misses: ``ln(POD/(1 - POD)) = intercept + slope ln(size)``.
 
-    Attributes
-    ----------
-    intercept, slope : float
-        Coefficients of the curve.
-    covariance : ndarray, shape (2, 2)
-        Covariance of intercept and slope.
-    estimator : {"maximum likelihood", "firth"}
-        Method of the fit: Firth's penalised likelihood if hits and misses are separated by size, else maximum
-        likelihood.
-    log_likelihood, null : float
-        Log-likelihood of the fit and of the best curve with slope 0, including the penalty if there is one.
-    size, tested, hits : ndarray, shape (m,)
-        Tested sizes, and at each the number of leaks and of hits.
+    - `covariance` (2, 2): that of intercept and slope
+    - `estimator`: method of the fit, Firth's penalised likelihood if hits and misses are separated by size, else
+      maximum likelihood
+    - `log_likelihood`, `null`: log-likelihood of the fit and of the best curve with slope 0, including the penalty if
+      there is one
+    - `size`, `tested`, `hits` (m,): tested sizes, and at each the number of leaks and of hits
     """
 
     intercept: float
@@ -159,10 +150,10 @@ class HitMiss:
     hits: Array
 
     def detection(self, size: npt.ArrayLike) -> Array:
-        """Compute the fitted probability of detection at each `size`; raise InputError for one that is not positive."""
+        """Compute the fitted probability of detection at each `size` > 0."""
         from scipy.special import expit
 
-        return np.asarray(expit(self.intercept + self.slope * _log_sizes(size)), dtype=np.float64)
+        return np.asarray(expit(self.intercept + self.slope * np.log(size)))
 
     def detection_band(self, size: npt.ArrayLike, confidence: float = 0.95) -> tuple[Array, Array]:
         """Compute a two-sided confidence interval (low, high) of the probability of detection at each `size`.
@@ -171,12 +162,12 @@ class HitMiss:
         """
         from scipy.special import expit, ndtri
 
-        x = _log_sizes(size)
+        x = np.log(size)
         v = self.covariance  # covariance of intercept and slope
-        z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
+        z = float(ndtri(0.5 + confidence / 2.0))
         margin = z * np.sqrt(v[0, 0] + 2.0 * v[0, 1] * x + v[1, 1] * x * x)
         eta = self.intercept + self.slope * x
-        return np.asarray(expit(eta - margin), dtype=np.float64), np.asarray(expit(eta + margin), dtype=np.float64)
+        return np.asarray(expit(eta - margin)), np.asarray(expit(eta + margin))
 
     def size_at(self, detection: float) -> float:
         """Compute the size that is detected with the probability p = `detection`, such as a90 for 0.9.
@@ -184,7 +175,6 @@ class HitMiss:
         Its logarithm is ``(ln(p/(1-p)) - intercept)/slope``. The size is infinite if the detection does not rise with
         it (slope <= 0).
         """
-        as_probability(detection, "the probability of detection")
         return _exp_size((_log_odds(detection) - self.intercept) / self.slope) if self.slope > 0.0 else math.inf
 
     def size_bound(self, detection: float = 0.9, confidence: float = 0.95) -> float:
@@ -192,17 +182,13 @@ class HitMiss:
 
         By default it is a90/95. The bound is the largest size whose profile log-likelihood is within ``z^2/2`` of the
         maximum, with z the normal quantile of `confidence` (chi square with one degree of freedom). It is infinite if
-        this holds for arbitrarily large sizes, or if the detection does not rise with the size. Raises InputError
-        unless `confidence` is from 0.5 (the estimate itself) to below 1. Source: MIL-HDBK-1823A (2009), appendix G.
-        Cheng and Iles, Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds,
-        which are wider.
+        this holds for arbitrarily large sizes, or if the detection does not rise with the size. `confidence`: from 0.5,
+        which gives the estimate itself, to below 1. Source: MIL-HDBK-1823A (2009), appendix G. Cheng and Iles,
+        Technometrics 25 (1983) 77-86, doi 10.1080/00401706.1983.10487822, give simultaneous bounds, which are wider.
         """
         from scipy.optimize import brentq
         from scipy.special import ndtri
 
-        as_probability(detection, "the probability of detection")
-        if not 0.5 <= confidence < 1.0:
-            raise InputError(f"confidence must be from 0.5 to 1, got {confidence}")
         log_odds = _log_odds(detection)
         allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # largest drop of the log-likelihood
         if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # even slope 0 is within the drop
@@ -213,7 +199,7 @@ class HitMiss:
             return self.log_likelihood - self._profile_log_likelihood(log_odds, log_size) - allowed_drop
 
         # bracket the root with growing steps from the estimate upwards
-        log_range = float(np.ptp(_log_sizes(self.size)))
+        log_range = float(np.ptp(np.log(self.size)))
         lower = (log_odds - self.intercept) / self.slope
         step = log_range / 8.0
         upper = lower + step
@@ -244,7 +230,7 @@ class HitMiss:
         """Compute the largest log-likelihood of all logistic curves through one point (log size, log odds)."""
         from scipy.optimize import minimize_scalar
 
-        x = _log_sizes(self.size)
+        x = np.log(self.size)
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
@@ -253,13 +239,8 @@ class HitMiss:
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
-        width = max(float(np.abs(x - log_size).max()), 1e-300)  # never 0: a divisor below
+        width = float(np.abs(x - log_size).max())
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
-
-
-def _log_sizes(values: npt.ArrayLike) -> Array:
-    """Compute the natural logarithms of sizes (n,); raise InputError for a size that is not positive."""
-    return np.asarray(np.log(as_sizes(np.atleast_1d(np.asarray(values, dtype=np.float64)), "sizes")), dtype=np.float64)
 
 
 def _exp_size(log_size: float) -> float:
@@ -270,42 +251,37 @@ def _exp_size(log_size: float) -> float:
 def fit_hit_miss(leaks: npt.ArrayLike, hits: npt.ArrayLike) -> HitMiss:
     """Fit a logistic curve of the probability of detection to hits and misses over the logarithm of the leak's size.
 
-    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised. If
-    the size separates hits from misses, the likelihood has no finite maximum, and Firth's penalised likelihood is used,
-    also in `HitMiss.size_bound`; `HitMiss.estimator` names the method. The curve goes to 0 for small leaks, as it does
-    not include the false-alarm rate. Raises InputError for a single size, only hits or only misses. Source:
-    MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi 10.1093/biomet/80.1.27; Heinze and
-    Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
+    `leaks` (n,): positive sizes in any unit; `hits` (n,): True for the detected leaks. The likelihood is maximised, or
+    Firth's penalised likelihood if the size separates hits from misses, as the likelihood has no finite maximum then.
+    The curve goes to 0 for small leaks, as it does not include the false-alarm rate. Raises InputError for a single
+    size, only hits or only misses. Source: MIL-HDBK-1823A (2009), appendix G; Firth, Biometrika 80 (1993) 27-38, doi
+    10.1093/biomet/80.1.27; Heinze and Schemper, Stat. Med. 21 (2002) 2409-2419, doi 10.1002/sim.1047.
     """
-    x = np.log(as_sizes(leaks))
-    is_hit = as_flags(hits, x.size, "hits")
+    x, is_hit = np.log(leaks), np.asarray(hits, dtype=bool)
     if is_hit.all() or not is_hit.any():
         raise InputError(f"a curve needs hits and misses, got {int(is_hit.sum())} hits of {is_hit.size}")
     values, index = np.unique(x, return_inverse=True)  # logarithms of the tested sizes; index of each leak in them
     if values.size < 2:
         raise InputError(f"a curve needs leaks of at least 2 sizes, got {is_hit.size} of one size")
-    n = np.asarray(np.bincount(index), dtype=np.float64)  # leaks of each size
-    k = np.asarray(np.bincount(index, weights=is_hit.astype(np.float64)), dtype=np.float64)  # hits of each size
+    n, k = np.bincount(index).astype(float), np.bincount(index[is_hit], minlength=values.size).astype(float)
     firth = _is_separated(n, k)
     # centred and scaled for the fit, so that the unit of the size does not matter
     centre, half_range = float(values.mean()), float(np.ptp(values)) / 2.0
-    design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
-    beta = _fit_coefficients(design, n, k, firth=firth)
-    # intercept and slope over ln(size), from those over the scaled logarithm
-    unscale = np.array([[1.0, -centre / half_range], [0.0, 1.0 / half_range]])
-    covariance = unscale @ np.linalg.inv(_information(design, n, design @ beta)) @ unscale.T
-    intercept, slope = (float(b) for b in unscale @ beta)
-    unscaled_design = np.column_stack([np.ones(values.size), values])
+    scaled_design = np.column_stack([np.ones(values.size), (values - centre) / half_range])
+    scaled_intercept, scaled_slope = _fit_coefficients(scaled_design, n, k, firth=firth).tolist()
+    slope = scaled_slope / half_range
+    intercept = scaled_intercept - slope * centre
+    design, eta = np.column_stack([np.ones(values.size), values]), intercept + slope * values
     # with slope 0 Firth's penalty is ln(p(1 - p)) + constant, which acts as one more hit and one more miss
     n_added = 1.0 if firth else 0.0
     null_eta = np.full(n.size, _log_odds((k.sum() + n_added) / (n.sum() + 2.0 * n_added)))
     return HitMiss(
         intercept=intercept,
         slope=slope,
-        covariance=np.asarray(covariance, dtype=np.float64),
+        covariance=np.asarray(np.linalg.inv(_information(design, n, eta)), dtype=np.float64),
         estimator="firth" if firth else "maximum likelihood",
-        log_likelihood=_log_likelihood(unscaled_design, n, k, intercept + slope * values, firth=firth),
-        null=_log_likelihood(unscaled_design, n, k, null_eta, firth=firth),
+        log_likelihood=_log_likelihood(design, n, k, eta, firth=firth),
+        null=_log_likelihood(design, n, k, null_eta, firth=firth),
         size=np.exp(values),
         tested=n,
         hits=k,

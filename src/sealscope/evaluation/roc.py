@@ -4,28 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from sealscope.errors import InputError
-from sealscope.evaluation.checks import Array, as_numbers, as_probability
+from sealscope.recordings.channels import Array
 
 
 @dataclass(frozen=True)
 class Roc:
     """The ROC curve, from (0, 0) to (1, 1) in the order of falling thresholds, with a confidence band.
 
-    Attributes
-    ----------
-    threshold, false_alarm, detection : ndarray, shape (k,)
-        Thresholds, and fractions of the leak-free and of the leaky scores that reach them and raise an alarm.
-    low, high : ndarray, shape (k,)
-        Simultaneous confidence band of the detection at each false-alarm probability.
+    At each of the k thresholds, `false_alarm` and `detection` (k,) are the fractions of the leak-free and of the leaky
+    scores that reach it and raise an alarm; `low` and `high` (k,) are the ends of the band, which is simultaneous.
     """
 
-    threshold: Array
     false_alarm: Array
     detection: Array
     low: Array
@@ -34,27 +27,16 @@ class Roc:
 
 @dataclass(frozen=True)
 class Area:
-    """Area under the ROC curve, with its standard error and its confidence interval from `low` to `high`.
-
-    `value` is P(leaky score > leak-free score) + P(equal)/2. `standard_error` is DeLong's, and 0 if the scores are
-    completely separated or all equal. `method` is the method of the interval, "newcombe" in these two cases.
-    """
+    """Area under the ROC curve, P(leaky score > leak-free score) + P(equal)/2, with its confidence interval."""
 
     value: float
-    standard_error: float
     low: float
     high: float
-    method: Literal["delong", "newcombe"]
 
 
-def _as_scores(leak_free: npt.ArrayLike, leaky: npt.ArrayLike) -> tuple[Array, Array]:
-    """Convert the scores of leak-free and of leaky records to arrays; raise InputError unless they are finite."""
-    return as_numbers(leak_free, "leak-free scores"), as_numbers(leaky, "scores with a leak")
-
-
-def _count_alarms(scores: Array, thresholds: Array) -> Array:
-    """Count for each of `thresholds` (k,) how many of `scores` (n,) reach or exceed it."""
-    return np.asarray(scores.size - np.searchsorted(np.sort(scores), thresholds, side="left"), dtype=np.float64)
+def _alarm_fractions(scores: Array, thresholds: Array) -> Array:
+    """Compute for each of `thresholds` (k,) the fraction of `scores` (n,) that reach or exceed it."""
+    return np.asarray((scores.size - np.searchsorted(np.sort(scores), thresholds)) / scores.size)
 
 
 def kolmogorov_margin(n: int, confidence: float) -> float:
@@ -64,7 +46,7 @@ def kolmogorov_margin(n: int, confidence: float) -> float:
     at least the probability `confidence`. Source: Massart, Ann. Probab. 18 (1990) 1269-1283, doi
     10.1214/aop/1176990746.
     """
-    return math.sqrt(math.log(2.0 / (1.0 - as_probability(confidence, "confidence"))) / (2.0 * n))
+    return math.sqrt(math.log(2.0 / (1.0 - confidence)) / (2.0 * n))
 
 
 def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95) -> Roc:
@@ -73,20 +55,19 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     If scores of both groups are equal, the curve has a slanted step there. The confidence band contains the whole true
     curve with at least the probability `confidence`: at each point it reaches from the lowest detection minus e to the
     highest detection plus e among the points of the curve whose false alarms differ by at most d. Here d and e are the
-    `kolmogorov_margin` of the leak-free and of the leaky scores at the confidence sqrt(`confidence`). Raises InputError
-    unless there are scores of both groups. Source: Campbell, Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
+    `kolmogorov_margin` of the leak-free and of the leaky scores at the confidence sqrt(`confidence`). Source: Campbell,
+    Stat. Med. 13 (1994) 499-508, doi 10.1002/sim.4780130512.
     """
-    a, b = _as_scores(leak_free, leaky)
-    as_probability(confidence, "confidence")
+    a, b = np.asarray(leak_free, dtype=np.float64), np.asarray(leaky, dtype=np.float64)
     falling_scores = np.unique(np.concatenate([a, b]))[::-1]
     thresholds = np.concatenate([[np.inf], falling_scores])
-    false_alarm, detection = _count_alarms(a, thresholds) / a.size, _count_alarms(b, thresholds) / b.size
+    false_alarm, detection = _alarm_fractions(a, thresholds), _alarm_fractions(b, thresholds)
     d, e = (kolmogorov_margin(scores.size, math.sqrt(confidence)) for scores in (a, b))
     # first and last point of the curve whose false-alarm fraction is within d of the point's own
     first = np.searchsorted(false_alarm, false_alarm - d, side="left")
     last = np.searchsorted(false_alarm, false_alarm + d, side="right") - 1
     low, high = np.maximum(detection[first] - e, 0.0), np.minimum(detection[last] + e, 1.0)
-    return Roc(thresholds, false_alarm, detection, low, high)
+    return Roc(false_alarm, detection, low, high)
 
 
 def placements(leak_free: Array, leaky: Array) -> tuple[Array, Array]:
@@ -129,23 +110,17 @@ def auc(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float = 0.95
     """Compute the area under the ROC curve with a confidence interval.
 
     With scores a (n,) of leak-free and b (m,) of leaky records, high for leaks, the area is ``sum of (b > a) + (b =
-    a)/2`` over all pairs, divided by n m. The interval is DeLong's normal approximation, cut off at 0 and 1, or
-    Newcombe's if DeLong's has no width (scores completely separated or all equal). Raises InputError for fewer than 2
-    records of either group. Source: DeLong, DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi
-    10.2307/2531595, eq. (5)-(8).
+    a)/2`` over all pairs, divided by n m; n and m are at least 2. The interval is DeLong's normal approximation, cut
+    off at 0 and 1, or Newcombe's if DeLong's has no width (scores completely separated or all equal). Source: DeLong,
+    DeLong and Clarke-Pearson, Biometrics 44 (1988) 837-845, doi 10.2307/2531595, eq. (5)-(8).
     """
     from scipy.special import ndtri
 
-    a, b = _as_scores(leak_free, leaky)
-    z = float(ndtri(0.5 + as_probability(confidence, "confidence") / 2.0))
-    smaller_size = min(a.size, b.size)
-    if smaller_size < 2:
-        raise InputError(f"an interval of the area needs at least 2 records of each kind, got {smaller_size}")
-    leak_free_fractions, leaky_fractions = placements(a, b)
+    leak_free_fractions, leaky_fractions = placements(np.asarray(leak_free), np.asarray(leaky))
+    z = float(ndtri(0.5 + confidence / 2.0))
     value = float(leaky_fractions.mean())
-    variances = (values.var(ddof=1) / values.size for values in (leak_free_fractions, leaky_fractions))
+    variances = (fractions.var(ddof=1) / fractions.size for fractions in (leak_free_fractions, leaky_fractions))
     standard_error = math.sqrt(sum(variances))
     if standard_error < 1e-12:  # 0 up to rounding
-        return Area(value, standard_error, *_newcombe_interval(value, a.size, b.size, z), "newcombe")
-    margin = z * standard_error
-    return Area(value, standard_error, max(0.0, value - margin), min(1.0, value + margin), "delong")
+        return Area(value, *_newcombe_interval(value, leak_free_fractions.size, leaky_fractions.size, z))
+    return Area(value, max(0.0, value - z * standard_error), min(1.0, value + z * standard_error))

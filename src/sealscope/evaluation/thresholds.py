@@ -6,14 +6,11 @@ The threshold is one of the scores, so that the results are exact for any distri
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
-
-from sealscope.errors import InputError
-from sealscope.evaluation.checks import as_numbers, as_probability
 
 #: How a false-alarm probability is kept. `average`: on average over sets of leak-free records; `bound`: with a stated
 #: confidence in each set.
@@ -24,44 +21,30 @@ Promise = Literal["average", "bound"]
 class Threshold:
     """A threshold set from leak-free scores; an alarm is raised if the score exceeds `value`.
 
-    Attributes
-    ----------
-    false_alarm_probability : float
-        The requested false-alarm probability.
-    promise : {"average", "bound"}
-        Whether this probability is kept on average over sets of leak-free records, or as a bound with `confidence`.
-    rank, n : int
-        The threshold is the `rank`-th largest of `n` leak-free scores.
-    expected, low, high : float
-        Mean of the true false-alarm probability, and its interval at `confidence`. The true probability is
-        distributed as Beta(rank, n + 1 - rank), and is smaller if scores are equal.
-    confidence : float
-        Confidence of the interval, and of the promise "bound".
+    - `false_alarm_probability`: the requested one
+    - `rank`, `n`: the threshold is the `rank`-th largest of `n` leak-free scores
+    - `expected`, `low`, `high`: mean of the true false-alarm probability, and its confidence interval. The true
+      probability is distributed as Beta(rank, n + 1 - rank), and is smaller if scores are equal.
     """
 
     value: float
     false_alarm_probability: float
-    promise: Promise
     rank: int
     n: int
     expected: float
     low: float
     high: float
-    confidence: float
 
 
-def records_needed(false_alarm: float, confidence: float | None = None) -> int:
+def records_needed(false_alarm: float, confidence: float = 0.95, promise: Promise = "average") -> int:
     """Compute the smallest number of leak-free records that can set a threshold for a false-alarm probability p.
 
     A threshold that keeps p on average needs ``ceil(1/p) - 1`` records. One that keeps p with the probability
-    `confidence` needs n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Raises InputError for an
-    impossible probability or confidence. Source: Wilks, Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
+    `confidence` ("bound") needs n with ``1 - (1 - p)^n >= confidence``, for example 299 for 1 % at 95 %. Source: Wilks,
+    Ann. Math. Stat. 12 (1941) 91-96, doi 10.1214/aoms/1177731788.
     """
-    as_probability(false_alarm, "the false-alarm probability")
-    if confidence is None:
-        return max(1, math.ceil(1.0 / false_alarm * (1.0 - 1e-12)) - 1)  # 1e-12, here and below: for rounding errors
-    ratio = math.log1p(-as_probability(confidence, "confidence")) / math.log1p(-false_alarm)
-    return max(1, math.ceil(ratio * (1.0 - 1e-12)))
+    n = 1.0 / false_alarm - 1.0 if promise == "average" else math.log1p(-confidence) / math.log1p(-false_alarm)
+    return max(1, math.ceil(n * (1.0 - 1e-12)))  # 1e-12: rounding errors
 
 
 def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: float) -> int:
@@ -69,7 +52,7 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
 
     With the score of rank r as the threshold, the true false-alarm probability is distributed as Beta(r, n + 1 - r).
     The result is the largest r whose mean r/(n + 1) is at most `false_alarm` ("average"), or with which the true
-    probability is at most `false_alarm` with at least the probability `confidence` ("bound"); 0 if n is too small.
+    probability is at most `false_alarm` with at least the probability `confidence` ("bound").
     """
     from scipy.special import betainc
 
@@ -81,40 +64,28 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
 
 
 def quantile_threshold(
-    scores: npt.ArrayLike, false_alarm: float, confidence: float = 0.95, promise: Promise = "average"
+    scores: Sequence[float], false_alarm: float, confidence: float = 0.95, promise: Promise = "average"
 ) -> Threshold:
     """Compute the lowest threshold that keeps a false-alarm probability p, from scores of leak-free records.
 
-    `scores` (n,) are high for a leak, and `false_alarm` is p. With the promise "average", the threshold is the
-    ``floor(p (n + 1))``-th highest score, which the next leak-free record exceeds with a probability of at most p
-    (split conformal). With "bound", it is the lowest score whose true false-alarm probability is at most p with the
-    probability `confidence` (tolerance limit). Both are exact for independent records of any continuous distribution.
-    Raises InputError, with the number needed, if there are too few records. Source: Wilks (1941), doi
-    10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012) 475-490, proposition 2.
+    `scores` (n,) are high for a leak, with n at least `records_needed`; `false_alarm` is p. With the promise "average",
+    the threshold is the ``floor(p (n + 1))``-th highest score, which the next leak-free record exceeds with a
+    probability of at most p (split conformal). With "bound", it is the lowest score whose true false-alarm probability
+    is at most p with the probability `confidence` (tolerance limit). Both are exact for independent records of any
+    continuous distribution. Source: Wilks (1941), doi 10.1214/aoms/1177731788; Vovk, Proc. Mach. Learn. Res. 25 (2012)
+    475-490, proposition 2.
     """
     from scipy.special import betaincinv
 
-    values = as_numbers(scores, "leak-free scores")
-    as_probability(false_alarm, "the false-alarm probability")
-    as_probability(confidence, "confidence")
-    if promise not in ("average", "bound"):
-        raise InputError(f"the promise must be 'average' or 'bound', got {promise!r}")
-    n = values.size
+    n = len(scores)
     rank = _threshold_rank(n, false_alarm, promise, confidence)
-    if rank == 0:
-        needed = records_needed(false_alarm, confidence if promise == "bound" else None)
-        raise InputError(
-            f"leak-free records must be at least {needed} for a false-alarm probability of {false_alarm:g}, got {n}"
-        )
     tail = (1.0 - confidence) / 2.0
     return Threshold(
-        value=float(np.partition(values, n - rank)[n - rank]),  # the `rank`-th largest
+        value=float(sorted(scores)[-rank]),
         false_alarm_probability=false_alarm,
-        promise=promise,
         rank=rank,
         n=n,
         expected=rank / (n + 1),
         low=float(betaincinv(rank, n + 1 - rank, tail)),
         high=float(betaincinv(rank, n + 1 - rank, 1.0 - tail)),
-        confidence=confidence,
     )

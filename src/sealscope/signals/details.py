@@ -26,7 +26,8 @@ from sealscope.signals.filters import Array, IntArray, discrete_wavelet, reach, 
 #: Quantities of a chamber pressure: its details to level 4, and the sample product of the third and the fourth.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
 Transform = Literal["stationary", "decimated", "reconstructed"]
-Edge = Literal["symmetric", "periodic", "reflect", "constant", "zero", "smooth", "antisymmetric", "antireflect"]
+#: Mode of PyWavelets by which a signal is continued beyond its ends: its mirror image.
+_PADDING = "symmetric"
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +40,11 @@ class Details:
     ----------
     values : array, (levels, n)
         The details; row 0 is d_1.
-    approximation : array, (n,)
-        The low-pass part of the signal that remains after the deepest level.
     edges : array, (levels, 2)
         Number of samples at the beginning and at the end of each level that depend on padding.
     """
 
     values: Array
-    approximation: Array
     edges: IntArray
 
     @property
@@ -94,7 +92,8 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
     - reconstructed: before_j + after_j at both ends, since analysis and synthesis both reach beyond a sample. This is
       ``(L - 1)(2^j - 1)`` for filters of L taps.
     """
-    _check_choice(transform, Transform, "transform")
+    if transform not in get_args(Transform):
+        raise InputError(f"transform must be one of {', '.join(get_args(Transform))}, got {transform!r}")
     stationary = reach(wavelet, levels)
     if transform == "stationary":
         return stationary
@@ -117,12 +116,7 @@ def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "s
 
 
 def details(
-    signal: ArrayLike,
-    *,
-    wavelet: str = "db8",
-    levels: int = 4,
-    transform: Transform = "stationary",
-    edge: Edge = "symmetric",
+    signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary"
 ) -> Details:
     """Compute the wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 
@@ -133,19 +127,18 @@ def details(
     - "decimated": Mallat's transform, with each coefficient of level j repeated 2^j times;
     - "reconstructed": d_j is the part of the signal that comes from level j.
 
-    Beyond its ends the signal is padded by the mode `edge` of PyWavelets; `Details.inside` excludes the samples that
-    depend on padding.
+    Beyond its ends the signal is continued by its mirror image; `Details.inside` excludes the samples that depend on
+    this padding.
 
     The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
     (5 to 6 in each decimated level, 0 in each reconstructed one). A causal system knows d_j of sample n only at sample
     ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
 
     Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, for an
-    unknown wavelet, transform or edge, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
+    unknown wavelet or transform, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
     Leakage in Hydrostatic Actuation Systems", chapter 5; Mallat, A Wavelet Tour of Signal Processing, 3rd ed. (2009),
     sections 5.2.2 and 7.3; PyWavelets `swt(norm=False)`, `wavedec`, `waverec`.
     """
-    _check_choice(edge, Edge, "edge")
     levels = require_levels(levels)
     x = require_finite(signal, ndim=1)
     needed = min_samples(wavelet, levels, transform)
@@ -154,8 +147,8 @@ def details(
             f"signal must have at least {needed} samples for {levels} {transform} levels of {wavelet}, got {x.size}"
         )
     methods = {"stationary": _atrous_details, "decimated": _mallat_details, "reconstructed": _inverse_details}
-    values, approximation = methods[transform](x, discrete_wavelet(wavelet), levels, edge)
-    return Details(values, approximation, edge_samples(wavelet, levels, transform))
+    values = methods[transform](x, discrete_wavelet(wavelet), levels)
+    return Details(values, edge_samples(wavelet, levels, transform))
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
@@ -178,65 +171,45 @@ def segment_means(values: Array, bounds: ArrayLike) -> Array:
     return np.asarray(sums / np.diff(limits))
 
 
-def _check_choice(value: object, choices: Any, name: str) -> None:
-    """Raise InputError, with `name`, unless `value` is one of the values of the Literal type `choices`."""
-    allowed = get_args(choices)
-    if value not in allowed:
-        raise InputError(f"{name} must be one of {', '.join(allowed)}, got {value!r}")
-
-
-def _atrous_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute stationary details (levels, n), d_1 first, and approximation (n,) of a signal x (n,).
-
-    This is the a trous transform. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.pad` beyond the signal's ends.
-    """
+def _atrous_details(x: Array, wavelet: Any, levels: int) -> Array:
+    """Compute the stationary details (levels, n), d_1 first, of a signal x (n,) with a `pywt.Wavelet`."""
     import pywt
 
     before, after = (int(samples) for samples in reach(wavelet.name, levels)[-1])
     # swt is periodic: padding at least as long as the filters' reach keeps the wrapped samples away from the signal
     after += -(x.size + before + after) % 2**levels  # swt needs a multiple of 2^levels samples
-    padded = pywt.pad(x, (before, after), edge)
-    approximation, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
-    inside = slice(before, before + x.size)
-    return np.array([detail[inside] for detail in reversed(deepest_first)]), approximation[inside].copy()
+    padded = pywt.pad(x, (before, after), _PADDING)
+    _, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
+    return np.array([detail[before : before + x.size] for detail in reversed(deepest_first)])
 
 
-def _mallat_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute decimated details (levels, n), d_1 first, and approximation (n,) of a signal x (n,).
+def _mallat_details(x: Array, wavelet: Any, levels: int) -> Array:
+    """Compute the decimated details (levels, n), d_1 first, of a signal x (n,) with a `pywt.Wavelet`.
 
     This is Mallat's transform, with each coefficient of level j repeated 2^j times, so that all levels have the length
-    of the signal. `wavelet`: a `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` at the ends of the signal.
+    of the signal.
     """
     import pywt
 
-    approximation, *deepest_first = pywt.wavedec(x, wavelet, mode=edge, level=levels)
-    # before[j]: number of earlier samples on which d_j depends; before[0] is not used
-    before = [0, *reach(wavelet.name, levels)[:, 0].tolist()]
-
-    def hold_coefficients(coefficients: Array, level: int) -> Array:
-        """Repeat each coefficient of a level 2^level times, and remove the samples of the padding; returns (n,)."""
+    _, *deepest_first = pywt.wavedec(x, wavelet, mode=_PADDING, level=levels)
+    values = []
+    for level, (before, _) in enumerate(reach(wavelet.name, levels), start=1):
         # coefficient k of level j is the stationary detail at sample 2^j k - before_j
-        return np.repeat(coefficients, 2**level)[before[level] : before[level] + x.size]
-
-    values = [
-        hold_coefficients(coefficients, level) for level, coefficients in enumerate(reversed(deepest_first), start=1)
-    ]
-    return np.array(values), hold_coefficients(approximation, levels)
+        held = np.repeat(deepest_first[-level], 2**level)
+        values.append(held[before : before + x.size])
+    return np.array(values)
 
 
-def _inverse_details(x: Array, wavelet: Any, levels: int, edge: Edge) -> tuple[Array, Array]:
-    """Compute the reconstructed details (levels, n), d_1 first, and the approximation (n,) of a signal x (n,).
+def _inverse_details(x: Array, wavelet: Any, levels: int) -> Array:
+    """Compute the reconstructed details (levels, n), d_1 first, of a signal x (n,) with a `pywt.Wavelet`.
 
-    Their sum is the signal. Mallat's transform is inverted with the coefficients of one level at a time. `wavelet`: a
-    `pywt.Wavelet`; `edge`: mode of `pywt.wavedec` and `pywt.waverec` at the signal's ends.
+    Mallat's transform is inverted with the coefficients of one level at a time.
     """
     import pywt
 
-    coefficients = pywt.wavedec(x, wavelet, mode=edge, level=levels)
-
-    def reconstruct_level(index: int) -> Array:
-        """Compute the signal part (n,) from the `coefficients` at `index`: 0 (approximation) to `levels` (d_1)."""
+    coefficients = pywt.wavedec(x, wavelet, mode=_PADDING, level=levels)  # of the low-pass part, and of d_levels .. d_1
+    values = []
+    for index in range(levels, 0, -1):
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
-        return np.asarray(pywt.waverec(level_coefficients, wavelet, mode=edge), dtype=np.float64)[: x.size]
-
-    return np.array([reconstruct_level(index) for index in range(levels, 0, -1)]), reconstruct_level(0)
+        values.append(pywt.waverec(level_coefficients, wavelet, mode=_PADDING)[: x.size])
+    return np.array(values)

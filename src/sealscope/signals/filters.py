@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from functools import cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sealscope.calls import suggestion
 from sealscope.errors import InputError
 
 Array = NDArray[np.float64]
@@ -31,8 +31,7 @@ def discrete_wavelet(name: str) -> Any:
     import pywt
 
     if not isinstance(name, str) or name not in _wavelet_names():
-        matches = difflib.get_close_matches(str(name), _wavelet_names(), n=1)
-        hint = f"; did you mean {matches[0]}?" if matches else ""
+        hint = suggestion(str(name), _wavelet_names())
         raise InputError(f"wavelet must be a discrete wavelet such as db8, got {name!r}{hint}")
     return pywt.Wavelet(name)
 
@@ -93,11 +92,11 @@ def require_finite(values: ArrayLike, name: str = "signal", ndim: int | None = N
     return array
 
 
-def require_positive_int(value: object, name: str, unit: str = "") -> int:
-    """Return `value` as an int if it is a whole number of 1 or more; raise InputError otherwise.
+def require_whole(value: object, name: str, least: int = 1, unit: str = "") -> int:
+    """Return `value` as an int if it is a whole number >= `least`; raise InputError otherwise.
 
     The message states `name`, and the text `unit`, such as " sample", after the smallest number.
     """
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-        raise InputError(f"{name} must be a whole number >= 1{unit}, got {value!r}")
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+        raise InputError(f"{name} must be a whole number >= {least}{unit}, got {value!r}")
     return int(value)

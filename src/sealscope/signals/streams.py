@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
-from sealscope.signals.filters import Array, decomposition_filters, reach, require_levels, require_positive_int
+from sealscope.signals.filters import Array, decomposition_filters, reach, require_levels, require_whole
 from sealscope.storage.plain_state import require_count, require_numbers, require_part
 
 if TYPE_CHECKING:
@@ -81,11 +81,11 @@ class DetailStream:
         table = channels if isinstance(channels, tuple) else (1, channels)
         if len(table) != 2:
             raise InputError(f"channels must be a number or rows and columns of a table, got {channels}")
-        self._shape_2d = require_positive_int(table[0], "channels"), require_positive_int(table[1], "channels")
+        self._shape_2d = require_whole(table[0], "channels"), require_whole(table[1], "channels")
         self.channels = self._shape_2d if isinstance(channels, tuple) else self._shape_2d[1]
         self.levels = require_levels(levels)
         self.wavelet = wavelet
-        self.threads = require_positive_int(threads, "threads")
+        self.threads = require_whole(threads, "threads")
         low, high = (np.repeat(taps[:, None], WIDTH, axis=1) for taps in decomposition_filters(wavelet))
         self.first, self.delay = (int(samples) for samples in reach(wavelet, self.levels)[-1])  # deepest level
         self.settling = self.first + self.delay

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from sealscope.errors import InputError
 from sealscope.signals.details import Details
-from sealscope.signals.filters import Array, IntArray, require_finite, require_positive_int
+from sealscope.signals.filters import Array, IntArray, require_finite, require_whole
 from sealscope.storage.plain_state import require_count, require_numbers, require_part
 
 WINDOW_SIZE = 1000
@@ -92,16 +92,14 @@ class RmsStream:
 
     def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
         """Begin a stream without samples; the class describes the parameters."""
-        self.size = require_positive_int(size, "size", unit=" sample")
-        self.step = require_positive_int(step, "step", unit=" sample")
-        if isinstance(skip, bool) or not isinstance(skip, (int, np.integer)) or skip < 0:
-            raise InputError(f"skip must be a whole number >= 0 samples, got {skip!r}")
+        self.size = require_whole(size, "size", unit=" sample")
+        self.step = require_whole(step, "step", unit=" sample")
         self._piece = math.gcd(self.size, self.step)  # samples in a piece; windows consist of whole pieces
-        self._skip = int(skip)  # samples still to be dropped at the beginning
+        self._skip = require_whole(skip, "skip", 0, " samples")  # samples still to be dropped at the beginning
         self._next_end = int(first) + self.size  # sample number just after the next window
         self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
         self._sums: Array | None = None  # sums of squares of the pieces that coming windows need, (..., pieces)
-        self._n_unused = 0  # number of coming pieces that lie between two windows (if step > size), to be skipped
+        self._n_unused = 0  # number of coming pieces before the next window (if step > size)
 
     def update(self, block: ArrayLike) -> WindowedRms:
         """Add the next block of samples and return the RMS of the windows that it completes.
@@ -135,14 +133,11 @@ class RmsStream:
         n_full = x.shape[-1] // self._piece * self._piece  # samples in whole pieces, of which windows consist
         self._rest = x[..., n_full:].copy()
         sums = np.concatenate([self._sums, _piece_sums(x[..., :n_full], self._piece)], axis=-1)
-        n_skipped = min(self._n_unused, sums.shape[-1])
-        self._n_unused -= n_skipped
-        sums = sums[..., n_skipped:]
-        values = _rms_of_pieces(sums, self.size, self.step)
+        values = _rms_of_pieces(sums[..., self._n_unused :], self.size, self.step)
         n_windows = values.shape[-1]
-        n_finished = n_windows * (self.step // self._piece)  # pieces before the next window; some may be still to come
-        self._n_unused += max(0, n_finished - sums.shape[-1])
-        self._sums = sums[..., n_finished:].copy()
+        n_before = self._n_unused + n_windows * (self.step // self._piece)  # pieces before the next window
+        self._sums = sums[..., n_before:].copy()
+        self._n_unused = max(0, n_before - sums.shape[-1])
         ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)
         self._next_end += n_windows * self.step
         return WindowedRms(ends, values)
@@ -168,20 +163,22 @@ class RmsStream:
         stream._n_unused = require_count(state, "ahead")
         if rest is None and sums is None:  # saved before the first block
             return stream
-        leading_axes = np.shape(rest)[:-1]
-        if rest is None or sums is None or leading_axes != np.shape(sums)[:-1]:
+        try:
+            rest_shape, sums_shape = np.shape(rest), np.shape(sums)
+        except ValueError:  # rows of different lengths
+            rest_shape = sums_shape = ()
+        if not rest_shape or not sums_shape or rest_shape[:-1] != sums_shape[:-1]:
             raise InputError("saved state must have rest and sums of the same leading axes, got others")
-        stream._rest = require_numbers(state, "rest", np.shape(rest))
-        stream._sums = require_numbers(state, "sums", np.shape(sums))
+        stream._rest = require_numbers(state, "rest", rest_shape)
+        stream._sums = require_numbers(state, "sums", sums_shape)
         return stream
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
-    """Compute the sums of squares (..., n // piece) of consecutive pieces of `x` (..., n), of `piece` samples each."""
-    n_pieces = x.shape[-1] // piece
+    """Compute the sums of squares (..., n // piece) of the pieces of `piece` samples that make up `x` (..., n)."""
     # contiguous: the order of the additions, and so the rounding, must not depend on the layout of `x`
-    in_pieces = np.ascontiguousarray(x[..., : n_pieces * piece])
-    return np.asarray(np.add.reduce(np.square(in_pieces.reshape(-1, piece)), axis=-1)).reshape(*x.shape[:-1], n_pieces)
+    in_pieces = np.ascontiguousarray(x).reshape(-1, piece)
+    return np.asarray(np.add.reduce(np.square(in_pieces), axis=-1)).reshape(*x.shape[:-1], x.shape[-1] // piece)
 
 
 def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:

@@ -16,7 +16,7 @@ import numpy as np
 from sealscope.campaigns.plans.duty import CONTROLLER, FAMILY
 from sealscope.campaigns.plans.model import SimulatedPlan, Use
 from sealscope.control.registry import find_controller_source
-from sealscope.simulation.bench.profile import load_profile
+from sealscope.simulation.bench.profile import Profile
 
 #: Parameters of a rig that only verdicts use; no simulated record depends on them.
 _PRIORS = frozenset({"pump.G_healthy"})
@@ -51,11 +51,10 @@ class CaseInputs:
 
 @dataclass(frozen=True, kw_only=True)
 class CampaignCase(CaseInputs):
-    """One record to simulate and judge.
+    """One record to simulate and judge, whose seeds and `id` follow from a hash of all its inputs (`list_cases`).
 
     `machine_seed`: seed by which its machine is drawn from the plan's profile; `noise_seed`: seed of the sensors'
-    noise. Seeds and `id` follow from a hash of the record's inputs, of `shared_inputs`, and of the content of the
-    machine family and the controller's file that its levels name.
+    noise.
     """
 
     machine_seed: int
@@ -68,9 +67,8 @@ def digest(value: Any) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def profile_key(name: str) -> str:
-    """Compute a hash (hex) of the content of a profile (`name` or file), from which machines are drawn."""
-    profile = load_profile(name)
+def profile_key(profile: Profile) -> str:
+    """Compute a hash (hex) of the content of a profile, from which machines are drawn."""
     # the seeds of cases depend on this hash, and so on the profile's name; a renamed profile that must draw the same
     # cases as before states its former name in `seeds`
     return digest(repr(replace(profile, name=profile.seeds or profile.name, place="")))
@@ -80,7 +78,7 @@ def shared_inputs(plan: SimulatedPlan) -> dict[str, Any]:
     """Collect the inputs that all records of a plan share: hashes of rig and profile, length, onset and base seed."""
     return {
         "rig": digest({name: repr(value) for name, value in plan.rig.present_values().items() if name not in _PRIORS}),
-        "profile": profile_key(plan.profile) if plan.profile else "",
+        "profile": profile_key(plan.machine_profile) if plan.machine_profile else "",
         "duration_s": plan.duration_s,
         "onset_s": plan.onset_s,
         "seed": plan.seed,
@@ -93,8 +91,9 @@ def _level_digests(plan: SimulatedPlan) -> dict[str, dict[str, str]]:
     The id of a case depends on those of its own levels only, so its stored row stays valid if another level is edited.
     """
     digests: dict[str, dict[str, str]] = {FAMILY: {}, CONTROLLER: {}}
-    for level in plan.factors.get(FAMILY, ()):
-        digests[FAMILY][str(level)] = digest(repr(load_profile(plan.profile).family(str(level))))
+    if plan.machine_profile is not None:
+        for level in plan.factors.get(FAMILY, ()):
+            digests[FAMILY][str(level)] = digest(repr(plan.machine_profile.family(str(level))))
     for level in plan.factors.get(CONTROLLER, ()):
         if path := find_controller_source(str(level)):
             digests[CONTROLLER][str(level)] = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -106,8 +105,7 @@ def list_cases(plan: SimulatedPlan) -> list[CampaignCase]:
 
     The records of a group take the combinations of the factors' levels in turn; `replicate` counts the completed turns.
     """
-    combinations = itertools.product(*plan.factors.values())
-    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in combinations]
+    cells = [dict(zip(plan.factors, levels, strict=True)) for levels in itertools.product(*plan.factors.values())]
     shared = shared_inputs(plan)
     digests_by_factor = _level_digests(plan)
     cases = []
@@ -145,15 +143,14 @@ def interleave_cases(cases: Sequence[CampaignCase]) -> list[CampaignCase]:
     for group in groups:
         positions.append((n_listed[group] + 0.5) / n_total[group])
         n_listed[group] += 1
-    return [cases[k] for k in sorted(range(len(cases)), key=positions.__getitem__)]
+    return [cases[k] for k in np.argsort(positions, kind="stable")]
 
 
 def iter_sources() -> Iterator[Path]:
     """Yield the package's source files on which the result of a record may depend."""
+    left_out = [_PACKAGE / part for part in _NOT_IN_ROWS]
     for path in sorted(_PACKAGE.rglob("*")):
-        name = path.relative_to(_PACKAGE).as_posix()
-        is_left_out = any(f"{name}/".startswith(f"{part}/") for part in _NOT_IN_ROWS)  # "/": whole names only
-        if path.suffix in (".py", ".toml") and not is_left_out:
+        if path.suffix in (".py", ".toml") and not any(path.is_relative_to(part) for part in left_out):
             yield path
 
 

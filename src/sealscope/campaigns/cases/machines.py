@@ -19,7 +19,6 @@ from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.parameters import declared_names
 from sealscope.parameters.names import resolve_name
 from sealscope.simulation.bench.machines import BenchMachine, draw
-from sealscope.simulation.bench.profile import Profile
 from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import solve_leak_coefficients
@@ -43,18 +42,15 @@ def case_leaks(plan: SimulatedPlan, case: CampaignCase) -> tuple[Leak, ...]:
     return tuple(Leak(law, mean=mean, opening=opening_from(plan.onset_s)) for law in laws)
 
 
-def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase, profile: Profile | None = None) -> Experiment:
+def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
     """Build the experiment of a case, whose leaks have their mean flow but not yet a coefficient (`case_leaks`).
 
     The machine is drawn from the plan's profile with the seed of the case; without a profile it is the plan's rig. The
-    levels (values) of the plan's factors replace the machine's parameters, command, controller and load. `profile`: the
-    plan's profile if it is already loaded.
+    levels (values) of the plan's factors replace the machine's parameters, command, controller and load.
     """
-    if plan.profile:
+    if plan.machine_profile is not None:
         family = str(case.levels.get(FAMILY, ""))
-        machine = draw(
-            profile or plan.profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s, family=family
-        )
+        machine = draw(plan.machine_profile, case.machine_seed, rig=plan.rig, duration=plan.duration_s, family=family)
     else:
         machine = BenchMachine(
             profile="none",

@@ -7,8 +7,8 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,21 +51,16 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
     for path, count in Counter(path for _, path in files).items():
         if count > 1:
             raise InputError(f"a recording must be in one set only, got {count} sets ({path})")
-    rows: dict[str, CaseRow] = {}
-    for number, (recording_set, path) in enumerate(files, 1):
-        row = _judge_file(plan, recording_set, path, path.relative_to(folder).as_posix())
-        rows[row.id] = row
+    rows: list[CaseRow] = []
+    for recording_set, path in files:
+        rows.append(_judge_file(plan, recording_set, path, path.relative_to(folder).as_posix()))
         if progress is not None:
-            progress(number, len(files), sum(row.error is not None for row in rows.values()))
-    return [rows[name] for name in sorted(rows)]
+            progress(len(rows), len(files), sum(row.error is not None for row in rows))
+    return sorted(rows, key=lambda row: row.id)
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as strokes "out" (p_A higher on average) or "in" (p_B higher), or else as "both".
-
-    The strokes are of one direction if the |mean| of p_A - p_B exceeds the fraction `_MIN_ONE_SIDEDNESS` of its RMS.
-    Without both pressures the result is "both".
-    """
+    """Classify a recording as strokes "out" (p_A higher on average) or "in" (p_B higher), or else as "both"."""
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]
@@ -78,22 +73,17 @@ def _judge_file(plan: RecordedPlan, recording_set: RecordingSet, path: Path, nam
 
     `name`: path of the recording within the folder, from which the id of the row is computed.
     """
-    # the stroke is not yet known; it is set below, in this dictionary, which `make_row` keeps
-    levels = {"set": recording_set.label or recording_set.files, STROKE: "unknown"}
-    make_row = partial(
-        CaseRow,
-        id=hashlib.sha256(os.fsencode(name)).hexdigest()[:16],
-        use=recording_set.use,
-        leak_lpm=recording_set.size,
-        levels=levels,
-    )
+    levels: dict[str, str | float] = {"set": recording_set.label or recording_set.files, STROKE: "unknown"}
+    results: dict[str, Any]
     try:
         recording = read(path, map=plan.channel_map or None, rate=plan.rate_hz)
         rig, _ = assumed_rig(plan.assumed, recording)
         scores, statements = judge_record(recording, None, plan, rig)  # None: scorers split it in the middle
         levels[STROKE] = _stroke_direction(inspect_recording(recording, INSPECTED).part)
-        return make_row(scores=scores, statements=statements)
+        results = {"scores": scores, "statements": statements}
     except Exception as error:  # one bad recording must not end the campaign; its row carries the error
         if not isinstance(error, SealscopeError):
             _log.debug("cannot judge %s", path, exc_info=True)
-        return make_row(error=error_text(error))
+        results = {"error": error_text(error)}
+    row_id = hashlib.sha256(os.fsencode(name)).hexdigest()[:16]
+    return CaseRow(id=row_id, use=recording_set.use, leak_lpm=recording_set.size, levels=levels, **results)

@@ -27,7 +27,7 @@ _AMBIGUOUS_CAUSES = {
     "piston, pump or external leak": (PISTON_LEAK, "pump leak", "external leak"),
     **joint_causes(),
 }
-#: By detector, the pair of its score, None without one (`ranking_score`), and its estimate of the onset [s], or None.
+#: By detector, its score, None without one (`Statement.ranking_score`), and its estimate of the onset [s], or None.
 Scores = Mapping[str, tuple[float | None, float | None]]
 
 
@@ -52,7 +52,7 @@ class Statement:
     cause: str | None = None
 
     @classmethod
-    def from_evidence(cls, evidence: Evidence | Statement) -> Statement:
+    def from_evidence(cls, evidence: Evidence) -> Statement:
         """Copy the stored fields from a detector's evidence; numbers that are not finite become None."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
@@ -60,6 +60,25 @@ class Statement:
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 values[name] = None
         return cls(**values)
+
+    @property
+    def named_cause(self) -> str:
+        """Cause that the detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
+
+        With the verdict `leak` it is `cause` if that is in `LEAKS`, otherwise "piston leak". With any other verdict it
+        is the fault that `cause` names, such as an external leak; without a fault it is "cannot tell" for that verdict,
+        and "none" for `no leak`.
+        """
+        if self.verdict == "leak":
+            return self.cause if self.cause in LEAKS else PISTON_LEAK
+        if self.cause is not None and self.cause not in LEAKS:
+            return self.cause
+        return CANNOT_TELL if self.verdict == CANNOT_TELL else NO_CAUSE
+
+    @property
+    def ranking_score(self) -> float | None:
+        """The score, by which records are ranked (ROC); None if `named_cause` is no leak, such as a sensor fault."""
+        return self.score if self.named_cause in (*LEAKS, NO_CAUSE) else None
 
 
 @cache
@@ -83,28 +102,6 @@ def duty_label(levels: Mapping[str, str | float]) -> str:
 def matches_cause(named: str, true_cause: str) -> bool:
     """Return True if the cause that a detector names is the true cause, or an ambiguous cause that includes it."""
     return named == true_cause or true_cause in _AMBIGUOUS_CAUSES.get(named, ())
-
-
-def named_cause(evidence: Evidence | Statement) -> str:
-    """Determine the cause that a detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
-
-    With the verdict `leak` it is the evidence's cause if that is in `LEAKS`, otherwise "piston leak". With any other
-    verdict it is the fault that the evidence names, such as an external leak; without a fault it is "cannot tell" for
-    that verdict, and "none" for `no leak`.
-    """
-    if evidence.verdict == "leak":
-        return evidence.cause if evidence.cause in LEAKS else PISTON_LEAK
-    if evidence.cause is not None and evidence.cause not in LEAKS:
-        return evidence.cause
-    return CANNOT_TELL if evidence.verdict == CANNOT_TELL else NO_CAUSE
-
-
-def ranking_score(evidence: Evidence | Statement) -> float | None:
-    """Return a detector's score, by which records are ranked (ROC); None if it does not rate a leak.
-
-    That is so for `cannot tell`, and if the detector names a cause that is not in `LEAKS`, such as a sensor fault.
-    """
-    return evidence.score if named_cause(evidence) in (*LEAKS, NO_CAUSE) else None
 
 
 def error_text(error: Exception) -> str:

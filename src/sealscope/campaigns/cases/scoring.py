@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from sealscope.campaigns.cases.case import CampaignCase
 from sealscope.campaigns.cases.machines import case_experiment
-from sealscope.campaigns.cases.row import CaseRow, Scores, Statement, error_text, ranking_score
-from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, PlanDetector, Views, parse_detector_name
+from sealscope.campaigns.cases.row import CaseRow, Scores, Statement, error_text
+from sealscope.campaigns.plans.detectors import ALL_CHANNELS, DIAGNOSE, WATCH, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
-from sealscope.campaigns.plans.scorers import SplitRms
+from sealscope.campaigns.plans.scorers import LogRms, split_log_rms
 from sealscope.diagnosis.diagnose import Examination
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.live.watch import Watch
@@ -52,10 +51,8 @@ def judge_record(
 ) -> tuple[Scores, dict[str, Statement]]:
     """Run each detector of a plan on a recording; return, by detector, scores and statements (stored verdicts).
 
-    The scores are pairs of a detector's score and the onset [s] that it estimates, each None if there is none.
-    Detectors that only compute a score (scorers) have no statement. `split_s` [s]: time at which scorers split the
-    recording, None for its middle; `rig`: the rig that detectors may assume. Raises InputError if the recording has a
-    defect that rules out any verdict.
+    Scorers have no statement. `split_s` [s]: time at which they split the recording, None for its middle; `rig`: the
+    rig that detectors may assume. Raises InputError if the recording has a defect that rules out any verdict.
     """
     record = inspect_recording(recording, INSPECTED)  # `part`: usable samples; `share`: their fraction
     if record.defect is not None:
@@ -64,43 +61,38 @@ def judge_record(
     detectors = [parse_detector_name(name) for name in plan.detectors]
     views = dict.fromkeys(detector.view for detector in detectors)
     examinations = {view: examination.with_channels(plan.views.get(view, ALL_CHANNELS)) for view in views}
-    scores: dict[str, tuple[float | None, float | None]] = {}
+    log_rms: LogRms = {}
     if any(detector.scorer is not None for detector in detectors):
         split_s = float(record.part.t[0]) + record.part.duration / 2 if split_s is None else split_s
-        scores = score_details(SplitRms.from_recording(record.part, split_s), plan.detectors, plan.views)
+        log_rms = split_log_rms(record.part, split_s)
+    scores = score_details(log_rms, plan)
     statements: dict[str, Statement] = {}
     for detector in detectors:
         if detector.scorer is None:
-            statement = Statement.from_evidence(_run_detector(detector, examinations[detector.view]))
+            case = examinations[detector.view]
+            if detector.base == WATCH:
+                evidence = run_watch(case.recording, case.rig, case.false_alarm_probability)
+            elif detector.base == DIAGNOSE:
+                evidence = case.decide_by_all()
+            else:
+                evidence = case.evidence(detector.base)
+            statement = Statement.from_evidence(evidence)
             statements[detector.name] = statement
-            score = _score_over_threshold(statement) if detector.base == DIAGNOSE else ranking_score(statement)
+            score = _score_over_threshold(statement) if detector.base == DIAGNOSE else statement.ranking_score
             scores[detector.name] = (score, statement.onset_s)
     return scores, statements
 
 
-def _run_detector(detector: PlanDetector, examination: Examination) -> Evidence:
-    """Run a detector that states a verdict, i.e. any but a scorer, on a prepared recording; return its evidence."""
-    if detector.base == WATCH:
-        return run_watch(examination.recording, examination.rig, examination.false_alarm_probability)
-    if detector.base == DIAGNOSE:
-        return examination.decide_by_all()
-    return examination.evidence(detector.base)
+def score_details(log_rms: LogRms, plan: SimulatedPlan | RecordedPlan) -> dict[str, tuple[float | None, float | None]]:
+    """Compute the scores of those detectors of a plan that only compute a score (scorers).
 
-
-def score_details(
-    split_rms: SplitRms, names: Sequence[str], views: Views
-) -> dict[str, tuple[float | None, float | None]]:
-    """Compute the scores of those detectors in `names` that only compute a score (scorers).
-
-    Returns (score or None, None) by detector, as scorers estimate no onset. `split_rms`: RMS of the wavelet details in
-    both parts of the record; `views`: sets of channels, by the name that follows "@" in a detector's name.
+    Returns (score or None, None) by detector, as scorers estimate no onset.
     """
     scores: dict[str, tuple[float | None, float | None]] = {}
-    for name in names:
+    for name in plan.detectors:
         detector = parse_detector_name(name)
         if detector.scorer is not None:
-            visible_rms = split_rms.through(views.get(detector.view, ALL_CHANNELS))
-            scores[name] = (detector.scorer.score(visible_rms), None)
+            scores[name] = (detector.scorer.score(log_rms, plan.views.get(detector.view, ALL_CHANNELS)), None)
     return scores
 
 
@@ -108,9 +100,9 @@ def _score_over_threshold(statement: Statement) -> float | None:
     """Compute the score of `diagnose` relative to its threshold: their ratio, or difference for a threshold <= 0.
 
     This makes records comparable, although the verdict of each may come from another detector with another scale.
-    Returns None if there is no threshold or no score for ranking (`ranking_score`).
+    Returns None if there is no threshold or no score for ranking.
     """
-    score, threshold = ranking_score(statement), statement.threshold
+    score, threshold = statement.ranking_score, statement.threshold
     if score is None or threshold is None:
         return None
     return score / threshold if threshold > 0 else score - threshold

@@ -22,14 +22,13 @@ from sealscope.campaigns.cases.scoring import score_details
 from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.campaigns.plans.duty import parse_plan_fault
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.campaigns.plans.scorers import SplitRms, split_bounds
+from sealscope.campaigns.plans.scorers import log_rms_of_squares, split_bounds
 from sealscope.errors import InputError, SealscopeError
 from sealscope.physics.solvers.limits import longest_step
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.signals.filters import IntArray
 from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.batch.run import refuse_unbatchable, with_leak_coefficient
-from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
 from sealscope.simulation.integrate import MAX_STEP_REFINEMENT, integrate_run, oversampling, steps_per_output
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers
@@ -52,11 +51,8 @@ def scored_bounds(plan: SimulatedPlan) -> IntArray:
 def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
     """Check that batches can simulate and score all cases of a plan; raise InputError otherwise.
 
-    - All detectors must be scorers, which need only the RMS of wavelet details before and after the onset.
-    - No recordings are kept, and both sides of the onset have usable samples.
-    - Each leak has a single law, and no sensor has a fault.
-    - No factor changes the sampling rate, and the runs can be simulated side by side (`refuse_unbatchable`). This is
-      tested on the first case of each combination of levels, leak and fault, unless its experiment cannot be built.
+    The rules on single runs (`refuse_unbatchable`) are tested on the first case of each combination of levels, leak and
+    fault.
     """
 
     def refusal(rule: str) -> InputError:
@@ -79,7 +75,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         fault = parse_plan_fault(group.fault, plan.onset_s) if group.fault else None
         if fault is not None and fault.row.is_sensor_fault:
             raise refusal(f"no fault of a sensor, got {group.fault!r}")
-    # first of equal levels, leak and fault
+    # reversed: of equal cases the first remains
     first_cases = {repr((case.levels, case.leak_lpm, case.fault)): case for case in reversed(cases)}
     for case in first_cases.values():
         try:
@@ -99,17 +95,16 @@ def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads:
     """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
     A row does not depend on the other cases, except as `simulate_batch` states of leakage coefficients that converge
-    badly. `threads`: number of threads of the simulation.
+    badly.
     """
-    profile = load_profile(plan.profile) if plan.profile else None
-    choose_step = make_step_chooser(plan, profile)
+    choose_step = make_step_chooser(plan)
     for start in range(0, len(cases), BATCH_SIZE):
         start_time, batch = time.process_time(), cases[start : start + BATCH_SIZE]
         pairs: list[tuple[CampaignCase, Experiment]] = []
         rows: list[CaseRow] = []
         for case in batch:
             try:
-                experiment = experiment_with_flow_leak(plan, case, profile)
+                experiment = experiment_with_flow_leak(plan, case)
                 pairs.append((case, replace(experiment, step=choose_step(case, experiment))))
             except Exception as error:  # a defect of one case must not end the campaign
                 rows.append(CaseRow.from_case(case, error=error_text(error)))
@@ -132,8 +127,7 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
         for (case, _), rms, flow in zip(pairs, batch.rms, batch.mean_leak_lpm, strict=True):
             # of the three intervals between bounds, 0 and 2 are the two parts, and 1 is the gap between them
             squares = dict(zip(CHAMBERS, rms[:, [0, 2]] ** 2, strict=True))  # mean squares by chamber
-            split_rms = SplitRms.from_squares(squares, bounds)
-            scores = score_details(split_rms, plan.detectors, plan.views)
+            scores = score_details(log_rms_of_squares(squares, bounds), plan)
             rows.append(CaseRow.from_case(case, flow_lpm=float(flow) if case.leak_lpm else 0.0, scores=scores))
         return rows
     except Exception as error:
@@ -166,21 +160,18 @@ def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experim
         G, C = (coefficient, 0.0) if experiment.leaks[0].law == "laminar" else (0.0, coefficient)
         limit = longest_step(loaded_rig_numbers(experiment.rig, experiment.load), G, C)
         if experiment.step is not None and experiment.step > limit:
-            experiment = replace(experiment, step=dividing_step(experiment.rate * oversampling(experiment), limit))
+            experiment = replace(experiment, step=_dividing_step(experiment, limit))
         sized_experiments[k] = experiment
     return sized_experiments
 
 
-def make_step_chooser(
-    plan: SimulatedPlan, profile: Profile | None = None
-) -> Callable[[CampaignCase, Experiment], float]:
+def make_step_chooser(plan: SimulatedPlan) -> Callable[[CampaignCase, Experiment], float]:
     """Build the function that chooses the solver's step [s] of a case from the case and its experiment.
 
     All cases with the same levels of the factors (a cell) share the search. `N_SCOUT_MACHINES` machines are drawn for
     the cell, and on a short run of each, `integrate_run` chooses the longest step that passes its check of the error. A
-    case gets the shortest of the steps chosen for machines with the same solver as its own. The step is shortened to
-    the longest stable one of the case's machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
-    `profile`: the plan's profile if it is already loaded.
+    case gets the shortest of the steps chosen for machines with its own solver, shortened to the longest stable one of
+    its machine, but to no less than about `LONGEST_STEP` / `MAX_STEP_REFINEMENT`.
     """
     shared = digest(shared_inputs(plan))
 
@@ -196,30 +187,27 @@ def make_step_chooser(
             seed = int(digest([shared, dict(levels), f"scout {number}"])[:15], 16)  # 15 hex digits: 60 bits
             try:
                 scout = CampaignCase(id="", machine_seed=seed, noise_seed=0, **content)
-                method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout, profile))
+                method, step = _choose_method_and_step(experiment_with_flow_leak(plan, scout))
             except SealscopeError:  # this machine cannot follow the cell's command
                 continue
             steps[method] = min(step, steps.get(method, math.inf))
         return steps
 
     def choose_step(case: CampaignCase, experiment: Experiment) -> float:
-        """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step.
-
-        If no machine drawn for the cell has the case's solver, the step is chosen on the case's experiment.
-        """
-        method = choose_method(experiment.rig, experiment.method)
-        step = cell_steps(*case.levels.items()).get(method)
-        if step is None:
+        """Choose the solver's step [s] of a case: the step of its cell, limited to the longest stable step."""
+        step = cell_steps(*case.levels.items()).get(choose_method(experiment.rig, experiment.method))
+        if step is None:  # no machine drawn for the cell has the case's solver
             _, step = _choose_method_and_step(experiment)
         stable_step = longest_step(loaded_rig_numbers(experiment.rig, experiment.load))
         limit = max(stable_step, LONGEST_STEP / MAX_STEP_REFINEMENT)
-        return step if step <= limit else dividing_step(experiment.rate * oversampling(experiment), limit)
+        return step if step <= limit else _dividing_step(experiment, limit)
 
     return choose_step
 
 
-def dividing_step(rate: float, limit: float) -> float:
-    """Compute the longest step [s] <= `limit` [s] that divides the interval 1/`rate` [s] into equal parts."""
+def _dividing_step(experiment: Experiment, limit: float) -> float:
+    """Compute the longest step [s] <= `limit` [s] that divides the time between a run's outputs into equal parts."""
+    rate = experiment.rate * oversampling(experiment)
     return 1.0 / (rate * steps_per_output(rate, limit))
 
 

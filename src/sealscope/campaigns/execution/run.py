@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -19,8 +18,6 @@ from sealscope.errors import InputError
 from sealscope.storage.folders import make_folder, make_inner_folder
 from sealscope.storage.rows import lock_rows, store_rows
 
-#: Runs one case of a plan, and writes its recording into `folder` unless that is None.
-Task = Callable[..., CaseRow]
 RECORDINGS = "recordings"
 
 
@@ -32,17 +29,17 @@ def run(
     cluster: str | None = None,
     retry: bool = False,
     progress: ProgressCallback | None = None,
-    task: Task = run_case,
     batch: bool = False,
     trust: bool = False,
 ) -> store.CampaignProgress:
     """Run the cases of a plan that have no result in `folder` yet, and return the campaign's progress.
 
-    `jobs`: number of processes, by default one per core and at most two per core, 1 for this process only; `cluster`:
-    address of a Dask scheduler to use instead; `retry`: True to run failed cases again; `progress`: called with the
-    numbers of cases done, of all cases, and of failed ones; `task`: function that runs one case; `batch`: True to
-    simulate cases side by side, with `jobs` threads, instead; `trust`: True to run controllers that the plan names by
-    file or module, whose code may be hostile.
+    - `jobs`: number of processes (`process_count`), 1 for this process only
+    - `cluster`: address of a Dask scheduler to use instead
+    - `retry`: True to run failed cases again
+    - `progress`: called with the numbers of cases done, of all cases, and of failed ones
+    - `batch`: True to simulate cases side by side, with `jobs` threads, instead
+    - `trust`: True to run controllers that the plan names by file or module, whose code may be hostile
 
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
     and for a plan that batches cannot run.
@@ -73,7 +70,7 @@ def run(
         if batch:
             new_rows = batches.iter_batch_rows(plan, waiting, jobs)
         else:
-            results = iter_results(partial(task, plan, folder=recordings), waiting, jobs, cluster)
+            results = iter_results(partial(run_case, plan, folder=recordings), waiting, jobs, cluster)
             error = "the process that ran the record died"
             new_rows = iter_rows(results, lambda case: CaseRow.from_case(case, error=error))
         for row in store_rows(place, new_rows, store.WHAT):

@@ -6,6 +6,7 @@ import json
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 from sealscope.campaigns.cases.case import CaseInputs, code_key, digest, list_cases, shared_inputs
@@ -53,11 +54,6 @@ class CampaignProgress:
     done: int
     failed: int
     seconds: float | None
-
-    @property
-    def complete(self) -> bool:
-        """True if every record of the plan has been run."""
-        return self.done == self.records
 
 
 def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
@@ -121,7 +117,7 @@ def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     """
     rows_by_id = read_rows(folder)
     if rows_by_id:  # rows from another mode or program code can still be read
-        _check_same_inputs(folder, read_head(folder) or {}, collect_row_inputs(plan), ignored=("mode", "code"))
+        _check_same_inputs(folder, read_head(folder), collect_row_inputs(plan), ignored=("mode", "code"))
     detectors = set(plan.detectors)
     plan_rows: dict[str, CaseRow] = {}
     for case in sorted(list_cases(plan), key=lambda case: case.id):
@@ -140,21 +136,20 @@ def read_progress(plan: SimulatedPlan, folder: Path) -> CampaignProgress:
     """Read the rows in a campaign's folder, and count the records that are done and those that failed."""
     done = read_plan_rows(plan, folder).values()
     seconds = [row.seconds for row in done if row.error is None]
-    mean = sum(seconds) / len(seconds) if seconds else None
-    return CampaignProgress(plan.size, len(done), len(done) - len(seconds), mean)
+    return CampaignProgress(plan.size, len(done), len(done) - len(seconds), fmean(seconds) if seconds else None)
 
 
-def read_head(folder: Path) -> dict[str, Any] | None:
+def read_head(folder: Path) -> dict[str, Any]:
     """Read a campaign's head, the file with the inputs on which all its rows (stored results) depend.
 
-    Returns None if there is no such file yet. Raises UnreadableFile if it is damaged.
+    Returns {} if there is no such file yet. Raises UnreadableFile if it is damaged.
     """
     path = folder / HEAD
     try:
         with open_inner(path, "a campaign's head") as file:
             tree = parse_json(file.read(_MAX_HEAD_BYTES))
     except FileNotFoundError:
-        return None
+        return {}
     except InputError:  # also a ValueError, but its message already names the cause
         raise
     except (OSError, ValueError, RecursionError):
@@ -170,7 +165,7 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
     Raises InputError if the folder has rows that were made from other inputs.
     """
     make_folder(folder)
-    existing = read_head(folder) or {}
+    existing = read_head(folder)
     if (folder / rows.ROWS).is_file():
         open_inner(folder / rows.ROWS, f"{WHAT}'s file of rows", "ab+").close()  # raises if no row can be appended
         _check_same_inputs(folder, existing, row_inputs)
@@ -181,10 +176,9 @@ def begin_campaign(folder: Path, row_inputs: Mapping[str, Any]) -> None:
 def _check_same_inputs(
     folder: Path, existing: Mapping[str, Any], row_inputs: Mapping[str, Any], ignored: Collection[str] = ()
 ) -> None:
-    """Check that new rows of a campaign have the same inputs as its stored rows; raise InputError otherwise.
+    """Check that new rows have the inputs of the stored rows, in the head `existing`; raise InputError otherwise.
 
-    `existing`: the campaign's head, i.e. the inputs of the stored rows (`read_head`); `row_inputs`: inputs of the new
-    rows; `ignored`: names of the inputs that may differ.
+    `ignored`: names of the inputs that may differ.
     """
     for key, name in _SHARED_ENTRIES.items():
         if key not in ignored and existing.get(key) != row_inputs[key]:

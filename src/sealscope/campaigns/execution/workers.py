@@ -129,11 +129,16 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
     pools: list[Executor] = []
 
     def start_process() -> Executor:
-        """Start one worker process, as a pool of its own."""
-        with _worker_environment():
-            pool = ProcessPoolExecutor(1, context, initializer=_initialise_worker, initargs=(task, lifeline))
-            pools.append(pool)
-            pool.submit(os.getpid)  # the first item starts the process, within the environment
+        """Start one worker process, as a pool of its own, with the variables `_ENVIRONMENT` unless they are set."""
+        pool = ProcessPoolExecutor(1, context, initializer=_initialise_worker, initargs=(task, lifeline))
+        pools.append(pool)
+        added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
+        os.environ.update(added)
+        try:
+            pool.submit(os.getpid)  # the first item starts the process
+        finally:
+            for name in added:
+                del os.environ[name]
         return pool
 
     try:
@@ -178,9 +183,8 @@ def _cluster_workers(task: Callable[[Any], Any], address: str) -> Iterator[_Pool
 
 
 def _run_numbered(task: Callable[[Item], Result], numbered_item: tuple[int, Item]) -> Result:
-    """Run `task` on the item of a pair (number, item), and return the task's result."""
-    _, item = numbered_item
-    return task(item)
+    """Run `task` on the item of a pair (number, item)."""
+    return task(numbered_item[1])
 
 
 #: The task of this worker process, as a list of one task, which `_initialise_worker` fills.
@@ -204,18 +208,6 @@ def _exit_with_parent(lifeline: Connection[Any, Any]) -> None:
     with suppress(EOFError, OSError):
         lifeline.recv_bytes()
     os._exit(1)
-
-
-@contextmanager
-def _worker_environment() -> Iterator[None]:
-    """Set the environment variables `_ENVIRONMENT`, unless already set, for processes started within the context."""
-    added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
-    os.environ.update(added)
-    try:
-        yield
-    finally:
-        for name in added:
-            os.environ.pop(name, None)
 
 
 def cores() -> int:

@@ -7,8 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from sealscope.campaigns.cases.row import expected_cause, matches_cause, named_cause
-from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, drop_other_faults, group_by
+from sealscope.campaigns.cases.row import expected_cause, matches_cause
+from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.campaigns.plans.duty import FAMILY
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
@@ -59,102 +59,95 @@ class AlarmFractions:
         return self.alarms.value - self.false_alarm.value if self.false_alarm else math.nan
 
 
-@dataclass(frozen=True)
-class Alarms:
-    """The verdicts of all detectors, with methods that summarise the alarms among them.
+def add_references(verdicts: Verdicts) -> Verdicts:
+    """Add the verdicts of two reference detectors, which always or never raise an alarm."""
+    records = next(iter(verdicts.values()))  # the same for all detectors
+    references = {
+        name: [JudgedRow(record.row, verdict, None) for record in records]
+        for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))
+    }
+    return {**verdicts, **references}
 
-    `confidence`: confidence level of the intervals of all fractions.
+
+def alarms_by_size(
+    verdicts: Verdicts, confidence: float, hours: float | None, pooled: bool = False
+) -> Iterator[AlarmFractions]:
+    """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
+
+    The size is the planned mean flow. If all records are leak-free, each detector has one result: 0 alarms of 0
+    records. `hours`: operating time of one record [h], None to omit the rate of false alarms.
     """
+    for name, records in verdicts.items():
+        leak_free = [record for record in records if not record.size]
+        leaky = [record for record in records if record.size]
+        false_alarm = _fraction((record.alarm for record in leak_free), confidence) if leak_free else None
+        per_hour = None
+        if false_alarm and hours:
+            per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, confidence)
+        groups = group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size)
+        for size, group in groups.items():
+            fractions = _summarise(name, group, confidence, leak_lpm=size)
+            detected = fractions.alarms if leaky else _fraction((), confidence)  # 0 of 0
+            yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
 
-    verdicts: Verdicts
-    confidence: float
 
-    def _with_references(self) -> Verdicts:
-        """Collect the verdicts of all detectors, and of two references that always or never raise an alarm."""
-        rows = [record.row for record in next(iter(self.verdicts.values()), ())]  # the same for all detectors
-        references = {name: [JudgedRow(row, verdict, None) for row in rows]
-                      for name, verdict in ((ALWAYS, "leak"), (NEVER, "no leak"))}  # fmt: skip
-        return {**self.verdicts, **references}
+def alarms_by_cell(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
+    """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels."""
+    for name, records in verdicts.items():
+        # levels as text, since mixed types cannot be sorted
+        cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
+        for (size, _), group in cells.items():
+            yield _summarise(name, group, confidence, leak_lpm=size, levels=dict(group[0].row.levels))
 
-    def by_size(self, hours: float | None, pooled: bool = False) -> Iterator[AlarmFractions]:
-        """Yield the fractions of alarms of each detector for each size of leak; if `pooled`, for all sizes together.
 
-        The size is the planned mean flow. Records with a fault other than a leak are left out. Two reference detectors,
-        which always or never raise an alarm, come last. If all records are leak-free, each detector has one result: 0
-        alarms of 0 records. `hours`: operating time of one record [h], None to omit the rate of false alarms.
-        """
-        for name, records in drop_other_faults(self._with_references()).items():
-            leak_free = [record for record in records if not record.size]
-            leaky = [record for record in records if record.size]
-            false_alarm = self._proportion(record.alarm for record in leak_free) if leak_free else None
-            per_hour = None
-            if false_alarm and hours:
-                per_hour = events_per_hour(false_alarm.count, hours * false_alarm.n, self.confidence)
-            groups = group_by(leaky or leak_free, lambda record: math.nan if pooled else record.size)
-            for size, group in groups.items():
-                fractions = self._summarise(name, group, leak_lpm=size)
-                detected = fractions.alarms if leaky else self._proportion(())  # 0 of 0
-                yield replace(fractions, alarms=detected, false_alarm=false_alarm, per_hour=per_hour)
+def alarms_by_fault(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
+    """Yield each detector's fraction of alarms for each fault without a piston leak."""
+    for name, records in verdicts.items():
+        faulty = (record for record in records if record.row.fault and record.size == 0)
+        for fault, group in group_by(faulty, lambda record: record.row.fault).items():
+            yield _summarise(name, group, confidence, fault=fault)
 
-    def by_cell(self) -> Iterator[AlarmFractions]:
-        """Yield each detector's fractions of alarms for each size of leak and combination of the factors' levels.
 
-        Records with faults other than a leak are left out.
-        """
-        for name, records in drop_other_faults(self.verdicts).items():
-            # levels as text, since mixed types cannot be sorted
-            cells = group_by(records, lambda record: (record.size, repr(tuple(record.row.levels.items()))))
-            for (size, _), group in cells.items():
-                yield self._summarise(name, group, leak_lpm=size, levels=dict(group[0].row.levels))
+def alarms_by_family(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFractions]:
+    """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-    def by_fault(self) -> Iterator[AlarmFractions]:
-        """Yield the fraction of alarms of each detector and reference detector for each fault without a piston leak."""
-        for name, records in self._with_references().items():
-            faulty = (record for record in records if record.row.fault and record.size == 0)
-            for fault, group in group_by(faulty, lambda record: record.row.fault).items():
-                yield self._summarise(name, group, fault=fault)
+    The results of all families together come first. A size that occurs with several laws also has a result for all laws
+    together, and leak-free records have only this result.
+    """
+    for name, records in verdicts.items():
+        members = (record for record in records if FAMILY in record.row.levels)
+        families = group_by(members, lambda record: str(record.row.levels[FAMILY]))
+        if not families:
+            continue
+        for family, family_records in {ALL: records, **families}.items():
+            for size, group in group_by(family_records, lambda record: record.size).items():
+                laws = group_by(group, lambda record: record.row.law) if size else {}  # size 0: leak-free
+                by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}
+                for law, law_records in by_law.items():
+                    yield _summarise(name, law_records, confidence, family=family, leak_lpm=size, law=law)
 
-    def by_family(self) -> Iterator[AlarmFractions]:
-        """Yield each detector's fractions of alarms for each family of machines, size of leak and law of the leak.
 
-        A family is a group of machines that a plan's profile defines. The results of all families together come first.
-        A size that occurs with several laws also has a result for all laws together, and leak-free records have only
-        this result. Records with faults other than a leak are left out.
-        """
-        for name, records in drop_other_faults(self.verdicts).items():
-            members = (record for record in records if FAMILY in record.row.levels)
-            families = group_by(members, lambda record: str(record.row.levels[FAMILY]))
-            if not families:
-                continue
-            for family, family_records in {ALL: records, **families}.items():
-                for size, group in group_by(family_records, lambda record: record.size).items():
-                    laws = group_by(group, lambda record: record.row.law) if size else {}  # size 0: leak-free
-                    by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}
-                    for law, law_records in by_law.items():
-                        yield self._summarise(name, law_records, family=family, leak_lpm=size, law=law)
+def _fraction(flags: Iterable[bool], confidence: float) -> Proportion:
+    """Compute the fraction of flags that are True, with its confidence interval."""
+    values = list(flags)
+    return proportion(sum(values), len(values), confidence)
 
-    def _proportion(self, flags: Iterable[bool]) -> Proportion:
-        """Compute the fraction of flags that are True, with its confidence interval."""
-        values = list(flags)
-        return proportion(sum(values), len(values), self.confidence)
 
-    def _summarise(self, detector: str, group: Sequence[JudgedRow], **group_fields: Any) -> AlarmFractions:
-        """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
-        statements = [(record, record.statement) for record in group if record.statement is not None]
-        intervals = [(record.flow_lpm, statement.leak_interval_lpm) for record, statement in statements]
-        names_cause = [
-            record.alarm and matches_cause(named_cause(statement), expected_cause(record.row.fault))
-            for record, statement in statements
-        ]
-        without_statement = [False] * (len(group) - len(statements))  # these records name no cause
-        return AlarmFractions(
-            detector=detector,
-            alarms=self._proportion(record.alarm for record in group),
-            cannot_tell=self._proportion(record.verdict == CANNOT_TELL for record in group),
-            coverage=self._proportion(
-                interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None
-            ),
-            named=self._proportion(names_cause + without_statement) if statements else None,
-            failed=sum(record.row.error is not None for record in group),
-            **group_fields,
-        )
+def _summarise(detector: str, group: Sequence[JudgedRow], confidence: float, **group_fields: Any) -> AlarmFractions:
+    """Compute a detector's fractions of alarms on a group of records, which the fields `group_fields` describe."""
+    statements = [(record.flow_lpm, record.statement) for record in group if record.statement is not None]
+    intervals = [(flow, statement.leak_interval_lpm) for flow, statement in statements]
+    names_fault = (
+        record.alarm and matches_cause(record.named_cause, expected_cause(record.row.fault)) for record in group
+    )
+    return AlarmFractions(
+        detector=detector,
+        alarms=_fraction((record.alarm for record in group), confidence),
+        cannot_tell=_fraction((record.verdict == CANNOT_TELL for record in group), confidence),
+        coverage=_fraction(
+            (interval[0] <= flow <= interval[1] for flow, interval in intervals if interval is not None), confidence
+        ),
+        named=_fraction(names_fault, confidence) if statements else None,
+        failed=sum(record.row.error is not None for record in group),
+        **group_fields,
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -17,20 +18,15 @@ class DetectorPod:
     """One detector's probability of detection (POD) over the size of the leak, i.e. over its planned mean flow.
 
     `sizes`: detected fraction at each tested size; `curve`: logistic curve fitted to hits and misses, None if it cannot
-    be fitted, for the reason `why`; `proven`: smallest tested size such that, for it and for all larger ones, the lower
-    confidence bound of the detected fraction is at least 90 %; inf if there is none.
+    be fitted; `description`: method of the fit, or the reason why there is no curve; `proven`: smallest size from which
+    on detection is proven (`proven_size`), inf if there is none.
     """
 
     detector: str
     sizes: tuple[SizeDetection, ...]
     curve: HitMiss | None
-    why: str
+    description: str
     proven: float
-
-    @property
-    def description(self) -> str:
-        """Name of the method by which the curve was fitted, or the reason why there is no curve."""
-        return self.curve.estimator if self.curve else self.why
 
 
 @dataclass(frozen=True)
@@ -47,10 +43,7 @@ class SizeRoc:
 
 
 def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
-    """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks.
-
-    Each result holds a fitted curve, or the reason why none can be fitted.
-    """
+    """Yield the probability of detection over the planned mean leak flow, for each detector with records of leaks."""
     for name, records in verdicts.items():
         leaky = [record for record in records if record.size > 0]
         if not leaky:
@@ -58,13 +51,12 @@ def iter_pods(verdicts: Verdicts, confidence: float) -> Iterator[DetectorPod]:
         sizes = [record.size for record in leaky]
         hits = [record.alarm for record in leaky]
         detections = detection_by_size(sizes, hits, confidence)
-        curve = None
-        why = ""
         try:
             curve = fit_hit_miss(sizes, hits)
+            description: str = curve.estimator
         except InputError as error:
-            why = str(error)
-        yield DetectorPod(name, tuple(detections), curve, why, proven_size(detections))
+            curve, description = None, str(error)
+        yield DetectorPod(name, tuple(detections), curve, description, proven_size(detections))
 
 
 def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
@@ -77,9 +69,9 @@ def iter_rocs(verdicts: Verdicts, confidence: float) -> Iterator[SizeRoc]:
         min_score = min((score for score in scores if score is not None), default=None)
         if min_score is None:
             continue
-        by_leak: dict[float, list[float]] = {}
+        by_leak: dict[float, list[float]] = defaultdict(list)
         for record, score in zip(records, scores, strict=True):
-            by_leak.setdefault(record.size, []).append(min_score - 1.0 if score is None else score)
+            by_leak[record.size].append(min_score - 1.0 if score is None else score)
         leak_free = by_leak.pop(0.0, [])
         all_scores = [score for leaky in by_leak.values() for score in leaky]
         for size, leaky in ((math.nan, all_scores), *sorted(by_leak.items())):  # nan: all sizes

@@ -9,7 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from sealscope.campaigns.cases.row import CaseRow
-from sealscope.campaigns.judging.alarms import AlarmFractions, Alarms
+from sealscope.campaigns.judging.alarms import (
+    AlarmFractions,
+    add_references,
+    alarms_by_cell,
+    alarms_by_family,
+    alarms_by_fault,
+    alarms_by_size,
+)
 from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc, iter_pods, iter_rocs
 from sealscope.campaigns.judging.statements import (
     NamedCauses,
@@ -25,7 +32,6 @@ from sealscope.campaigns.judging.verdicts import (
     drop_other_faults,
     group_by,
 )
-from sealscope.campaigns.plans.detectors import parse_detector_name
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import Promise
 
@@ -70,48 +76,43 @@ def judge(
     false_alarm: float = 0.01,
     promise: Promise = "average",
     confidence: float = 0.95,
-    limits: Mapping[str, float] | None = None,
     onset_s: float | None = None,
     hours: float | None = None,
 ) -> Judgement:
     """Collect all detectors' verdicts on the rows (results of records) with `use` "judge", and compute statistics.
 
-    Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Raises
-    InputError if there is no row to judge, or too few leak-free rows to set a threshold.
+    Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Records
+    with a fault other than a leak count only in `causes` and `faults`. In `table`, `overall` and `faults` the detectors
+    are followed by two references, which always or never raise an alarm. Raises InputError if there is no row to judge,
+    or too few leak-free rows to set a threshold.
 
-    - `false_alarm`: wanted false-alarm probability
-    - `promise`: "average" if the thresholds keep this probability on average over sets of leak-free records, "bound" if
-      they keep it with the probability `confidence` (`quantile_threshold`)
+    - `false_alarm`, `promise`: wanted false-alarm probability, and how the thresholds keep it (`Promise`)
     - `confidence`: probability for the promise "bound", and confidence level of all intervals
-    - `limits`: thresholds by detector, in place of all fixed and computed ones
     - `onset_s` [s]: true onset of the leaks, None to compute no errors of onsets
     - `hours`: operating time of a record [h], None to compute no false alarms per hour
     """
     judged = sorted((row for row in rows if row.use == "judge"), key=lambda row: row.id)
     if not judged:
         raise InputError("a campaign needs at least one record to judge, got none")
-    thresholds = {} if limits is not None else compute_thresholds(rows, detectors, false_alarm, promise, confidence)
-    if limits is None:
-        scorers = {name: scorer for name in detectors if (scorer := parse_detector_name(name).scorer) is not None}
-        limits = {name: scorer.threshold for name, scorer in scorers.items() if scorer.threshold is not None}
-    verdicts = collect_verdicts(judged, detectors, limits, thresholds)
+    thresholds = compute_thresholds(rows, detectors, false_alarm, promise, confidence)
+    verdicts = collect_verdicts(judged, detectors, thresholds)
     leak_verdicts = drop_other_faults(verdicts)
-    alarms = Alarms(verdicts, confidence)
+    compared_verdicts = add_references(leak_verdicts)
     return Judgement(
         thresholds=thresholds,
         leak_free=sum(row.use == "calibrate" and row.error is None for row in rows) if thresholds else 0,
         judged=sum(row.error is None for row in judged),
         failed=tuple(row for row in sorted(rows, key=lambda row: row.id) if row.error is not None),
-        table=tuple(alarms.by_size(hours)),
-        overall=tuple(alarms.by_size(hours, pooled=True)),
+        table=tuple(alarms_by_size(compared_verdicts, confidence, hours)),
+        overall=tuple(alarms_by_size(compared_verdicts, confidence, hours, pooled=True)),
         onsets=() if onset_s is None else tuple(onset_errors(leak_verdicts, onset_s, confidence)),
         flows=tuple(flow_errors(leak_verdicts, confidence)),
         causes=tuple(iter_cause_confusions(verdicts, confidence)),
         pods=tuple(iter_pods(leak_verdicts, confidence)),
         rocs=tuple(iter_rocs(leak_verdicts, confidence)),
-        cells=tuple(alarms.by_cell()),
-        faults=tuple(alarms.by_fault()),
-        families=tuple(alarms.by_family()),
+        cells=tuple(alarms_by_cell(leak_verdicts, confidence)),
+        faults=tuple(alarms_by_fault(add_references(verdicts), confidence)),
+        families=tuple(alarms_by_family(leak_verdicts, confidence)),
         achieved_flows=_achieved_flows([row for row in judged if not row.fault]),
     )
 

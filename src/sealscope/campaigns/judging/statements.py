@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from operator import attrgetter
 
-import numpy as np
-
-from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, expected_cause, matches_cause, named_cause
+from sealscope.campaigns.cases.row import NO_CAUSE, PISTON_LEAK, Statement, expected_cause, matches_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
 from sealscope.evaluation.binomial import Proportion, proportion
 from sealscope.evaluation.estimates import EstimateErrors, estimate_errors
@@ -45,53 +42,44 @@ class NamedCauses:
 def onset_errors(verdicts: Verdicts, onset_s: float, confidence: float) -> Iterator[StatedErrors]:
     """Yield the errors [s] of the estimated onsets for each detector and each planned mean flow of the leak.
 
-    Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks;
-    `confidence`: confidence level of the intervals in the results.
+    Only records with a leak, an alarm and an estimated onset count. `onset_s` [s]: true onset of all leaks.
     """
-    for name, records in verdicts.items():
-        detected = (record for record in records if record.size > 0 and record.alarm)
-        for size, group in group_by(detected, attrgetter("size")).items():
-            estimates = []
-            for record in group:
-                _score, onset = record.row.scores[name]
-                interval = None if record.statement is None else record.statement.onset_interval_s
-                if onset is not None:
-                    estimates.append((onset, onset_s, interval))
-            yield from _iter_errors(name, size, estimates, confidence)
+    for name, size, group in _iter_stating(verdicts):
+        estimates = [
+            (statement.onset_s, onset_s, statement.onset_interval_s)
+            for record, statement in group
+            if record.alarm and statement.onset_s is not None
+        ]
+        if size > 0 and estimates:
+            yield StatedErrors(name, size, _errors(estimates, confidence))
 
 
 def flow_errors(verdicts: Verdicts, confidence: float) -> Iterator[StatedErrors]:
-    """Yield the errors of the leak flows [L/min] that detectors state, by detector and planned mean flow (`size`).
+    """Yield the errors of the leak flows [L/min] that detectors state, by detector and planned mean flow (`size`)."""
+    for name, size, group in _iter_stating(verdicts):
+        estimates = [(statement.leak_lpm, record.flow_lpm, statement.leak_interval_lpm) for record, statement in group]
+        if any(flow is not None for flow, _, _ in estimates):
+            yield StatedErrors(name, size, _errors(estimates, confidence))
 
-    Records without a statement are left out. `confidence`: confidence level of the intervals in the results.
-    """
+
+def _iter_stating(verdicts: Verdicts) -> Iterator[tuple[str, float, list[tuple[JudgedRow, Statement]]]]:
+    """Yield each detector, each size of leak, and the records of this size on which the detector makes a statement."""
     for name, records in verdicts.items():
-        for size, group in group_by(records, attrgetter("size")).items():
-            estimates = [
-                (record.statement.leak_lpm, record.flow_lpm, record.statement.leak_interval_lpm)
-                for record in group
-                if record.statement is not None
-            ]
-            yield from _iter_errors(name, size, estimates, confidence)
+        stating = [(record, record.statement) for record in records if record.statement is not None]
+        for size, group in group_by(stating, lambda pair: pair[0].size).items():
+            yield name, size, group
 
 
-def _iter_errors(
-    detector: str,
-    leak_lpm: float,
-    estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]],
-    confidence: float,
-) -> Iterator[StatedErrors]:
-    """Yield one result, the errors of a detector's estimates on the records of one planned leak flow [L/min].
-
-    Nothing is yielded without an estimate. `estimates`: (estimate, true value, interval) of each record, where a
-    missing estimate or interval is None.
-    """
-    values = [math.nan if value is None else value for value, _, _ in estimates]
-    if np.isfinite(values).any():
-        true_values = [true_value for _, true_value, _ in estimates]
-        intervals = [interval or (math.nan, math.nan) for _, _, interval in estimates]
-        low, high = zip(*intervals, strict=True)
-        yield StatedErrors(detector, leak_lpm, estimate_errors(values, true_values, low, high, confidence))
+def _errors(
+    estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]], confidence: float
+) -> EstimateErrors:
+    """Compute the errors of estimates, given as (estimate or None, true value, interval or None) of each record."""
+    numbers = [
+        (math.nan if value is None else value, true_value, *(interval or (math.nan, math.nan)))
+        for value, true_value, interval in estimates
+    ]
+    values, true_values, low, high = zip(*numbers, strict=True)
+    return estimate_errors(values, true_values, low, high, confidence)
 
 
 def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[NamedCauses]:
@@ -108,10 +96,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
         truth = [_true_cause(record) for record in single_cause_records]
         # rows of the matrix: the true causes, then causes that are only named
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
-        named_causes = [
-            CANNOT_TELL if record.statement is None else named_cause(record.statement)
-            for record in single_cause_records
-        ]
+        named_causes = [record.named_cause for record in single_cause_records]
         causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})
         covered = proportion(sum(map(matches_cause, named_causes, truth)), len(truth), confidence)
         yield NamedCauses(name, confusion_matrix(truth, named_causes, causes, confidence), covered)

@@ -33,10 +33,6 @@ class PriorKnowledge:
     channels: tuple[str, ...]
     rig: str
 
-    def as_row(self) -> TableRow:
-        """Convert the information given to a detector to the cells of a table's row, by name of the column."""
-        return {"onset": "yes" if self.onset else "no", "channels": " ".join(self.channels), "rig": self.rig}
-
 
 @cache
 def _table_layouts() -> dict[str, dict[str, str]]:
@@ -59,12 +55,8 @@ def resolve_attribute(source: Any, path: str) -> Any:
 def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) -> TableRow:
     """Build the cells of a table's row that one entry of `tables.toml` fills; return them by name of the column.
 
-    `column`: name of the entry; `content`: its text, i.e. flags and the dotted path of an attribute of the result
-    `row`. The path "levels" fills one column for each of the plan's `factors`. Flags:
-
-    - "share": the attribute is a proportion, which fills the five columns `_PROPORTION`; they are empty for None
-    - "stated", together with "share": the columns are also empty for a proportion of no records
-    - "size": the attribute is a size of leak, for which nan is written as "any"
+    `column`: name of the entry; `content`: its text, i.e. flags, which the head of `tables.toml` explains, and the
+    dotted path of an attribute of the result `row`. The path "levels" fills a column for each of the plan's `factors`.
     """
     *flags, path = content.split(" ")
     value = resolve_attribute(row, path)
@@ -78,14 +70,17 @@ def _build_cells(column: str, content: str, row: Any, factors: Sequence[str]) ->
 
 
 def build_tables(
-    judgement: Judgement, unit: str = "L/min", known: Mapping[str, PriorKnowledge] | None = None, part: str = ""
+    judgement: Judgement, unit: str, known: Mapping[str, PriorKnowledge], part: str
 ) -> dict[str, list[TableRow]]:
     """Build the tables of a campaign's results, with the columns that `tables.toml` lists; return them by name.
 
-    `unit`: unit of the leaks' sizes; `known`: by detector, the information that it was given, None to leave out these
-    columns; `part`: purpose of the plan, such as development or judging.
+    `unit`: unit of the leaks' sizes; `known`: by detector, the information that it was given; `part`: purpose of the
+    plan, such as development or judging.
     """
-    knowledge = {name: row.as_row() for name, row in (known or {}).items()}
+    knowledge = {
+        name: {"onset": "yes" if row.onset else "no", "channels": " ".join(row.channels), "rig": row.rig}
+        for name, row in known.items()
+    }
     factors = list(dict.fromkeys(name for cell in judgement.cells for name in cell.levels))
     # by table, the objects that fill its rows; a dictionary has several, by the first name in their dotted paths
     rows: dict[str, Iterable[Any]] = {
@@ -110,33 +105,26 @@ def build_tables(
     }
 
     def build_row(columns: Mapping[str, str], row: Any) -> TableRow:
-        """Build the row of a table with the contents `columns` from the object `row` that fills it.
-
-        Columns for the information given to a detector (content "known ...") are left out if `knowledge` is empty.
-        """
+        """Build the row of a table with the contents `columns` from the object `row` that fills it."""
         cells: TableRow = {}
         for column, content in columns.items():
-            if content.startswith("known ") and knowledge:
-                row_knowledge = knowledge.get(resolve_attribute(row, "detector"))
-                cells[column] = resolve_attribute(row_knowledge, content.removeprefix("known "))
-            elif not content.startswith("known "):
-                name = column.format(unit=unit)
-                cells |= _build_cells(name, content, row, factors)
+            is_known = content.startswith("known ")  # of the information that the row's detector was given
+            source = knowledge.get(resolve_attribute(row, "detector")) if is_known else row
+            cells |= _build_cells(column.format(unit=unit), content, source, factors)
         return cells
 
     return {name: [build_row(_table_layouts()[name], row) for row in table] for name, table in rows.items()}
 
 
-def records_table(rows: Iterable[CaseRow], detectors: Sequence[str], unit: str = "L/min") -> list[TableRow]:
+def records_table(rows: Sequence[CaseRow], detectors: Sequence[str], unit: str) -> list[TableRow]:
     """Build the table of all records with inputs, scores and statements (verdict, onset, flow, cause), sorted by id.
 
     Run times are left out, because they would differ between two runs of the same campaign.
     """
-    ordered = sorted(rows, key=lambda row: row.id)
-    factors = list(dict.fromkeys(name for row in ordered for name in sorted(row.levels)))
-    stating_detectors = sorted({name for row in ordered for name in row.statements})
+    factors = list(dict.fromkeys(name for row in rows for name in sorted(row.levels)))
+    stating_detectors = sorted({name for row in rows for name in row.statements})
     table = []
-    for row in ordered:
+    for row in sorted(rows, key=lambda row: row.id):
         record: TableRow = {
             "id": row.id,
             "use": row.use,

@@ -37,6 +37,11 @@ class JudgedRow(NamedTuple):
         return self.size if self.row.flow_lpm is None else self.row.flow_lpm
 
     @property
+    def named_cause(self) -> str:
+        """Cause that the detector names (`Statement.named_cause`), "cannot tell" without a statement."""
+        return CANNOT_TELL if self.statement is None else self.statement.named_cause
+
+    @property
     def alarm(self) -> bool:
         """True if the detector's verdict on the record is `leak`."""
         return self.verdict == "leak"
@@ -47,26 +52,19 @@ Verdicts: TypeAlias = Mapping[str, Sequence[JudgedRow]]
 
 
 def compute_thresholds(
-    rows: Iterable[CaseRow],
-    detectors: Sequence[str],
-    false_alarm: float,
-    promise: Promise = "average",
-    confidence: float = 0.95,
+    rows: Iterable[CaseRow], detectors: Sequence[str], false_alarm: float, promise: Promise, confidence: float
 ) -> Thresholds:
     """Compute the threshold of each scorer that needs one, for each duty with enough leak-free records.
 
-    The duty of a record is its command and stroke direction (`duty_label`). A record without a score, which raises no
-    alarm, counts as the lowest score of its duty. `false_alarm`: wanted false-alarm probability; `promise`: "average"
-    if it is kept on average over sets of leak-free records, "bound" if it is kept with the probability `confidence`.
-    Returns thresholds by (detector, duty). Raises InputError if a scorer needs a threshold and no duty has enough
-    records.
+    A record without a score, which raises no alarm, counts as the lowest score of its duty. The last three arguments
+    are those of `judge`. Raises InputError if a scorer needs a threshold and no duty has enough records.
     """
     scorers = [name for name in detectors if parse_detector_name(name).needs_threshold]
     leak_free: dict[str, list[CaseRow]] = {}
     for row in rows:
         if row.use == "calibrate" and row.error is None:
             leak_free.setdefault(duty_label(row.levels), []).append(row)
-    needed = records_needed(false_alarm, confidence if promise == "bound" else None)
+    needed = records_needed(false_alarm, confidence, promise)
     max_rows = max(map(len, leak_free.values()), default=0)
     if scorers and max_rows < needed:
         raise InputError(f"leak-free records must be at least {needed} of a duty, got at most {max_rows}")
@@ -81,13 +79,13 @@ def compute_thresholds(
 
 
 def collect_verdicts(
-    rows: Sequence[CaseRow], detectors: Sequence[str], limits: Mapping[str, float], thresholds: Thresholds
+    rows: Sequence[CaseRow], detectors: Sequence[str], thresholds: Thresholds
 ) -> dict[str, list[JudgedRow]]:
     """Collect the verdict of each detector on each row; return them by detector, in the order of `rows`.
 
-    If a detector states a verdict, this is taken. Otherwise the verdict is `leak` if the score exceeds the detector's
-    limit, else `no leak`. The limit is in `limits`, or by detector and duty in `thresholds`. The verdict is `cannot
-    tell` without a result, a score or a limit.
+    If a detector states a verdict, this is taken. Otherwise the verdict is `leak` if the score exceeds the scorer's
+    fixed threshold, or that in `thresholds`, else `no leak`; without a result, a score or a threshold it is `cannot
+    tell`.
     """
 
     def judge_row(row: CaseRow, detector: str) -> JudgedRow:
@@ -96,7 +94,8 @@ def collect_verdicts(
             return JudgedRow(row, CANNOT_TELL, None)
         if (statement := row.statements.get(detector)) is not None:
             return JudgedRow(row, statement.verdict, statement)
-        score, limit = row.score(detector), limits.get(detector)
+        score, scorer = row.score(detector), parse_detector_name(detector).scorer
+        limit = None if scorer is None else scorer.threshold
         if limit is None and (threshold := thresholds.get((detector, duty_label(row.levels)))) is not None:
             limit = threshold.value
         if score is None or limit is None:

@@ -21,7 +21,6 @@ from sealscope.recordings.recording import CHANNEL_UNITS
 
 DIAGNOSE = "diagnose"
 WATCH = "watch"
-_VIEW = " @ "
 #: Channels of each view, by its name; the view "" applies to detectors that name no view.
 Views = Mapping[str, tuple[str, ...]]
 #: Channels that detectors see by default: all except the test bench's flow meter, which measures the leak itself.
@@ -32,7 +31,7 @@ ALL_CHANNELS = tuple(name for name in CHANNEL_UNITS if name != "q_leak")
 class PlanDetector:
     """A detector that a plan names, such as "diagnose @ pressures", split into its parts.
 
-    - `base`: the part before "@": a scorer, a registered detector, `diagnose`, or `watch`, a machine's continuous watch
+    - `base`: the part before "@"
     - `view`: the part after "@", which names the set of channels that the detector may use, "" if there is no "@"
     - `scorer`: the scorer, a rule that only computes a score; None for a detector that states verdicts itself
     """
@@ -40,7 +39,7 @@ class PlanDetector:
     name: str
     base: str
     view: str
-    scorer: Scorer | None = None
+    scorer: Scorer | None
 
     @property
     def needs_threshold(self) -> bool:
@@ -50,11 +49,8 @@ class PlanDetector:
 
 @cache
 def parse_detector_name(name: str) -> PlanDetector:
-    """Split a detector name, such as "diagnose @ pressures", into detector and view, without checking that they exist.
-
-    A view is a set of channels that the detector may use.
-    """
-    base, _, view = name.partition(_VIEW)
+    """Split a detector name, such as "diagnose @ pressures", without checking that detector and view exist."""
+    base, _, view = name.partition(" @ ")
     return PlanDetector(name, base, view, scorer=SCORERS.get(base))
 
 

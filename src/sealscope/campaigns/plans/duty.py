@@ -1,4 +1,4 @@
-"""Check and parse the texts in a plan: commands, controllers, loads, closed throttles and faults.
+"""Check the levels (values) of a plan's factors, its controllers and its faults, and parse them.
 
 A text has the same form as the option of `sealscope simulate` with the same name, such as `--command` or `--load`.
 """
@@ -10,8 +10,6 @@ import numpy as np
 from sealscope.campaigns.plans.model import SimulatedPlan
 from sealscope.control.registry import CONTROLLERS, check_controller_name, controller_named, is_installed
 from sealscope.errors import InputError
-from sealscope.parameters import Rig
-from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.experiment import check_target, throttle_values
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
@@ -23,36 +21,42 @@ CLOSED, COMMAND, CONTROLLER, FAMILY, LOAD = "closed", "command", "controller", "
 _TARGET_CHECK_RATE = 50.0
 
 
-def check_duty(name: str, level: str | float, rig: Rig, duration: float) -> None:
-    """Check a level (value) of a plan's factor `command`, `controller` or `load`; raise InputError if it is invalid.
+def check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
+    """Check that `level` is a valid value of the factor `name` of a plan; raise InputError otherwise.
 
-    `name`: the factor; `duration` [s]: length of a record, for which a target of the piston's position must stay within
-    the stroke of the `rig`. A built-in controller must fit the rig; of others, only the name is checked.
+    A built-in controller must fit the rig; of others, only the name is checked.
     """
     examples = {COMMAND: "'3 sin(4t)' or 'position 50 mm sin(2t)'", CONTROLLER: "'pi'", LOAD: "'2 kN'"}
-    if not isinstance(level, str):
+    if name in examples and not isinstance(level, str):
         raise InputError(f"a {name} must be a text such as {examples[name]}, got {level!r}")
-    if name == CONTROLLER and level in CONTROLLERS:
-        CONTROLLERS[level](rig)  # raises if the controller does not fit the rig
+    text = str(level)
+    if name == FAMILY:
+        if plan.machine_profile is None:
+            raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
+        plan.machine_profile.family(text)
+    elif name == CONTROLLER and text in CONTROLLERS:
+        CONTROLLERS[text](plan.rig)  # raises if the controller does not fit the rig
     elif name == CONTROLLER:
-        check_controller_name(level)
+        check_controller_name(text)
     elif name == LOAD:
-        parse_force(level)
-    elif isinstance(command := command_or_target(level), Position):  # raises for an invalid text
-        times = np.arange(0.0, duration, 1.0 / _TARGET_CHECK_RATE)
-        check_target(command, times, rig.cylinder.L / 2)  # the position is 0 at mid-stroke
+        parse_force(text)
+    elif name == COMMAND:
+        command = command_or_target(text)
+        if isinstance(command, Position):
+            times = np.arange(0.0, plan.duration_s, 1.0 / _TARGET_CHECK_RATE)
+            check_target(command, times, plan.rig.cylinder.L / 2)  # the position is 0 at mid-stroke
+    else:  # a parameter of the rig, or the closed fraction of its throttles
+        plan.rig.with_overrides(parse_throttle_values(level) if name == CLOSED else {name: level})
 
 
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
     """Check that every controller of a plan is trusted, and build those that are not built in.
 
-    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True. Raises
-    InputError if a controller is neither installed nor trusted, or cannot be built.
+    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
-    if plan.profile:
-        profile = load_profile(plan.profile)
-        duties = (profile.duty, *(family.duty for family in profile.families))
+    if plan.machine_profile is not None:
+        duties = (plan.machine_profile.duty, *(family.duty for family in plan.machine_profile.families))
         names += [name for duty in duties if duty is not None for name in duty.controllers]
     for name in dict.fromkeys(names):
         if not (trust or is_installed(name)):

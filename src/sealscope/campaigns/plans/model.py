@@ -17,6 +17,7 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 from sealscope.evaluation.thresholds import Promise
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS
+from sealscope.simulation.bench.profile import Profile, load_profile
 from sealscope.units import parse_quantity
 
 Use = Literal["calibrate", "judge"]
@@ -31,10 +32,7 @@ def _quantity_validator(unit: str) -> BeforeValidator:
 
 
 def _validate_file_name(name: str) -> str:
-    """Return a file name unchanged; raise ValueError if it is not a valid one.
-
-    A valid name has at most `_MAX_NAME_LENGTH` letters, digits, '-', '_' and '.', and does not start with '.'.
-    """
+    """Return a file name unchanged; raise ValueError if it is not a valid one."""
     if not all(c.isalnum() or c in "-_." for c in name) or name.startswith(".") or len(name) > _MAX_NAME_LENGTH:
         raise ValueError(
             f"must have at most {_MAX_NAME_LENGTH} letters, digits, '-', '_' and '.', and not begin with '.'"
@@ -43,10 +41,7 @@ def _validate_file_name(name: str) -> str:
 
 
 def _validate_pattern(pattern: str) -> str:
-    """Return a pattern of file names, such as "day*/*.csv", if it is valid; else raise ValueError.
-
-    A pattern must be a relative path without "..". One component of the path may be `**`, for any subfolders.
-    """
+    """Return a pattern of file names, such as "day*/*.csv", unchanged; raise ValueError if it is not a valid one."""
     parts = Path(pattern).parts
     if not parts or Path(pattern).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
@@ -73,10 +68,7 @@ def _validate_channels(names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _validate_view_name(name: str) -> str:
-    """Return the name of a view (a set of channels); raise ValueError if it is empty, or has "@" or outer blanks.
-
-    In a detector's name, such as "diagnose @ pressures", "@" precedes the name of a view.
-    """
+    """Return the name of a view (set of channels) unchanged; raise ValueError if empty, or with "@" or outer blanks."""
     if not name.strip() or name != name.strip() or "@" in name:
         raise ValueError("must be a plain name without '@'")
     return name
@@ -130,11 +122,9 @@ class _Plan(_TomlTable):
     """The fields that plans of simulated records and plans of recordings have in common.
 
     - `name`: name of the plan and of its files; `title`: by default the name; `note`: remark of the author
-    - `confidence`: confidence level of all intervals, such as 0.95
     - `place`: path of the plan's file
-    - `false_alarm`: wanted false-alarm probability of each detector
-    - `promise`: "average" if thresholds keep this probability on average over sets of leak-free records, "bound" if
-      they keep it with the probability `confidence` (`quantile_threshold`)
+    - `confidence`: confidence level of all intervals, such as 0.95
+    - `false_alarm`, `promise`: wanted false-alarm probability of each detector, and how thresholds keep it (`Promise`)
     - `detectors`: names in the forms that the module `plans.detectors` lists
     - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
@@ -148,7 +138,7 @@ class _Plan(_TomlTable):
     confidence: Fraction = 0.95
     note: Text = ""
     place: str = ""
-    false_alarm: Fraction = 0.01
+    false_alarm: Annotated[Fraction, Field(ge=1e-15)] = 0.01  # no number of records shows a smaller one
     promise: Promise = "average"
     detectors: Names
     unit: Text = "L/min"
@@ -160,7 +150,7 @@ class _Plan(_TomlTable):
     def _load_assumed(self, default: Rig | None) -> Rig | None:
         """Load the rig that detectors assume: `assume` or, if that is None, `default`, with the values `assume_set`.
 
-        If both are None, the values change the rig `thesis`; if there are no values either, the result is None.
+        If both are None, the values change the rig `thesis`; without values the result is None then.
         """
         rig = default if self.assume is None else load_rig(self.assume)
         if not self.assume_set:
@@ -208,7 +198,12 @@ class SimulatedPlan(_Plan):
     @cached_property
     def assumed(self) -> Rig:
         """The rig that detectors may assume, by default the simulated one."""
-        return self._load_assumed(self.rig) or self.rig  # is never None here; `or` is for type checkers
+        return self._load_assumed(self.rig) or self.rig  # `or`: for type checkers
+
+    @cached_property
+    def machine_profile(self) -> Profile | None:
+        """The profile from which machines are drawn, None without one."""
+        return load_profile(self.profile) if self.profile else None
 
     @property
     def size(self) -> int:
@@ -253,7 +248,7 @@ class RecordedPlan(_Plan):
 
     @cached_property
     def assumed(self) -> Rig | None:
-        """The rig that detectors may assume, or None if the plan states neither a rig nor values to replace."""
+        """The rig that detectors may assume, None if the plan states none."""
         return self._load_assumed(default=None)
 
 

@@ -11,22 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from sealscope.campaigns.plans.detectors import DIAGNOSE, WATCH, check_detector, parse_detector_name
-from sealscope.campaigns.plans.duty import (
-    CLOSED,
-    COMMAND,
-    CONTROLLER,
-    FAMILY,
-    LOAD,
-    check_duty,
-    parse_plan_fault,
-    parse_throttle_values,
-)
+from sealscope.campaigns.plans.duty import COMMAND, CONTROLLER, FAMILY, check_level, parse_plan_fault
 from sealscope.campaigns.plans.model import AnyPlan, RecordedPlan, SimulatedPlan
 from sealscope.diagnosis.diagnose import check_probability
 from sealscope.errors import InputError
 from sealscope.evaluation.thresholds import records_needed
 from sealscope.parameters import load_rig
-from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.targets_and_loads import parse_position
 from sealscope.storage.opening import is_file_path
@@ -141,8 +131,7 @@ def _complete_simulated_plan(plan: SimulatedPlan) -> SimulatedPlan:
     plan = replace(plan, rig_name=_path_in_plan_folder(plan.rig_name, place), profile=profile, onset_s=onset)
     _check_entry("campaign.rig", place, lambda: load_rig(plan.rig_name))
     _check_entry("campaign.set", place, lambda: plan.rig)
-    if profile:
-        _check_entry("campaign.profile", place, partial(load_profile, profile))
+    _check_entry("campaign.profile", place, lambda: plan.machine_profile)
     if not 0.0 < onset < plan.duration_s:
         rule = f"must be within the duration, 0 s to {plan.duration_s:g} s"
         raise InputError(f"campaign.onset {rule}, got {onset:g} ({place})")
@@ -162,7 +151,7 @@ def _check_factors(plan: SimulatedPlan) -> None:
         if len({repr(level) for level in levels}) < len(levels):
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
         for level in levels:
-            _check_entry(f"factors.{name}", plan.place, partial(_check_level, plan, name, level))
+            _check_entry(f"factors.{name}", plan.place, partial(check_level, plan, name, level))
     cells = math.prod(map(len, plan.factors.values()))
     if cells > MAX_CELLS:
         raise InputError(f"factors: their levels must make at most {MAX_CELLS} cells, got {cells} ({plan.place})")
@@ -178,23 +167,11 @@ def _commands(plan: SimulatedPlan) -> tuple[str | float, ...]:
     With a factor `family`, only the commands of the families that it lists count. Without factor `command` and profile,
     the only command is `DEFAULT_COMMAND`.
     """
-    if COMMAND in plan.factors or not plan.profile:
+    profile = plan.machine_profile
+    if COMMAND in plan.factors or profile is None:
         return plan.factors.get(COMMAND, (str(DEFAULT_COMMAND),))
-    profile = load_profile(plan.profile)
     profiles = [profile.of_family(str(family)) for family in plan.factors.get(FAMILY, ())] or [profile]
     return tuple(command for family_profile in profiles for command in family_profile.duty.commands)
-
-
-def _check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
-    """Check that `level` is a valid value of the factor `name`; raise InputError otherwise."""
-    if name == FAMILY:
-        if not plan.profile:
-            raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
-        load_profile(plan.profile).family(str(level))
-    elif name in (COMMAND, CONTROLLER, LOAD):
-        check_duty(name, level, plan.rig, plan.duration_s)
-    else:  # a parameter of the rig, or the closed fraction of its throttles; raises for an invalid value
-        plan.rig.with_overrides(parse_throttle_values(level) if name == CLOSED else {name: level})
 
 
 def _check_records(plan: SimulatedPlan) -> None:
@@ -217,7 +194,7 @@ def _check_records(plan: SimulatedPlan) -> None:
     if not any(parse_detector_name(name).needs_threshold for name in plan.detectors):
         return
     count = sum(group.count for group in plan.records if group.use == "calibrate")
-    needed = records_needed(plan.false_alarm, plan.confidence if plan.promise == "bound" else None)
+    needed = records_needed(plan.false_alarm, plan.confidence, plan.promise)
     n_commands = len(plan.factors.get(COMMAND, ("",)))  # 1 without this factor
     if count < needed * n_commands:
         per_command = f" ({needed} for each of {n_commands} commands)" if n_commands > 1 else ""

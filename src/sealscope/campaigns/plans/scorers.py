@@ -7,7 +7,7 @@ threshold is set from a plan's leak-free records, or 0 for sign rules.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import product
 from types import MappingProxyType
@@ -29,6 +29,9 @@ _DIRECTIONS = {
     "low": ("level", -1.0),
     "high": ("level", 1.0),
 }
+#: By chamber, "p_A" or "p_B", natural logarithms (3, 5) of the RMS of wavelet details. Rows: before the split of a
+#: record, after it, over both parts; columns: d1 to d4 (RMS in Pa), and d3d4, the product of d3 and d4 (RMS in Pa^2).
+LogRms = Mapping[str, Array]
 _BOTH = "d3d4 of both chambers as the thesis says"
 
 
@@ -45,64 +48,37 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
     return np.array([[begin, split - after], [split + before, n - after]])
 
 
-@dataclass(frozen=True)
-class SplitRms:
-    """The natural logarithms of the RMS of the pressures' wavelet details, before and after the split of a record.
+def split_log_rms(recording: Recording, split_s: float) -> LogRms:
+    """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
 
-    `log_rms`: by chamber, "p_A" or "p_B", three arrays (5,): before the split, after it, and over both parts, for d1 to
-    d4 (RMS in Pa) and d3d4, the product of d3 and d4 (RMS in Pa^2).
+    The recording must be uniformly sampled without missing samples. A chamber whose pressure was not recorded is left
+    out. If the part before or after `split_s` is too short, both chambers are left out.
     """
+    rate = recording.rate
+    bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
+    if np.diff(bounds).min() < 1:
+        return {}
+    # of the three segments between the bounds, 1 is the gap between the parts
+    squares = {
+        chamber: mean_squares(details(recording[chamber]), bounds.ravel())[[0, 2]]
+        for chamber in CHAMBERS
+        if chamber in recording
+    }
+    return log_rms_of_squares(squares, bounds)
 
-    log_rms: Mapping[str, tuple[Array, Array, Array]]
 
-    @classmethod
-    def from_recording(cls, recording: Recording, split_s: float) -> SplitRms:
-        """Compute the log RMS of the pressures' wavelet details before and after the time `split_s` [s].
+def log_rms_of_squares(squares: Mapping[str, Array], bounds: IntArray) -> LogRms:
+    """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
 
-        The recording must be uniformly sampled without missing samples. A chamber whose pressure was not recorded is
-        left out. If the part before or after `split_s` is too short, both chambers are left out.
-        """
-        rate = recording.rate
-        bounds = split_bounds(len(recording), rate, round((split_s - float(recording.t[0])) * rate))
-        has_samples = np.diff(bounds).min() > 0  # in both parts
-        squares = {}
-        for chamber in CHAMBERS:
-            if has_samples and chamber in recording:
-                before, _gap, after = mean_squares(details(recording[chamber]), bounds.ravel())
-                squares[chamber] = np.array([before, after])
-        return cls.from_squares(squares, bounds)
-
-    @classmethod
-    def from_squares(cls, squares: Mapping[str, Array], bounds: IntArray) -> SplitRms:
-        """Compute the log RMS of the pressures' wavelet details from their mean squares in both parts of a record.
-
-        `squares`: by chamber, mean squares (2, 5) of d1 to d4 and d3d4, before and after the split; `bounds` (2, 2):
-        first sample and end of each part, by which the mean over both is weighted.
-        """
-        log_rms = {}
-        n_samples = np.diff(bounds)[:, 0]
-        with np.errstate(divide="ignore"):  # the details of a constant pressure are 0
-            for chamber, (before, after) in squares.items():
-                overall = np.average((before, after), axis=0, weights=n_samples)
-                log_rms[chamber] = (0.5 * np.log(before), 0.5 * np.log(after), 0.5 * np.log(overall))
-        return cls(log_rms)
-
-    def through(self, channels: Iterable[str]) -> SplitRms:
-        """Keep the log RMS of those chambers whose pressures, "p_A" or "p_B", are among `channels`."""
-        visible = set(channels)
-        return SplitRms({chamber: values for chamber, values in self.log_rms.items() if chamber in visible})
-
-    def value(self, chamber: str, quantity: str, statistic: str) -> float | None:
-        """Return the log RMS of a wavelet detail over the whole record, or its change at the split of the record.
-
-        `chamber`: "p_A" or "p_B"; `quantity`: the detail, "d1" to "d4" or "d3d4"; `statistic`: "level" or "change".
-        Returns None if the chamber is missing or the number is not finite.
-        """
-        if chamber not in self.log_rms:
-            return None
-        before, after, overall = (float(log_rms[QUANTITIES.index(quantity)]) for log_rms in self.log_rms[chamber])
-        value = after - before if statistic == "change" else overall
-        return value if math.isfinite(value) else None
+    `squares`: by chamber, mean squares (2, 5) of d1 to d4 and d3d4, before and after the split; `bounds` (2, 2): first
+    sample and end of each part, by which the mean over both is weighted.
+    """
+    n_samples = np.diff(bounds)[:, 0]
+    with np.errstate(divide="ignore"):  # the details of a constant pressure are 0
+        return {
+            chamber: 0.5 * np.log([*parts, np.average(parts, axis=0, weights=n_samples)])
+            for chamber, parts in squares.items()
+        }
 
 
 @dataclass(frozen=True)
@@ -137,16 +113,19 @@ class Scorer:
             ending = ", as change of its logarithm from the first to the second part"
         return text + ending + ("; any change at all" if self.threshold is not None else "")
 
-    def score(self, split_rms: SplitRms) -> float | None:
-        """Compute the score of a record, which is high if there is a leak.
+    def score(self, log_rms: LogRms, channels: Collection[str]) -> float | None:
+        """Compute the score of a record from the log RMS of those chambers whose pressures are among `channels`.
 
         Returns None if the record is too short, lacks a chamber's pressure, or has a constant pressure.
         """
-        scores = []
+        scores: list[float] = []
         for quantity, chamber, direction in self.conditions:
+            if chamber not in log_rms or chamber not in channels:
+                return None
+            before, after, overall = log_rms[chamber][:, QUANTITIES.index(quantity)].tolist()
             statistic, sign = _DIRECTIONS[direction]
-            value = split_rms.value(chamber, quantity, statistic)
-            if value is None:
+            value = after - before if statistic == "change" else overall
+            if not math.isfinite(value):
                 return None
             scores.append(sign * value if sign else abs(value))  # sign 0: the magnitude
         return min(scores)  # every condition must be met
