@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.equations.terms import (
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_tests
+from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -92,10 +92,9 @@ def volume_observables(
     observables = []
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
     for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
-        steps = step_tests(coefficient, signs, shape)
-        if not steps:
+        step = step_test(coefficient, signs, shape)
+        if step is None:
             continue
-        step = max(steps, key=lambda test: test.score)
         pressure_scale = None
         if name in (PUMP, *_LEAK_EXPONENTS):
             pressure_scale = _pressure_scale(coefficient, step)
@@ -118,7 +117,7 @@ def volume_observables(
                 name,
                 VOLUMES,
                 step,
-                n_tests=len(steps),
+                n_tests=len(signs),
                 advantage=advantage,
                 pressure_scale=pressure_scale,
             )
