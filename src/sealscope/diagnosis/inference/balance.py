@@ -79,25 +79,13 @@ class BlockStream(SavedAttributes):
 
     The blocks do not depend on how many samples arrive at a time, unless `n_first` is None.
 
-    Parameters
-    ----------
-    balances : sequence of Equation
-        Balances of the machine (`balances.equations`).
-    rate : float
-        Sampling rate [Hz].
-    block_s : float
-        Length of a block [s], rounded to whole strides of the weak form.
-    n_first : int, optional
-        Number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
-    start : float
-        Time of the first sample [s].
-    offset : float
-        Sensor offset [Pa] that is subtracted from p_A - p_B.
-    left_signs : tuple of float
-        Factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty to estimate
-        the factors from the first blocks or, of a stream, from the first ones with motion.
-    on_samples : callable, optional
-        Called with the start time [s] and the samples of each block.
+    - `balances`: volume balances of the machine (`balances.equations`); `rate`: sampling rate [Hz].
+    - `block_s`: length of a block [s], rounded to whole strides of the weak form.
+    - `n_first`: number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
+    - `start`: time of the first sample [s]; `offset`: sensor offset [Pa] that is subtracted from p_A - p_B.
+    - `left_signs`: factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty
+      to estimate the factors from the first blocks or, of a stream, from the first ones with motion.
+    - `on_samples`: called with the start time [s] and the samples of each block.
     """
 
     SAVED = ("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits", "_weighting")
@@ -394,7 +382,7 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     nuisance, tested = [k for k in roles.nuisance if k != roles.leak], [roles.leak, roles.left]
     coupling = gram[np.ix_(nuisance, tested)]
     reduced = gram[np.ix_(tested, tested)] - coupling.T @ solve(gram[np.ix_(nuisance, nuisance)], coupling)
-    (energy, moment), (_, left_square) = reduced.tolist()
+    energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
     freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
     if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
         return 0.0

@@ -70,15 +70,11 @@ class LowDrifts(NamedTuple):
     low_B: float
     low_B_error: float
 
-    def estimate(self, side: str) -> Estimate | None:
-        """Return the drift [Pa/s] of the low pressure of chamber `side`, "A" or "B"; None if it is unknown."""
-        drift = Estimate(*(self[:2] if side == "A" else self[2:]))
-        return drift if np.isfinite(drift).all() else None
-
     @property
     def known_drifts(self) -> dict[str, Estimate]:
         """Known drifts [Pa/s] by chamber, "A" and "B"."""
-        return {side: drift for side in "AB" if (drift := self.estimate(side)) is not None}
+        drifts = {"A": Estimate(*self[:2]), "B": Estimate(*self[2:])}
+        return {side: drift for side, drift in drifts.items() if np.isfinite(drift).all()}
 
 
 @np.errstate(all="ignore")
@@ -114,10 +110,7 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
 
 
 def _rate_of_change(pressure: Array, rate: float) -> Array:
-    """Compute the rate of change [Pa/s] of a pressure (n,) that is averaged over `charge.seconds`; NaN near its ends.
-
-    At each sample it is the difference of the values `charge.seconds` later and earlier, over the time between them.
-    """
+    """Compute the rate of change [Pa/s] of a pressure (n,) as a difference over 2 `charge.seconds`; NaN at the ends."""
     window = max(1, round(CHANGES.charge.seconds * rate))
     slope = np.full(len(pressure), np.nan)
     if len(pressure) > 2 * window:
@@ -167,8 +160,8 @@ class ChargeTrend(NamedTuple):
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     """Estimate the rate [Pa/s] at which the charge pressure of a closed circuit falls, from both low pressures.
 
-    The rate is minus the mean of the drifts of both pressures (`estimate_low_drifts`), weighted by their precisions.
-    Return None where `estimate_low_drifts` does, or if no drift has a finite standard error.
+    It is minus the mean of both drifts (`estimate_low_drifts`), weighted by their precisions. Return None where
+    `estimate_low_drifts` does, or if no drift has a finite standard error.
     """
     drifts = estimate_low_drifts(recording)
     if drifts is None:
@@ -252,7 +245,7 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
 
     Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
     the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. The `advantage` of each
-    comes from a prior on its size. A fall does not explain a difference between the two drifts; if both are known, its
+    comes from a prior on its size. A fall does not explain a difference between the two drifts: if both are known, its
     p-value is
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference),

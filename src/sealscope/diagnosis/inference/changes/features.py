@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
+from sealscope.diagnosis.inference.changes.levels import MOTIONS, motion_columns, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -29,8 +29,8 @@ from sealscope.signals.smoothing import TINY, average_over
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
-#: Channels of the command and of the motion, in the order of preference; a single channel stands for both.
-COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
+#: Channels of the command, in the order of preference; a single channel stands for command and motion.
+COMMANDS = ("u", "omega", "theta")
 #: Distances [bins] from a spectral line to bins outside of its main lobe with a Hann window.
 _NEIGHBOURS = _PRIORS.neighbours
 
@@ -38,8 +38,7 @@ _NEIGHBOURS = _PRIORS.neighbours
 def duty_tests(recording: Recording) -> list[StepTest]:
     """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
 
-    Returns a test for each amplitude; an empty list if one cannot be tested, as with too few blocks in motion. A change
-    of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one. The
+    A change of the commanded motion (the machine's duty) changes both amplitudes alike; a leak changes only one. The
     recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of
     whole cycles.
     """
@@ -59,18 +58,16 @@ def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
     """Compute the fraction of each block's samples in which the piston moves, (K,).
 
     `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz], in any unit, NaN where missing. The speed,
-    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`; a time
-    without any known speed counts as rest.
+    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`.
     """
     mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
     return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in which the piston moves for long enough.
+    """Flag the blocks (K,) that move for at least `features.busy` (`priors.toml`) times as long as the busiest block.
 
-    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`). It must be at least
-    `features.busy` (`priors.toml`) times that of the busiest block.
+    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`).
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
@@ -90,7 +87,7 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 
     The amplitude is the range from the 10 % to the 90 % quantile, which neither a short transient nor a short rest
     changes much. Its log is NaN for a block without samples, and -inf for constant samples. `blocks`: samples (K,
-    length) by channel. "command" or "motion" is left out if none of its channels is recorded.
+    length) by channel. A name is left out if none of its channels is recorded.
     """
     for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
         if channel := next((candidate for candidate in candidates if candidate in blocks), None):
@@ -102,10 +99,9 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 
 
 def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
-    """Test the log amplitudes (K,) of command and motion in K blocks for a step; one test for each.
+    """Test the log amplitudes (K,) of command and motion in K blocks for a step (`feature_step_test`).
 
-    `time` (K,): middles of the blocks [s]. The list is empty if one of the amplitudes cannot be tested
-    (`feature_step_test`).
+    `time` (K,): middles of the blocks [s]. The list has a test for each amplitude, or is empty if one cannot be tested.
     """
     tests = [feature_step_test(time, values) for values in amplitudes.values()]
     possible_tests = [test for test in tests if test is not None]
@@ -157,15 +153,14 @@ SENSOR_FEATURES = (
 
 
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield the name and the values (K,) of each feature of the pressures: sense, noise and hum, which no leak shifts.
+    """Yield the name and the values (K,) of each feature of the pressures, which no leak shifts (`SENSOR_FEATURES`).
 
-    The features (`SENSOR_FEATURES`) are the sense of p_A - p_B, the noise of both pressures, the difference of their
-    noise, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
+    The features are the sense of p_A - p_B, the log variance of the noise of both pressures, its difference between
+    them, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
     into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. A change of a sensor
     shifts the features, and a load that changes its side shifts the sense. The sense is left out if no motion is
-    recorded, and a hum if the sampling rate is too low. Noise is a log variance. The first word of a name is its kind
-    of data (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate
-    [Hz].
+    recorded, and a hum if the sampling rate is too low. The first word of a name is its kind of data
+    (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -210,8 +205,8 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
     """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
-    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: the ten times slower
-    function that skips missing values, such as `np.nanmedian`, for the other rows.
+    `statistic`: function for complete rows, such as `np.median`; `without_missing`: the ten times slower function that
+    skips missing values, such as `np.nanmedian`.
     """
     results = np.full(len(values), np.nan)
     is_known = np.isfinite(values)

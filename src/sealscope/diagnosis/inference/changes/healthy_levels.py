@@ -27,11 +27,8 @@ from sealscope.diagnosis.inference.changes.charge_pressure import (
 )
 from sealscope.diagnosis.inference.changes.motion_fit import (
     TIME,
-    Motion,
     fit_difference,
     fit_robustly,
-    influence_factor,
-    jackknife_errors,
     select_motion,
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
@@ -41,7 +38,7 @@ from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Recording, compute_once
 
 #: Smallest number that is divided by.
 TINY = 1e-300
@@ -65,7 +62,7 @@ class HealthyLevels:
         """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated.
 
         The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
-        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
+        channels) to an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
@@ -105,19 +102,16 @@ def _read_low_drifts(summary: Summary) -> LowDrifts | None:
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    `judged`, `healthy`: summaries of the recordings. Of up to two estimates of the friction (`FRICTION_KEYS`), the one
-    whose logarithm scatters less between the healthy recordings is compared. Return None if this estimate is not usable
-    in the judged recording, or if neither estimate is usable in `MIN_HEALTHY` healthy recordings.
+    Of up to two estimates of the friction (`FRICTION_KEYS`), the one whose logarithm scatters less between the healthy
+    recordings is compared. Return None if this estimate is not usable in the judged recording, or if neither estimate
+    is usable in `MIN_HEALTHY` healthy recordings.
     """
     prior = CHANGES.healthy
-    choices = [
-        (float(np.std([friction.value for friction in healthy_logs], ddof=1)), judged_log, healthy_logs)
-        for judged_log, healthy_logs in (_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS)
-        if len(healthy_logs) >= MIN_HEALTHY
-    ]
-    if not choices:
+    estimates = [_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS]
+    comparable = [(judged_log, logs) for judged_log, logs in estimates if len(logs) >= MIN_HEALTHY]
+    if not comparable:
         return None
-    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])  # choice with the smallest scatter
+    judged_log, healthy_logs = min(comparable, key=lambda estimate: np.std([log.value for log in estimate[1]], ddof=1))
     if judged_log is None:
         return None
     scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
@@ -209,7 +203,10 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         if fit is not None:
             levels |= dict(zip(keys, (fit.friction, fit.friction_error), strict=True))
     if (motion := select_motion(recording)) is not None:
-        drifts = [_estimate_drift(motion, recording[name]) for name in CHAMBERS]
+        # residuals may be correlated within a stroke
+        drifts = [
+            fit_robustly(motion.design, recording[name][motion.rows], [TIME], motion.strokes)[0] for name in CHAMBERS
+        ]
         if np.isfinite(drifts).all():
             levels |= dict(zip(DRIFT_KEYS, np.ravel(drifts).tolist(), strict=True))
     if (low_drifts := estimate_low_drifts(recording)) is not None:
@@ -220,16 +217,3 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         if (octaves := compute_octaves(recording, pair)) is not None
     }
     return {**levels, **spectra} or None
-
-
-def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
-    """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
-
-    The error allows for residuals that are correlated within a stroke. It is infinite if the motion does not determine
-    the drift.
-    """
-    values = pressure[motion.rows]
-    coefficients, weight = fit_robustly(motion.design, values)
-    # TIME is the column of the time over the duration: its coefficient is the drift over the whole recording
-    (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
-    return Estimate(float(coefficients[TIME]), influence_factor(weight) * float(error))

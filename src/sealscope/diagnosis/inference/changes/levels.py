@@ -29,7 +29,7 @@ Each further coefficient costs log n (G. Schwarz, Ann. Statist. 6 (1978) 461).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -44,7 +44,9 @@ _PRIORS = CHANGES.levels
 #: Iterations of the scatter of differences between blocks.
 _SCATTER_ITERATIONS = 20
 _TINY = float(np.finfo(float).tiny)
-#: Unit changes of level_A, level_B, half_A and half_B.
+#: Channels that show a motion, in the order of preference.
+MOTIONS = ("x", "theta", "omega", "u")
+#: Unit changes of the four numbers of a block, level_A, level_B, half_A and half_B.
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
@@ -65,17 +67,6 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
 )
 
 
-class PressureLevels(NamedTuple):
-    """Levels of both chamber pressures in K blocks of a recording, at the times `time` (K,) [s].
-
-    `values` (K, 4) [Pa]: level_A and level_B, the mean of each pressure over both directions of motion, and half_A and
-    half_B = (p for v > 0 - p for v < 0) / 2 of each pressure, at the same motion otherwise.
-    """
-
-    time: Array
-    values: Array
-
-
 class LevelChange(NamedTuple):
     """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
@@ -94,6 +85,11 @@ class LevelChange(NamedTuple):
     pressure_scale: Estimate | None = None
 
 
+def find_motion_channel(channels: Collection[str]) -> str | None:
+    """Return the name of the channel that shows the motion best; None if none is recorded."""
+    return next((name for name in MOTIONS if name in channels), None)
+
+
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
@@ -101,7 +97,7 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     the acceleration is the difference of the speed over that time; the position is relative to its mean. Missing values
     are NaN. Return None if none of these channels is recorded.
     """
-    name = next((channel for channel in ("x", "theta", "omega", "u") if channel in channels), None)
+    name = find_motion_channel(channels)
     if name is None:
         return None
     values = channels[name]
@@ -118,14 +114,13 @@ def top_speed(motion: Array) -> float:
     return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), _TINY)[0])
 
 
-def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate each pressure's mean over both directions of motion, and half its change with the direction, in blocks.
+def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
+    """Estimate the levels of both pressures and their half changes with the direction of motion, in K blocks.
 
-    The samples in motion are fitted by p = level + half sign(v) + b v + c dv/dt + d x. Level and half difference are
-    free in each block; the slopes b, c and d on speed v, acceleration and position x are common to the recording.
-    Without a recorded motion the levels are means and the half differences zero. Several block lengths are tried, whole
-    cycles first; the first with enough samples of both directions in every block is used. Return None if there is no
-    such length, or if a pressure is not recorded.
+    Returns the middles of the blocks (K,) [s], and level_A, level_B, half_A and half_B of each, (K, 4) [Pa]. The slopes
+    b, c and d of the module are common to the recording. Without a recorded motion the levels are means and the half
+    changes zero. Several block lengths are tried, whole cycles first; the first with enough samples of both directions
+    in every block is used. Return None if there is no such length, or if a pressure is not recorded.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -145,7 +140,7 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
         gram = blocks.transpose(0, 2, 1) @ blocks
         values = fit_pressure_levels(gram, length, means)
         if values is not None:
-            return PressureLevels(recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values)
+            return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
     return None
 
 
@@ -156,8 +151,7 @@ def pressure_level_rows(
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
     `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures, against rounding; `max_speed`: highest
-    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of
-    `max_speed`.
+    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of it.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -172,9 +166,8 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit each pressure's mean over both directions of motion, and half its change with the direction, in K blocks.
+    """Fit level_A, level_B, half_A and half_B in K blocks, (K, 4) [Pa]; None if a block has too few of one direction.
 
-    The result (K, 4) contains `PressureLevels.values`. It is None if a block has too few samples of one direction.
     `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,): means of the
     pressures that were subtracted in these rows [Pa].
     """
@@ -207,7 +200,7 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     """Test pressure levels for a step in each of several patterns; the most likely one (highest rank) comes first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
-    Those that cannot be tested are left out. `time` (K,), `values` (K, 4): times [s] and levels of `PressureLevels`.
+    Those that cannot be tested are left out. `time` (K,), `values` (K, 4): as from `estimate_levels`.
 
     A step takes time, so that the block in which it begins shows neither the old nor the new levels. The tests are
     therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
@@ -262,9 +255,8 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
 def _pressure_scale(before: Array, after: Array) -> Estimate | None:
     """Compute the logarithm of the factor on both pressures that would explain a change of the friction.
 
-    `before`, `after` (k, 4) [Pa]: `PressureLevels.values` of the blocks before and after the change. The friction shows
-    in the difference of half_A and half_B. Return None if there are fewer than two blocks before or after, or if a mean
-    friction is not positive.
+    `before`, `after` (k, 4) [Pa]: levels of the blocks before and after the change. half_A - half_B is the friction.
+    Return None if there are fewer than two blocks before or after, or if a mean friction is not positive.
     """
     frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
     if min(len(friction) for friction in frictions) < 2:
@@ -281,8 +273,8 @@ def _whitening_matrix(values: Array) -> Array:
 
     The matrix W is a root of the inverse of S, W' W = S^-1. S is the maximum-likelihood estimate of the scatter matrix
     of the differences between neighbouring blocks, under a multivariate t distribution, so that the large differences
-    at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
-    `PressureLevels.values`; c: number of its columns that are not constant.
+    at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4): levels of
+    the blocks; c: number of its columns that are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # a machine that never moves has constant levels
     differences = np.diff(values[:, varying], axis=0)

@@ -80,9 +80,9 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
     """Compute the log amplitudes of both channels of a `pair` in octaves of frequency, and the phase between them.
 
     The power in an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows of time, since a machine
-    may often rest; the phase [rad], with its variance, is that of the sum over all windows. Return None if a channel is
-    not recorded, if the recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all
-    windows have missing samples.
+    may often rest; the phase is that of the sum over all windows. Return None if a channel is not recorded, if the
+    recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all windows have missing
+    samples.
     """
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):
@@ -120,12 +120,13 @@ def _octave_powers(
 ) -> tuple[Array, Array, NDArray[np.complex128]] | None:
     """Compute powers and cross-power of a pair of channels A and B in half-overlapping Hann windows, in octaves.
 
-    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. A median of three removes single wrong
-    samples. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k) each.
-    Windows with missing samples are left out; None if no window is left.
+    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. The results are sums of abs(A)^2,
+    abs(B)^2 and A B* over the lines of each octave, (windows, k) each. Windows with missing samples are left out; None
+    if no window is left.
     """
     from scipy.ndimage import median_filter
 
+    # the median of three removes single wrong samples
     values = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
     hann, powers = np.hanning(length), []
@@ -148,8 +149,7 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
     `judged`, `healthy`: spectra of each recording for pairs of channels, by their names in `PAIRS`. The result is named
     after the pressure that is most probably filtered. Its size is the most probable cut-off frequency [Hz], its p-value
     the inverse of the Bayes factor of a filter, averaged over the pairs, or 1 for a factor below 1. Its score is twice
-    the log of this factor, or 0. Healthy recordings with fewer octaves of a pair than the judged one are left out.
-    Return None if too few remain for every pair.
+    the log of this factor, or 0. Return None if too few healthy recordings remain for every pair (`_compare_pair`).
     """
     from scipy.special import logsumexp
 

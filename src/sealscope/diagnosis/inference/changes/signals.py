@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
@@ -51,18 +50,16 @@ def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, .
     return tuple(observables)
 
 
-#: Minimum ratio of the smaller to the larger of two steps (a, b). As an angle of the vector (a, b) it is half way
-#: between a single step, 0 degrees, and equal steps, 45 degrees.
+#: Minimum ratio of the smaller to the larger of two steps: half way, as an angle, between a single step and equal ones.
 _MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 
 
 def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
     """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must rise, or both fall: the
-    smaller step must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score,
-    onset and size are those of the test with the lower score. The p-value is twice the higher one, since a step may be
-    up or down.
+    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must rise, or both fall, by
+    similar amounts (`_MIN_STEP_RATIO`), since a leak changes only one amplitude. Score, onset and size are those of the
+    test with the lower score. The p-value is twice the higher one, since a step may be up or down.
     """
     steps = np.abs([test.fitted.value for test in tests])
     has_one_sign = len({test.sign for test in tests}) == 1
@@ -80,25 +77,20 @@ def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
 
 
 def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert step tests of sensor features, such as noise and hum, to observables (test results).
+    """Convert step tests of sensor features, such as noise and hum, to observables.
 
     `tests`: pairs of a feature's name, whose first word is the kind of data, and its test. The p-value is doubled, as
     each test is the better of two, for a step up and a step down.
     """
     for name, test in tests:
-        observable = Observable.from_test(name, name.split()[0], test, n_tests=2.0)
+        scale = None
         if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
-            scale = Estimate(0.25 * observable.size, 0.25 * test.fitted.deviation)
-            observable = replace(observable, pressure_scale=scale)
-        yield observable
-
-
-#: Largest exponent whose exponential fits into a float.
-_MAX_EXPONENT = 700.0
+            scale = Estimate(0.25 * test.sign * test.fitted.value, 0.25 * test.fitted.deviation)
+        yield Observable.from_test(name, name.split()[0], test, n_tests=2.0, pressure_scale=scale)
 
 
 def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
-    """Convert tests for steps of the pressure levels to observables (test results).
+    """Convert tests for steps of the pressure levels to observables.
 
     `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
     rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
@@ -108,7 +100,7 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     """
     for change in changes:
         onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
-        deficit = min(changes[0].rank - change.rank, _MAX_EXPONENT)
+        deficit = min(changes[0].rank - change.rank, 700.0)  # the largest exponent whose exponential is finite
         chance = min(1.0, len(changes) * changes[0].chance * float(np.exp(deficit)))
         yield Observable(
             name=change.name,
