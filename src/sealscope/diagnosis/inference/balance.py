@@ -350,10 +350,10 @@ def _z_score(products: Array) -> float:
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
     """Compute p_A - `area_ratio` p_B in each row of a regression, i.e. the pressures' force over the area of A.
 
-    `rows` (r, m): rows of a volume balance; `columns`: roles of their columns; `area_ratio`: area of the piston on side
-    B over that on side A. p_A and -p_B are the columns of the two external leaks: 0 while the pressure is negative or,
-    with a meter in a valve's supply line, while its side is not fed. If the balance lacks one of them, or if
-    `area_ratio` is 1, the result is the column of the leak, p_A - p_B.
+    `rows` (r, m): rows of a volume balance; `area_ratio`: area of the piston on side B over that on side A. p_A and
+    -p_B are the columns of the two external leaks: 0 while the pressure is negative or, with a meter in a valve's
+    supply line, while its side is not fed. If the balance lacks one of them, or if `area_ratio` is 1, the result is the
+    column of the leak, p_A - p_B.
     """
     names = [f"external leak {side}" for side in "AB"]
     if area_ratio == 1.0 or not set(names) <= set(columns.names):
@@ -376,8 +376,8 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares: positive for oil from high to low pressure.
 
-    `gram` (m, m): Gram matrix of the `n_rows` rows of the regression; `roles`: roles of its columns. The result is 0 if
-    the rows do not determine the coefficient.
+    `gram` (m, m): Gram matrix of the `n_rows` rows of the regression. The result is 0 if the rows do not determine the
+    coefficient.
     """
     nuisance, tested = [k for k in roles.nuisance if k != roles.leak], [roles.leak, roles.left]
     coupling = gram[np.ix_(nuisance, tested)]

@@ -389,10 +389,10 @@ def solve(matrix: Array, right: Array) -> Array:
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, with_expansion: bool = False) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    `columns`: roles of the columns of each equation; `test`: index of the coefficient's column; `with_expansion`: add
-    the errors of the coefficient by an imperfect model of the oil's expansion (`_expansion_errors`). The likelihoods of
-    the equations are multiplied. The result also contains the prior standard deviation of the coefficient in a healthy
-    machine (`level`, `ColumnRoles.leak_deviation`).
+    `test`: index of the coefficient's column; `with_expansion`: add the errors of the coefficient by an imperfect model
+    of the oil's expansion (`_expansion_errors`). The likelihoods of the equations are multiplied. The result also
+    contains the prior standard deviation of the coefficient in a healthy machine (`level`,
+    `ColumnRoles.leak_deviation`).
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
@@ -440,16 +440,6 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     has_energy = fit.normal.energy > 0.0
     products = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
     return np.asarray(INFERENCE.blocks.expansion * products / np.where(has_energy, fit.normal.energy, 1.0))
-
-
-def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
-    """Compute the polynomials (K, DRIFT_DEGREE + 1) of slow drifts over K blocks, and the recording's length [min].
-
-    A single block has only the constant polynomial.
-    """
-    minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
-    position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0  # -1 to 1, the polynomials' range
-    return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
 class _NormalEquations(NamedTuple):
@@ -558,11 +548,13 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `equation`: index of the equation; `test`: column of g, by default the leak's.
+    `test`: column of g, by default the leak's.
     """
     gram, test = blocks.gram[:, equation], roles.leak if test is None else test
     nuisance = [k for k in roles.nuisance if k != test]
-    polynomials, minutes = _drift_polynomials(blocks)
+    seconds = max(float(blocks.end[-1] - blocks.start[0]), 1e-9)
+    position = (blocks.time - blocks.start[0]) / seconds * 2.0 - 1.0  # -1 to 1, the range of Legendre polynomials
+    polynomials = np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0)  # of the drifts
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
@@ -572,7 +564,7 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     # prior standard deviations of constants and drifts, last of the offset: without a prior if it has no effect
     deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
     deviations[:-1, 0] = level
-    deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * minutes)[:, None]
+    deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
     deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block

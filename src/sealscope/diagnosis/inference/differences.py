@@ -31,6 +31,7 @@ import numpy as np
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.inference import StepSize
+from sealscope.signals.smoothing import TINY
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
@@ -40,8 +41,6 @@ NODES = 64
 MAX_RATIO, MAX_RATIO_TO_VALUES = 100.0, 10.0
 #: Number of grid points of the factor by which errors are too small or too large.
 INFLATIONS = 9
-#: Smallest positive number that is divided by.
-TINY = float(np.finfo(float).tiny)
 
 
 class PriorScatter(NamedTuple):

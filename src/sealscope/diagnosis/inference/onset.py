@@ -254,15 +254,11 @@ def fit_history(information: Information, test: StepTest | None, *, with_step: b
         columns.append(np.sqrt(walk) * np.tril(np.ones((count, count))))
         prior += [1.0] * count
     basis = np.column_stack(columns)
-    inverse = _inverse((basis.T @ information.precision @ basis + np.diag(prior)) / noise)
+    precision = (basis.T @ information.precision @ basis + np.diag(prior)) / noise
+    scale = np.sqrt(np.maximum(np.diag(precision), np.finfo(float).tiny))  # to a unit diagonal, against rounding
+    inverse = np.linalg.pinv(precision / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale)
     mean = basis @ (inverse @ (basis.T @ information.vector / noise))
     return History(mean, basis @ inverse @ basis.T)
-
-
-def _inverse(matrix: Array) -> Array:
-    """Compute the pseudoinverse of a positive semidefinite matrix, scaled to a unit diagonal against rounding."""
-    scale = np.sqrt(np.maximum(np.diag(matrix), np.finfo(float).tiny))
-    return np.asarray(np.linalg.pinv(matrix / np.outer(scale, scale), hermitian=True) / np.outer(scale, scale))
 
 
 class NullLaw(NamedTuple):

@@ -41,8 +41,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
     The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa]. The blocks are returned
-    unchanged if too few of them determine the leak, or if an equation has no column for a constant flow. `columns`:
-    roles of the columns of each equation.
+    unchanged if too few of them determine the leak, or if an equation has no column for a constant flow.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks

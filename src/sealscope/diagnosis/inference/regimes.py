@@ -43,7 +43,7 @@ MIN_STATE_BLOCKS = 2
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `balances.with_rests` adds.
+    `roles` includes the columns `STATES` that `balances.with_rests` adds.
 
     - Open valves: the columns `STATES` are dropped from the Gram matrices.
     - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
@@ -105,11 +105,11 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while the pump rests (`rest_log_odds`).
 
-    `roles`: roles of the columns of `blocks`, among them those of `balances.with_rests`. All coefficients are estimated
-    from blocks with motion; then leakage and flow offset at rest are estimated from the other blocks, given all other
-    coefficients. A single regression could make both leakage and compliance zero at rest, since the rate at which the
-    pressures relax shows only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the
-    other columns Z and their coefficients b in motion, the leakage r at rest is the first of
+    `roles` includes the columns of `balances.with_rests`. All coefficients are estimated from blocks with motion; then
+    leakage and flow offset at rest are estimated from the other blocks, given all other coefficients. A single
+    regression could make both leakage and compliance zero at rest, since the rate at which the pressures relax shows
+    only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the other columns Z and
+    their coefficients b in motion, the leakage r at rest is the first of
 
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 

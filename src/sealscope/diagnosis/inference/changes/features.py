@@ -48,8 +48,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         # cycle, and would look like another duty in blocks of whole cycles.
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
-    time, blocks = _split_blocks(recording, length)
-    is_moving = _find_moving_blocks(recording, length)
+    time, blocks, is_moving = _split_blocks(recording, length)
     amplitudes = {name: values[is_moving] for name, values in log_amplitudes(blocks)}
     return amplitude_step_tests(time[is_moving], amplitudes)
 
@@ -70,16 +69,6 @@ def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
     `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`).
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
-
-
-def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
-    """Flag the K blocks of `length` samples in which the piston moves, (K,); all blocks if no motion is recorded."""
-    count = len(recording) // length
-    motion = motion_columns(recording.channels, recording.rate)
-    if motion is None:
-        return np.ones(count, dtype=bool)
-    speeds = motion[: count * length, 0].reshape(count, length)  # the first column is the speed
-    return is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
@@ -111,16 +100,14 @@ def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[S
 def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     """Test features of the pressures, such as their noise, for a lasting change that no leak causes.
 
-    Returns pairs of a feature's name and its test, without features that cannot be tested. The list is empty if a
-    chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
+    Returns pairs of a feature's name and its test, without features that cannot be tested; none if a chamber pressure
+    is not recorded, or if p_A has no samples in one of the blocks.
     """
     if not {"p_A", "p_B"} <= recording.channels.keys():
         return []
-    length = len(recording) // BLOCKS
-    time, blocks = _split_blocks(recording, length)
+    time, blocks, is_moving = _split_blocks(recording, len(recording) // BLOCKS)
     if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples, in which no channel has any
         return []
-    is_moving = _find_moving_blocks(recording, length)
     tests = (
         (name, feature_step_test(time[is_moving], values[is_moving]))
         for name, values in sensor_features(blocks, recording.rate)
@@ -128,17 +115,23 @@ def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
     return [(name, test) for name, test in tests if test is not None]
 
 
-def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
-    """Split the channels of a recording into K blocks of `length` samples, without samples after the last whole block.
+def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array], NDArray[np.bool_]]:
+    """Split the channels of a recording into K whole blocks of `length` samples.
 
-    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing.
+    Returns the middles of the blocks (K,) [s], the samples (K, length) by channel name, NaN where missing, and flags
+    (K,) of the blocks in which the piston moves, all if no motion is recorded.
     """
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
     if recording.bridged is not None:
         missing = recording.bridged[: count * length].reshape(count, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
-    return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks
+    motion = motion_columns(recording.channels, recording.rate)
+    is_moving = np.ones(count, dtype=bool)
+    if motion is not None:
+        speeds = motion[: count * length, 0].reshape(count, length)
+        is_moving = is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
+    return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks, is_moving
 
 
 #: Name of the noise of both pressures together.
@@ -220,8 +213,8 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
-    `time` (K,): middles of the blocks [s]. Return None if the values are constant or fewer than `MIN_BLOCKS`, or if one
-    of them is not finite.
+    `time` (K,): middles of the blocks [s]. Return None if the values are constant, not finite or fewer than
+    `MIN_BLOCKS`.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None

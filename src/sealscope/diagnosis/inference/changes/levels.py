@@ -35,15 +35,15 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, step_test
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, Interval, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import TINY
 
 _PRIORS = CHANGES.levels
 #: Iterations of the scatter of differences between blocks.
 _SCATTER_ITERATIONS = 20
-_TINY = float(np.finfo(float).tiny)
 #: Channels that show a motion, in the order of preference.
 MOTIONS = ("x", "theta", "omega", "u")
 #: Unit changes of the four numbers of a block, level_A, level_B, half_A and half_B.
@@ -52,9 +52,8 @@ A, B, HALF_A, HALF_B = np.eye(4)
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
 #: Name of a change of the friction, which changes with the direction of motion.
 FRICTION = "friction"
-#: Name of each pattern, and bases of its subspace. If the subspace of the load contains simpler patterns, each of them
-#: supplies the first vector of one basis (`_test_patterns`). Friction has three patterns: both half differences change,
-#: with the mean level, alone and oppositely, or with any levels.
+#: Name of each pattern, and bases of its subspace: the load has three, each of which begins with a simpler pattern.
+#: Friction has three patterns: both half changes, with the mean level, alone and oppositely, or with any levels.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
     (FRICTION, [[A + B, HALF_A, HALF_B]]),
@@ -71,17 +70,15 @@ class LevelChange(NamedTuple):
     """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
 
     `name`: cause that changes these levels, such as "friction"; `rank`: by which patterns are compared (see the
-    module); `score`: twice the log likelihood ratio of a step to no step in these levels alone; `chance`: probability
-    that a healthy recording scores as high; `onset`: time of the step [s]; `block`: length of a block [s];
-    `pressure_scale`: logarithm of a factor on both pressures that would cause the change, None if there is none.
+    module); `chance`: probability that a healthy recording has such a step in these levels; `onset`: time of the step
+    [s], with one block to either side; `pressure_scale`: logarithm of a factor on both pressures that would cause the
+    change, None if there is none.
     """
 
     name: str
     rank: float
-    score: float
     chance: float
-    onset: float
-    block: float
+    onset: Interval
     pressure_scale: Estimate | None = None
 
 
@@ -111,7 +108,7 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
 
 def top_speed(motion: Array) -> float:
     """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), _TINY)[0])
+    return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), TINY)[0])
 
 
 def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
@@ -181,17 +178,17 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     free = np.linalg.solve(gram[:, :n_free, :n_free], gram[:, :n_free, n_free:])
     # eliminate the free coefficients of each block, then fit the motion's slopes to all blocks together
     reduced = (gram[:, n_free:, n_free:] - gram[:, n_free:, :n_free] @ free).sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], _TINY))[:, None]
+    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], TINY))[:, None]
     normalised, right_sides = reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale
     slopes = np.linalg.lstsq(normalised, right_sides, rcond=None)[0] / scale
-    values = np.zeros((len(gram), 4))  # half differences stay 0 without a recorded motion
+    values = np.zeros((len(gram), 4))  # half changes stay 0 without a recorded motion
     values[:, : 2 * n_free] = (free[:, :, -2:] - free[:, :, :-2] @ slopes).reshape(len(gram), -1)
     values[:, :2] += means
     return values
 
 
 def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test a recording for a step in each pattern of pressure levels (`pattern_tests`); empty if they are unknown."""
+    """Test a recording for a step in each pattern of its pressure levels (`pattern_tests`)."""
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
@@ -210,7 +207,7 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]
     if changes and len(time) >= MIN_BLOCKS + 2:
-        onset = max(changes, key=lambda change: change.rank).onset
+        onset = max(changes, key=lambda change: change.rank).onset.value
         near_onset = np.argsort(np.abs(time - onset), kind="stable")[:2]
         reduced_tests = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
         changes = [
@@ -224,25 +221,24 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
 def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested.
 
-    A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels. The
-    results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
+    The results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
     """
     mean = values.mean(axis=0)
     sum_of_levels = values[:, :2].sum(axis=1)
-    # a step of a sensor's scale changes level and half difference of that pressure in proportion to their means
+    # a step of a sensor's scale changes level and half change of that pressure in proportion to their means
     scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
     if not np.ptp(values, axis=0).any():  # constant pressures have no errors by which steps are tested
         return [None] * (len(PATTERNS) + len(scales))
     whitening = _whitening_matrix(values)
     changes = list[LevelChange | None]()
     for name, bases in (*PATTERNS, *scales):
-        tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
+        tests = [_test_pattern(name, np.array(basis) @ whitening.T, values @ whitening.T, time) for basis in bases]
         # the rank depends on the basis, as each direction has a random walk of its own: a pattern must be supported by
         # each of its bases, so that the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
         if change is not None:
             # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
-            after = time > change.onset
+            after = time > change.onset.value
             is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
             if name == CHARGE and not is_falling:
                 change = change._replace(name=SUPPLY)
@@ -296,10 +292,8 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
     `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if the vectors are zero, or if a direction
-    cannot be tested.
-
-    The score counts only the directions of the pattern, each with its own variance. For the rank, by which patterns are
-    compared, all directions have one variance in common. The formulas are in the module's docstring.
+    cannot be tested. The score counts only the directions of the pattern, each with its own variance. For the rank all
+    directions have one variance in common. The formulas are in the module's docstring.
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
@@ -331,4 +325,4 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     # up or down in each direction, by the law under which the score is the most probable
     chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return LevelChange(name, rank, score, min(1.0, chance), onset, block)
+    return LevelChange(name, rank, min(1.0, chance), Interval(onset, onset - block, onset + block))

@@ -32,7 +32,7 @@ from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once
-from sealscope.signals.smoothing import average_over
+from sealscope.signals.smoothing import TINY, average_over
 
 #: Maximum number of positions between which the level is linear, and minimum number of rows for each.
 KNOTS, ROWS_PER_KNOT = 24, 10
@@ -40,8 +40,8 @@ KNOTS, ROWS_PER_KNOT = 24, 10
 MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 60, 8
 #: Scale of the weights' decrease with the residual, over the median residual.
 WEIGHT_SCALE = 2.0
-#: Smallest number that is divided by, and smallest scale of residuals [Pa].
-TINY, MIN_RESIDUAL = 1e-300, 1.0
+#: Smallest scale of residuals [Pa].
+MIN_RESIDUAL = 1.0
 #: Maximum number of groups of rows whose residuals count as independent.
 GROUPS = 20
 #: Eigenvalue of a normalised normal matrix, over the largest one, below which a combination of coefficients is free.
@@ -156,7 +156,12 @@ def fit_robustly(design: Array, values: Array, columns: Sequence[int], groups: N
             residual = np.abs(values - design @ coefficients)
         fits.append((float(np.median(residual)), coefficients, _robust_weight(residual)))
     _, coefficients, weight = min(fits, key=lambda fit: fit[0])
-    errors = _influence_factor(weight) * jackknife_errors(design * weight[:, None], values * weight, columns, groups)
+    errors = jackknife_errors(design * weight[:, None], values * weight, columns, groups)
+    # With u = residual / scale and w = 1/(1 + u^2), the robust coefficients make the sum of psi(u) times the row of the
+    # design zero, where psi = u w^2. Its slope is 4 w^3 - 3 w^2, with the fixed weights of the jackknife w^2. The
+    # errors are larger by the ratio of the means of both, at most by 10.
+    squares, slopes = float((weight**2).mean()), float((4.0 * weight**3 - 3.0 * weight**2).mean())
+    errors *= squares / max(slopes, 0.1 * squares)
     return [Estimate(*pair) for pair in zip(coefficients[columns].tolist(), errors.tolist(), strict=True)]
 
 
@@ -164,19 +169,6 @@ def _robust_weight(residual: Array) -> Array:
     """Compute the weights (n,) of rows from the magnitudes of their residuals (n,) [Pa] (`fit_robustly`)."""
     scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
     return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
-
-
-def _influence_factor(weight: Array) -> float:
-    """Compute the factor by which a robust fit has larger standard errors than a fit with fixed weights.
-
-    `weight` (n,): final weights of the robust fit. With u = residual / scale and w = 1/(1 + u^2), the robust
-    coefficients make the sum of psi(u) times the row of the design zero, where psi = u w^2. The slope of psi is
-    4 w^3 - 3 w^2; with fixed weights it would be w^2. The factor is the mean of w^2 over the mean of the slope, at most
-    10.
-    """
-    squares = float((weight**2).mean())
-    slopes = float((4.0 * weight**3 - 3.0 * weight**2).mean())
-    return squares / max(slopes, 0.1 * squares)
 
 
 def equal_parts(n_rows: int) -> NDArray[np.intp]:

@@ -38,8 +38,6 @@ from sealscope.recordings.recording import Array, Recording
 
 #: `Observable.data` of the comparison of spectra.
 SIDES = "sides"
-#: `Observable.name` of a filter, by the filtered pressure.
-FILTER_NAMES = {channel: f"filter of {channel}" for channel in CHAMBERS}
 #: Pairs of channels whose spectra are compared, by their names in a recording's summary.
 PAIRS = {
     "octaves": CHAMBERS,
@@ -50,8 +48,6 @@ PAIRS = {
 }
 #: Minimum number of octaves.
 MIN_OCTAVES = 3
-#: Number of samples of the median that removes single wrong ones.
-GLITCH = 3
 #: Power added before dividing or taking a logarithm: of pressures [Pa^2], position [m^2], pump's speed [rad^2/s^2].
 MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
 #: Minimum coherence, since its square is a divisor.
@@ -127,7 +123,7 @@ def _octave_powers(
     from scipy.ndimage import median_filter
 
     # the median of three removes single wrong samples
-    values = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in pair])
+    values = np.stack([median_filter(recording[name], 3, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
     hann, powers = np.hanning(length), []
     for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
@@ -164,7 +160,7 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
     log_factor = float(logsumexp([log_factor for log_factor, _, _ in filters]) - np.log(len(filters)))
     _, channel, cutoff = max(filters, key=lambda comparison: comparison[0])
     return Observable(
-        name=FILTER_NAMES[channel],
+        name=f"filter of {channel}",
         data=SIDES,
         score=max(2.0 * log_factor, 0.0),
         chance=float(np.exp(-max(log_factor, 0.0))),

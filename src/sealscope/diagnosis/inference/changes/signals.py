@@ -15,7 +15,7 @@ import numpy as np
 from sealscope.diagnosis.inference.changes.features import BLOCKS, NOISE, ORDER, duty_tests, sensor_tests
 from sealscope.diagnosis.inference.changes.levels import LevelChange, level_tests
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
+from sealscope.diagnosis.inference.onset import Estimate, StepTest
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -96,10 +96,9 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
     rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
     (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)). The Bayes factor of change 1 over
     change k (Schwarz's approximation) counts twice, once as evidence and once as a prior, because a pattern that
-    explains only part of the change needs a second cause. The interval of an onset is one block to either side.
+    explains only part of the change needs a second cause.
     """
     for change in changes:
-        onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
         deficit = min(changes[0].rank - change.rank, 700.0)  # the largest exponent whose exponential is finite
         chance = min(1.0, len(changes) * changes[0].chance * float(np.exp(deficit)))
         yield Observable(
@@ -107,6 +106,6 @@ def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
             data="levels",
             score=change.rank,
             chance=chance,
-            onset=onset,
+            onset=change.onset,
             pressure_scale=change.pressure_scale,
         )

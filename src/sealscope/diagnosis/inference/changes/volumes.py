@@ -88,6 +88,7 @@ def volume_observables(
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
+    law_prior_of = dict(zip(EXPONENTS, law_priors(), strict=True))
     observables = []
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
     for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
@@ -99,7 +100,8 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
-        advantage += 2.0 * _law_log_prior(name)
+        prior = law_prior_of[_LEAK_EXPONENTS.get(name, 1.0)]
+        advantage += 2.0 * float(np.log(prior / law_prior_of[1.0]))
         term = name.removesuffix(MADE_UP)  # the end of a name that marks a leak whose lost oil a check valve replaces
         if (accumulator_test := oil_loss.get(term)) is not None:
             advantage += _accumulator_support(step, accumulator_test)
@@ -156,24 +158,15 @@ def _size_penalty(
     return 0.0
 
 
-def _law_log_prior(name: str) -> float:
-    """Compute the log prior odds of a leak whose flow follows a power of p_A - p_B to a laminar leak.
-
-    `name`: name of the tested step, which states the power. The result is 0 for a laminar leak and for other steps.
-    """
-    laminar, *_ = priors = law_priors()
-    return float(np.log(priors[EXPONENTS.index(_LEAK_EXPONENTS.get(name, 1.0))] / laminar))
-
-
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
 ) -> Iterator[tuple[str, Sequence[float], Information, Array | None]]:
     """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
     `centred`, `recorded`: the blocks `blocks` and `plain` of `volume_observables`; `terms`: terms of the first
-    equation; `columns`: roles of the columns of each equation; `has_accumulator`: true if the recording shows the
-    volume of an accumulator. Yields for each step its name, the signs to test (1 up, -1 down), the likelihood of the
-    coefficient in K blocks, and the change (K,) of the coefficient by a unit step, None if it is 1 in every block.
+    equation; `has_accumulator`: true if the recording shows the volume of an accumulator. Yields for each step its
+    name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, and the change (K,) of the
+    coefficient by a unit step, None if it is 1 in every block.
     """
     first = columns[0]
     for term in terms:
@@ -199,8 +192,7 @@ def _step_hypotheses(
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    `roles`: roles of the balance's columns; `has_accumulator`: true if the recording shows the volume of an
-    accumulator.
+    `has_accumulator`: true if the recording shows the volume of an accumulator.
     """
     # The coefficients of motion change together, with an area, the displacement or a sensor's scale: the test of SCALE
     # covers them. The motion of one recording varies too little to test SPEED_LOSS. A leaking piston raises HOLDING as
@@ -231,7 +223,7 @@ def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index:
 
     This volume is the sum of the columns of motion, each times its coefficient fitted to the whole recording. A change
     of the sensor's scale of position or speed by the fraction s changes the coefficient of the new column by s.
-    `columns`: roles of the columns of each equation.
+
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -16,9 +16,9 @@ from itertools import compress
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.comparison.rise import TINY
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
 
 
 def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None) -> Array:
@@ -45,8 +45,8 @@ def _limit_precisions(prior: Array, gram: Array) -> Array:
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`; `columns`: roles of their columns. Both
-    results are 0 without information on the leak.
+    `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`. Both results are 0 without information on
+    the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -89,8 +89,8 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
     Their `between_deviation` is infinite. The leakage of a pump that holds the load, which counts only within a
-    recording, is set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations;
-    `columns`: roles of their columns. In the result the rows and columns of these coefficients are zero.
+    recording, is set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations. In the
+    result the rows and columns of these coefficients are zero.
     """
     reduced = _remove_hold_leaks(gram, columns)
     for e, roles in enumerate(columns):
@@ -122,8 +122,8 @@ def subtract_reference(
 ) -> tuple[Array, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
-    roles of their columns. Returns the arguments of `eliminate`:
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings. Returns the
+    arguments of `eliminate`:
 
     - Gram matrix (m, m) of the recording with the residual in place of the left side;
     - indices of the c columns whose coefficients may differ between recordings, with the leak only if `has_leak`;
@@ -151,10 +151,10 @@ def estimate_leak_excess(
     """Estimate the excess of a recording's leak coefficient over that of reference recordings, and the standard errors.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the reference recordings, for E
-    equations; `columns`: roles of their columns; `widths` (s,): factors on the prior standard deviations of the
-    differences between recordings in the coefficients of all terms but the leak. Both results (s,) are 0 where there is
-    no information. The excess is fitted to the residual under the coefficients of the reference recordings
-    (`subtract_reference`); the precisions and moments of the equations are added up.
+    equations; `widths` (s,): factors on the prior standard deviations of the differences between recordings in the
+    coefficients of all terms but the leak. Both results (s,) are 0 where there is no information. The excess is fitted
+    to the residual under the coefficients of the reference recordings (`subtract_reference`); the precisions and
+    moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
@@ -181,7 +181,7 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
     information all weights are equal.
 
     `grams` (K, E, m, m): Gram matrices of the blocks for E equations; `reference` (E, m, m): that of the sum of the
-    reference recordings; `columns`: roles of their columns.
+    reference recordings.
     """
     grams = _remove_hold_leaks(grams, columns)
     totals = grams.sum(axis=0)

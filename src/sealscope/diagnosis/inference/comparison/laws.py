@@ -10,9 +10,9 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.coefficients import eliminate, subtract_reference
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.comparison.rise import TINY
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
 
 
 class LawFit(NamedTuple):
@@ -33,9 +33,8 @@ def compare_laws(
 ) -> LawFit | None:
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
-    `columns`: roles of the columns of each volume balance; all balances are fitted together. Return None if a balance
-    has no column of an orifice, if the recording has no information on one of the two leaks, or if their columns are
-    not positively correlated.
+    All balances are fitted together. Return None if a balance has no column of an orifice, if the recording has no
+    information on one of the two leaks, or if their columns are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None

@@ -64,9 +64,9 @@ MAX_Z = 30.0
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `columns`: roles of the columns of each equation, the same for all recordings. The rise and its standard deviation
-    are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The result is an average over widths of
-    the prior on the differences of the other coefficients between recordings (`_compare_levels`).
+    The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The
+    result is an average over widths of the prior on the differences of the other coefficients between recordings
+    (`_compare_levels`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
@@ -196,7 +196,7 @@ def _compare_levels(
     max_scatter = min(steepness * prior.largest * judged.conductance_of_flow, prior.relative)
     max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
-    judged_z, healthy_z = scale.transform(values), scale.transform(rises)
+    healthy_z = scale.transform(rises)
     # log Jacobian of z, plus log prior of the width, for each row
     log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * log_widths**2
     predictions = []
@@ -211,10 +211,10 @@ def _compare_levels(
             condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
         )
         shifts = scale.transform(thinned - level) - scale.transform(np.zeros(1))  # effect of the oil on z
-        predicted = Population(*candidates).predict(
-            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, log_priors + oil.log_probability
-        )
-        predictions.append(scale.to_levels(predicted, judged_z))  # with the effect of the oil again
+        log_weights = (log_priors + oil.log_probability)[:, None]
+        predicted = Population(*candidates).predict(healthy_z - shifts[:-1], sigma, log_weights)
+        with_oil = predicted._replace(centres=predicted.centres + shifts[-1])
+        predictions.append(scale.to_rises(with_oil))
     all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
     return rise_of_mixture(all_oils, values)
 
@@ -281,16 +281,16 @@ class _LevelScale(NamedTuple):
         """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) at leak coefficients a = `level`, a number or an array."""
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
-    def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
+    def to_rises(self, predicted: Mixture) -> Mixture:
         """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
-        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, with log
-        weights and centres relative to `transformed` (s,), the z of the judged recording. Each normal distribution is
-        split into `PARTS` narrower ones, along a new last axis, with the same mean and variance together.
+        `predicted`: mixture of normal distributions, as from `Population.predict`. Each is split into `PARTS` narrower
+        ones, along a new last axis, with the same mean and variance together.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
-        centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
-        z = np.clip(centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x, -MAX_Z, MAX_Z)
+        deviations = predicted.deviations[..., None]
+        z = predicted.centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x
+        z = np.clip(z, -MAX_Z, MAX_Z)
         return Mixture(
             predicted.weights[..., None] + np.log(part_weights / part_weights.sum()),
             2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,  # da/dz times the deviation of a part

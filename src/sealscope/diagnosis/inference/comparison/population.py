@@ -53,32 +53,21 @@ class Population:
         sums_of_squares = freedom * prior_sigma**2 + count * healthy.var(axis=1)
         if not 1e4 * sums_of_squares.max() < MAX_READING:
             return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=freedom)
-        # limits of a log-spaced grid of sigma, far below and far above the probable values
+        # limits of the grid of sigma, far below and far above the probable values
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
         sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)
-        log_prior = -0.5 * freedom * (np.log(sigma**2) + prior_sigma**2 / sigma**2)
-        predicted = self.predict(values, healthy_values, sigma, np.zeros(len(values)), log_prior)
-        return rise_of_mixture(predicted._replace(centres=predicted.centres + values[:, None, None]), values)
+        log_priors = -0.5 * freedom * (np.log(sigma**2) + prior_sigma**2 / sigma**2)
+        return rise_of_mixture(self.predict(healthy_values, sigma, log_priors), values)
 
-    def predict(
-        self,
-        values: Array,
-        healthy_values: Array,
-        sigma: Array,
-        log_priors: Array,
-        sigma_log_prior: Array | float = 0.0,
-    ) -> Mixture:
+    def predict(self, healthy_values: Array, sigma: Array, log_priors: Array) -> Mixture:
         """Predict the judged value from the healthy ones by kriging, as a mixture of normal distributions.
 
         The prediction is m + c' V^-1 (x - m) for the healthy values x: V is their covariance, c their covariance with
-        the judged value, and m the generalised least-squares mean.
-
-        - `values` (s,), `healthy_values` (s, n): the judged value and the healthy ones, by s alternative estimates;
-        - `sigma` (s, nodes): standard deviations of the values, a log-spaced grid for each estimate;
-        - `log_priors` (s,): log prior of each estimate; `sigma_log_prior`: log prior density of log sigma on the grid.
-
-        Returns log weights, standard deviations, and centres relative to `values`, of shape (s, g, nodes).
+        the judged value, and m the generalised least-squares mean. `healthy_values` (s, n): the healthy values, by s
+        alternative estimates; `sigma` (s, nodes): standard deviations of the values, a log-spaced grid for each
+        estimate; `log_priors` (s, nodes or 1): log prior of the estimate and of log sigma. Returns log weights,
+        standard deviations and centres of shape (s, g, nodes).
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -91,11 +80,10 @@ class Population:
         log_likelihood = 0.5 * (
             np.log(weight).sum(axis=-1) - np.log(precision) - (weighted_residual * rotated).sum(axis=-1)
         )
-        log_likelihood += self._log_priors + np.reshape(log_priors, (-1, 1, 1))
         # add the log of the prior density of log sigma, times the spacing of its grid
         log_spacing = np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))
-        log_likelihood += np.broadcast_to(sigma_log_prior, sigma.shape)[:, None] + log_spacing[:, None]
-        centres = mean + (weighted_residual * cross).sum(axis=-1) - values[:, None, None]
+        log_likelihood += self._log_priors + (log_priors + log_spacing)[:, None]
+        centres = mean + (weighted_residual * cross).sum(axis=-1)
         mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)  # weight of the estimated mean in the prediction
         variances = variance + self._judged_variance - (weight * cross**2).sum(axis=-1) + mean_deficit**2 / precision
         return Mixture(log_likelihood, np.sqrt(variances), centres)

@@ -12,6 +12,7 @@ from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
 
 #: `Observable.data` of the leakage against healthy recordings.
 RISE = "rise"
@@ -19,8 +20,6 @@ RISE = "rise"
 NODES = 32
 #: Reach of a grid of rises [standard deviations].
 MAX_LOG = 4.0
-#: Lower limit of divisors and of arguments of logarithms.
-TINY = 1e-300
 #: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
 NEGLIGIBLE = 16.0
 #: Number of parts of a large mixture that give the first estimate of a quantile, and step for the slope there.
@@ -30,7 +29,7 @@ SAMPLED, SLOPE_STEP = 1000, 1e-3
 class Mixture(NamedTuple):
     """Mixture of k normal distributions: their `weights`, of sum 1, standard `deviations` and `centres`, (k,) each.
 
-    A mixture that `Population.predict` returns has log weights and more axes; `rise_of_mixture` converts it.
+    A mixture that `Population.predict` returns has log weights and more axes, until `rise_of_mixture`.
     """
 
     weights: Array

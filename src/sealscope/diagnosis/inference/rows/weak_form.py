@@ -32,8 +32,6 @@ SPAN = 4
 MIN_WEIGHT = 0.1
 #: Limit of integrals that count as readings of a sensor: squares of larger ones might overflow.
 MAX_READING = 1e100
-#: Sampling rate at which the overlap of test functions is computed [Hz]; fine enough that the factor has converged.
-_FINE_RATE = 1e4
 
 
 class Rows(NamedTuple):
@@ -81,15 +79,12 @@ def test_function(rate: float) -> Array:
     return np.asfortranarray((phi * (rate / phi.sum())).reshape(SPAN, stride))
 
 
-def _variance_inflation() -> float:
-    """Compute the factor by which the overlap of test functions inflates the variance of a sum over white noise."""
-    phi = test_function(_FINE_RATE).ravel()
-    stride, energy = len(phi) // SPAN, float(phi @ phi)
-    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
-
-
+_phi = test_function(1e4).ravel()  # at a rate [Hz] at which `OVERLAP` has converged
+_stride = len(_phi) // SPAN
 #: Variance of a sum over overlapping rows of white noise, relative to independent rows.
-OVERLAP = _variance_inflation()
+OVERLAP = 1.0 + 2.0 * sum(
+    float(_phi[k * _stride :] @ _phi[: -k * _stride]) / float(_phi @ _phi) for k in range(1, SPAN)
+)
 
 
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
