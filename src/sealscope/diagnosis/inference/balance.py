@@ -111,6 +111,7 @@ class BlockStream(SavedAttributes):
         self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
         self._strides_per_block = strides_in(block_s, rate)
+        self._length = self._strides_per_block * self._stride  # samples in a block
         # samples on either side of a block on which its speeds and rests depend; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._drops_rests = is_separate_at_rest(balances[0])
@@ -148,10 +149,9 @@ class BlockStream(SavedAttributes):
         if samples:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
-        length = self._strides_per_block * self._stride  # samples in a block
         # samples needed after a block: those of its last rows, and a margin for its speeds and rests
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
-        n_complete = max(0, (self._end - tail) // length)
+        n_complete = max(0, (self._end - tail) // self._length)
         is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
         min_blocks = (self._n_first or 1) if is_waiting else 1
         if n_complete <= self._n_closed or n_complete < min_blocks:
@@ -165,7 +165,7 @@ class BlockStream(SavedAttributes):
         groups = zip([self._n_closed, *group_ends[:-1]], group_ends, strict=True)
         blocks = Blocks.join([self._build_blocks(joined, first, end) for first, end in groups])
         self._n_closed = n_complete
-        first_stored = max(0, n_complete * length - self._margin)  # later blocks need these samples
+        first_stored = max(0, n_complete * self._length - self._margin)  # later blocks need these samples
         self._pieces = [{name: values[first_stored - self._first :].copy() for name, values in joined.items()}]
         self._first = first_stored
         return blocks
@@ -208,7 +208,7 @@ class BlockStream(SavedAttributes):
         odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             left = balance.flow_sign * values[:, columns.left]
-            motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
+            motion = values[:, list(columns.piston)].sum(axis=1)
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
             log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
@@ -226,10 +226,11 @@ class BlockStream(SavedAttributes):
 
         `rows`: for each balance the rows (r, m) of its regression. Also True if no balance has a position.
         """
-        z_scores = []
-        for columns, values in zip(self.columns, rows, strict=True):
-            if motion := [k for k in columns.motion if columns.names[k].startswith("motion")]:
-                z_scores.append(_z_score(values[:, motion].sum(axis=1) * values[:, columns.left]))
+        z_scores = [
+            _z_score(values[:, list(columns.piston)].sum(axis=1) * values[:, columns.left])
+            for columns, values in zip(self.columns, rows, strict=True)
+            if columns.piston
+        ]
         return not z_scores or max(map(abs, z_scores)) > INFERENCE.sense.moves
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
@@ -239,15 +240,15 @@ class BlockStream(SavedAttributes):
         weights. The first call also determines absolute minus gauge pressures, and the speeds below which the machine
         rests; the first one in which the piston moves, the signs of the left sides. They hold for all blocks.
         """
-        length = self._strides_per_block * self._stride  # samples in a block
+        length = self._length
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
         if self._absolute_offsets is None:
-            self._absolute_offsets = {
-                name: _absolute_offset(samples[name][:n_first_samples]) for name in ("p_A", "p_B") if name in samples
-            }
-        if self._finds_rests and self._rest_limits is None:
             first_samples = {name: values[:n_first_samples] for name, values in samples.items()}
-            self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
+            self._absolute_offsets = {
+                name: _absolute_offset(first_samples[name]) for name in ("p_A", "p_B") if name in samples
+            }
+            if self._finds_rests:
+                self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -296,7 +297,7 @@ class BlockStream(SavedAttributes):
           than those in motion, and many of them would determine the scale of the errors;
         - `Blocks.flow` (K,) and `Blocks.pressures` (K, p).
         """
-        length = self._strides_per_block * self._stride  # samples in a block
+        length = self._length
         # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
@@ -338,12 +339,8 @@ class BlockStream(SavedAttributes):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,): sum(products) / sqrt(OVERLAP sum(products^2)).
-
-    A product is that of the flow and another quantity in one row of the regression. Overlapping rows increase the
-    variance of the sum by the factor `OVERLAP`.
-    """
-    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
+    """Compute the z score of the sum of `products` (r,), each of the flow and another quantity in one row."""
+    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))  # of overlapping rows
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
@@ -391,12 +388,11 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
-    """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
+    """Compute the speed [m/s] or flow [m^3/s] v below which a piston or a pump counts as resting.
 
-    With the speed v of a piston, or the flow v of a pump, it is the larger of two values: a `fraction` of the mean
-    speed in motion, sum(v^2) / sum(abs(v)), and three standard deviations of the noise of a mean of v over
-    `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples;
-    `rate`: sampling rate [Hz].
+    It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
+    deviations of the noise of a mean of v over `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or
+    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
@@ -415,9 +411,8 @@ def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.
 
     A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside. A load that
     sinks by a leak is slower, so the piston must be faster than the fraction `rest.lowers` (`priors.toml`) of its mean
-    speed in motion, for `MIN_REST` or longer. The flags extend by `AVERAGING_TIME` to either side. `pump_volume`,
-    `x_step` (n,): increments of the pump's volume [m^3] and of the position [m], of which the former may be NaN;
-    `rate`: sampling rate [Hz].
+    speed in motion, for `MIN_REST` or longer. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3], NaN
+    where missing, and of the position [m]; `rate`: sampling rate [Hz].
     """
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
     is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
@@ -449,9 +444,9 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
     """Return the samples (n,) of those channels `names` that are recorded, with clipped pressures as NaN.
 
     Holes, i.e. long gaps of missing samples, keep the values with which the inspection filled them
-    (`corrections.gaps`). If there are holes, the additional entry `HOLE` is 1 there and 0 elsewhere. If a pressure is
-    clipped, and the result has p_A and p_B, the additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the
-    pressure level of a block: clipped values are closer to the true ones than the mean of the other samples.
+    (`corrections.gaps`); the additional entry `HOLE` is then 1 there and 0 elsewhere. If p_A or p_B is clipped, the
+    additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values
+    are closer to the true ones than the mean of the other samples.
     """
     samples, is_clipped = {}, False
     is_hole = flag_holes(recording)
@@ -669,10 +664,9 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the blocks as recorded and removed from their Gram matrices, which assumes terms that are linear in
-    the offset. If it exceeds `NEGLIGIBLE_OFFSET` standard deviations of its prior, the blocks are instead computed
-    again after subtracting it, and the remaining offset is removed.
+    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The estimated offset
+    is removed from the Gram matrices, which assumes terms that are linear in it. If it exceeds `NEGLIGIBLE_OFFSET`
+    standard deviations of its prior, the blocks are computed again after subtracting it, and the rest is removed.
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded

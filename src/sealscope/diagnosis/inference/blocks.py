@@ -186,7 +186,8 @@ class ColumnRoles:
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
     - `nuisance`: terms whose coefficients are unknown in any machine, the leak among them;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
-    - `motion`: motion of the piston, or flow of the valve's edges; `compliance`: the chambers' oil and its air;
+    - `piston`: motion of the piston; `motion`: the same with its delay, or the flow of the valve's edges;
+    - `compliance`: the chambers' oil and its air;
     - `hold_leak`: leakage of a pump that holds the load, left out in a comparison of recordings (`regimes`); None
       unless valves shut at rest;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
@@ -216,6 +217,7 @@ class ColumnRoles:
             return tuple(k for k in self.nuisance if terms[k].drift in drifts)
 
         self.motion, self.compliance = fitted_columns("motion", "edge"), fitted_columns("compliance", "air")
+        self.piston = tuple(k for k in self.motion if self.names[k].startswith("motion"))
         self.fast = fitted_columns(*UNSTEADY)
         # columns that are zero at rest; HOLDING is left out, since separate leakages of holds and other rests would
         # follow outliers
@@ -251,13 +253,12 @@ class ColumnRoles:
         `level.lag` [s] times the area, the rms flow over the rms speed. `total` (m, m): Gram matrix of the recording.
         """
         deviations, energies = self.level_deviation.copy(), np.diag(total)
-        piston = [k for k in self.motion if self.names[k].startswith("motion")]
-        if not piston:  # behind a servo valve, or in a balance without motion
+        if not self.piston:  # behind a servo valve, or in a balance without motion
             return deviations
         # finite for an external leak, which has a prior of its own (`level.outside`)
         if self.bias is not None and not np.isfinite(deviations[self.bias]) and energies[self.bias] > 0.0:
             deviations[self.bias] = INFERENCE.level.bias * np.sqrt(energies[self.left] / energies[self.bias])
-        motion_energy = float(energies[piston].sum())
+        motion_energy = float(energies[list(self.piston)].sum())
         if LAG in self.names and motion_energy > 0.0:
             deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / motion_energy)
         return deviations
@@ -292,8 +293,7 @@ class ColumnRoles:
     def replace_leak(self, name: str) -> ColumnRoles:
         """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term.
 
-        The prior deviation of the old leak between recordings, infinite for the tested term, becomes `between.pump`
-        (`priors.toml`).
+        The prior deviation of the old leak between recordings becomes `between.pump` (`priors.toml`).
         """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
@@ -591,8 +591,8 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure or its root times the
     sampling interval dt, from which `offset` [Pa] or [Pa^0.5] times dt is subtracted; `coefficients` (K,): coefficient
     g of this column in each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the
-    volume balance with respect to the offset. In a balance without a flow offset, whose column is dt, nothing is
-    corrected, and the last column is zero.
+    volume balance with respect to the offset. Without a flow offset, whose column is dt, nothing is corrected, and the
+    last column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -618,8 +618,8 @@ def offset_cost(offset: Any) -> Any:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    Only a leak that changes between blocks reveals the offset. Otherwise the estimate stays near `blocks.zero`, the
-    offset already removed.
+    Only a leak that changes between blocks reveals it; otherwise it stays near `blocks.zero`, the offset already
+    removed.
     """
     offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
     return float(np.mean(blocks.zero)) + float(np.mean(offsets))

@@ -36,7 +36,7 @@ from sealscope.recordings.recording import Array
 
 #: Fraction of the sum of squares of p_A - p_B below which a state of the machine does not occur, but for rounding.
 NEGLIGIBLE = 1e-6
-#: Least number of blocks with motion, and without, from which the leakage of either state is estimated by itself.
+#: Least number of blocks with motion, and without, for an estimate of the leakage of either state.
 MIN_STATE_BLOCKS = 2
 
 

@@ -83,24 +83,17 @@ def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     is_known = np.isfinite(regressors).all(axis=1) & is_turning
     pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
+    window = max(1, round(prior.seconds * rate))
     drifts = dict[str, Estimate]()
     for side, p, low in zip("AB", pressures, lowest, strict=True):
-        is_steady = np.abs(_rate_of_change(p, rate)) < prior.steady
-        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & is_steady
+        slope = np.full(len(p), np.nan)  # over twice `charge.seconds`
+        slope[window:-window] = (p[2 * window :] - p[: -2 * window]) * rate / (2 * window)
+        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & (np.abs(slope) < prior.steady)
         if low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum():
             drift = _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low))
             if drift is not None:
                 drifts[side] = drift
     return drifts
-
-
-def _rate_of_change(pressure: Array, rate: float) -> Array:
-    """Compute the rate of change [Pa/s] of a pressure (n,) as a difference over 2 `charge.seconds`; NaN at the ends."""
-    window = max(1, round(CHANGES.charge.seconds * rate))
-    slope = np.full(len(pressure), np.nan)
-    if len(pressure) > 2 * window:
-        slope[window:-window] = (pressure[2 * window :] - pressure[: -2 * window]) * rate / (2 * window)
-    return slope
 
 
 class ChargeTrend(NamedTuple):
@@ -217,7 +210,7 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
-    parts = [part for part in np.array_split(np.arange(len(residual)), GROUPS) if part.size]
+    parts = np.array_split(np.arange(len(residual)), GROUPS)
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
     times = np.array([time[part].mean() for part in parts])
     return float(levels.std() / np.sqrt(len(parts) - 2) / max(float(times.std()), TINY))
@@ -239,7 +232,7 @@ def compare_low_drifts(
     """
     prior = CHANGES.charge
     scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
-    known = {side: [drifts[side] for drifts in healthy if side in drifts] for side in judged}
+    known = {side: [other[side] for other in healthy if side in other] for side in judged}
     drifts = {side: drift for side, drift in judged.items() if len(known[side]) >= MIN_HEALTHY}
     if not drifts:
         return

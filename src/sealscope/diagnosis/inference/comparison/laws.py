@@ -20,8 +20,7 @@ class LawFit(NamedTuple):
 
     `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all other
     terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak for one independent residual,
-    -log(residual sum of squares with the orifice / the same with the laminar leak) / 2. A recording counts as
-    `size.readings` independent residuals (`priors.toml`).
+    of which a recording has `size.readings` (`priors.toml`).
     """
 
     regression: float

@@ -301,9 +301,8 @@ class _LevelScale(NamedTuple):
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n times the difference from the common leak coefficient of the other n - 1 recordings. The other
-    coefficients of the balance may differ between recordings within their priors (`between` in `priors.toml`). The flow
-    offset may differ by any amount, as it does behind valves that shut at rest: both assumptions on the valves, which
+    It is (n - 1)/n times the difference from the common leak coefficient of the others. The flow offset may differ by
+    any amount between recordings, as it does behind valves that shut at rest: both assumptions on the valves, which
     are compared by these deviations, are thus treated alike.
     """
     columns = [roles.with_free_zero() for roles in columns]  # so that `eliminate_unshared` eliminates the flow offset

@@ -34,15 +34,6 @@ class OilHypothesis(NamedTuple):
     session_deviation: float = 0.0
 
 
-def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
-    """Predict the rise of each recording's log leakage (n + 1,) by thinner oil, relative to the healthy mean.
-
-    The judged recording is the last of `recordings`. The prediction is that of the most probable of the
-    `oil_hypotheses`, 0 if nothing shows the oil's viscosity.
-    """
-    return oil_hypotheses(recordings)[0].thinning
-
-
 def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last, most probable first.
 

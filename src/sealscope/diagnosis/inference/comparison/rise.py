@@ -119,8 +119,8 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
 
-        `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
-        of the logarithm of the true rise about log(`rise`); 0 if the true rise is exactly `rise`.
+        `log_deviation`: standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is
+        exactly `rise`, in the unit of `value`.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -129,9 +129,8 @@ class Rise(NamedTuple):
     def log_ratio_within(self, rise: float, tail: float) -> float:
         """Compute the log likelihood ratio of a rise by `rise` to no rise, robust to an outlying estimate `value`.
 
-        Both densities of `value` have a floor: the smaller of the densities of a healthy recording at its quantiles
-        `tail` and 1 - `tail` (for a `share` of 1). An estimate that is improbable with the rise and without it is
-        therefore evidence for neither.
+        Both densities of `value` are at least the smaller of those of a healthy recording at its quantiles `tail` and
+        1 - `tail`: an estimate that is improbable with the rise and without it is evidence for neither.
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)
