@@ -23,30 +23,20 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 class Observable:
     """Result of testing one quantity, estimated by a detector, for a change.
 
-    Parameters
-    ----------
-    name : str
-        Name of the quantity: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
-    data : str
-        Kind of data from which the quantity is computed, such as "volumes", "rise", "drift" or "details", as the
-        patterns in `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative
-        descriptions of one change in these data.
-    score : float
-        Twice the logarithm of the likelihood ratio of the change.
-    chance : float
-        Probability that a healthy recording scores as high, as stated by the detector.
-    onset : Interval, optional
-        Time of the change [s]; None for a comparison with other recordings.
-    size : float
-        Amount of the change, in the unit of the quantity; negative for a fall.
-    advantage : float
-        Twice the log odds of this description over the alternative ones, from sources other than the score, such as a
-        prior on its size.
-    log_ratio_to_leak : float, optional
-        Log likelihood ratio of two explanations of a difference from healthy recordings: this change, and a leak.
-    pressure_scale : Estimate, optional
-        Logarithm of a factor on both recorded pressures that would cause this change without a change of the machine;
-        None if it is unknown, or if no factor would.
+    - `name`: name of the quantity: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
+    - `data`: kind of data from which the quantity is computed, such as "volumes", "rise", "drift" or "details", as the
+      patterns in `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative
+      descriptions of one change in these data.
+    - `score`: twice the logarithm of the likelihood ratio of the change.
+    - `chance`: probability that a healthy recording scores as high, as stated by the detector.
+    - `onset`: time of the change [s]; None for a comparison with other recordings.
+    - `size`: amount of the change, in the unit of the quantity; negative for a fall.
+    - `advantage`: twice the log odds of this description over the alternative ones, from sources other than the score,
+      such as a prior on its size.
+    - `log_ratio_to_leak`: log likelihood ratio of this change to a leak, as explanations of a difference from healthy
+      recordings.
+    - `pressure_scale`: logarithm of a factor on both recorded pressures that would cause this change without a change
+      of the machine; None if it is unknown, or if no factor would.
     """
 
     name: str
@@ -75,10 +65,9 @@ class Observable:
         advantage: float = 0.0,
         pressure_scale: Estimate | None = None,
     ) -> Observable:
-        """Make an observable from a test for a step, a sudden lasting change, within the recording.
+        """Make an observable from a step test within the recording, the best of `n_tests` tests.
 
-        `test`: the best of `n_tests` tests; its p-value is therefore multiplied by `n_tests` (Bonferroni correction).
-        The other arguments are fields of the class.
+        Its p-value is multiplied by `n_tests` (Bonferroni correction). The other arguments are fields of the class.
         """
         return cls(
             name=name,
@@ -224,10 +213,8 @@ class LeakMeasure:
 class Ringing(NamedTuple):
     """Facts on the comparison of the pressures' ringing, for a recording whose leakage cannot be measured.
 
-    The ringing is an oscillation, measured by the RMS of wavelet details.
-
-    - `bound`: 95 % upper bound of an undetected change of the ringing, the logarithm of this RMS without noise;
-    - `rate`: sampling rate [Hz];
+    - `bound`: 95 % upper bound of an undetected change of the ringing, the logarithm of the RMS of wavelet details
+      without noise; `rate`: sampling rate [Hz];
     - `healthy`: number of healthy recordings in the comparison; `is_dated`: true if their dates are known;
     - `unused`: recorded columns that are not assigned to a channel.
     """
@@ -243,26 +230,13 @@ class Ringing(NamedTuple):
 class Observed:
     """Report of one detector on a recording.
 
-    Parameters
-    ----------
-    provider : str
-        Name of the detector.
-    observables : tuple of Observable
-        Tests of the quantities that the detector estimates.
-    leak : LeakMeasure, optional
-        The leakage, if the detector measures it.
-    ringing : Ringing, optional
-        Facts on the comparison of the ringing, the oscillation of the pressures, if the detector makes one.
-    lack : str
-        Reason for an empty report, else "".
-    share : float
-        Fraction of the recording's samples that were used.
-    judged_until : float
-        Time of the last judged sample, as a fraction of the recording.
-    has_failed : bool
-        True if the detector raised an error.
-    refusal : str
-        Reason why none of the given healthy recordings could be compared, else "".
+    - `provider`: name of the detector; `observables`: tests of the quantities that it estimates.
+    - `leak`: the leakage, if the detector measures it; `ringing`: facts on the comparison of the pressures' ringing, if
+      it makes one.
+    - `lack`: reason for an empty report, else ""; `has_failed`: true if the detector raised an error.
+    - `share`: fraction of the recording's samples that were used; `judged_until`: time of the last judged sample, as a
+      fraction of the recording.
+    - `refusal`: reason why none of the given healthy recordings could be compared, else "".
     """
 
     provider: str

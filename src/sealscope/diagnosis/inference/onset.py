@@ -306,10 +306,10 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
 def constant_log_ratio(information: Information, shape: Array) -> float:
     """Compute the log likelihood ratio of an older leak to no leak, from a coefficient's changes within the recording.
 
-    A leak that is older than the recording adds to the coefficient a constant times `shape` (K,), its apparent
-    coefficient in each block. `shape` varies with the pressure unless the flow is laminar. The result is the log
-    likelihood ratio of the best positive constant to no constant, each with the random walk that fits best. It is at
-    least 0, and 0 if too few blocks have information, or if `shape` hardly varies and the level has no prior.
+    A leak that is older than the recording adds to the coefficient a positive constant times `shape` (K,), its apparent
+    coefficient in each block, which varies with the pressure unless the flow is laminar. Both hypotheses have the
+    random walk that fits best. The result is at least 0, and 0 if too few blocks have information, or if `shape` hardly
+    varies and the level has no prior.
     """
     whitened = _whiten_blocks(information)
     if whitened is None:

@@ -150,9 +150,8 @@ def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[
 
     The features are the sense of p_A - p_B, the log variance of the noise of both pressures, its difference between
     them, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
-    into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. A change of a sensor
-    shifts the features, and a load that changes its side shifts the sense. The sense is left out if no motion is
-    recorded, and a hum if the sampling rate is too low. The first word of a name is its kind of data
+    into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. The sense is left out
+    if no motion is recorded, and a hum if the sampling rate is too low. The first word of a name is its kind of data
     (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]

@@ -138,14 +138,14 @@ def solve_weighted(equations: Array, weight: Array) -> Array:
 
 
 def fit_robustly(design: Array, values: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> list[Estimate]:
-    """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
+    """Fit coefficients c of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
     The weights, by which the rows are multiplied, are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE`
-    times the median of abs(residual), plus `MIN_RESIDUAL`. The fit is run twice: from equal weights, and from weights
-    that are small for values far from their median, such as those in contact with a workpiece. The run with the smaller
-    median counts. Returns estimates of the coefficients of the given `columns`, with jackknife errors for these
-    `groups` of rows (`jackknife_errors`). The errors are infinite for a coefficient that the motion does not determine,
-    such as the friction of a piston that moves in one direction only.
+    times the median of abs(residual), plus `MIN_RESIDUAL`. The fit is run from equal weights, and from weights that are
+    small for values far from their median, such as those in contact with a workpiece; the run with the smaller median
+    counts. Returns the coefficients of the given `columns`, with the errors of a jackknife over `groups` of rows
+    (`jackknife_errors`). An error is infinite if the motion does not determine the coefficient, such as the friction of
+    a piston that moves in one direction only.
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -233,9 +233,8 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
-    viscous drop of a steady motion. The result is computed only once for a recording. It is None if too few samples are
-    in motion (`select_motion`), or if a value or its error is not finite, as for a piston that moves in one direction
-    only. The errors allow for residuals that are correlated within each of the `equal_parts` of the rows.
+    viscous drop of a steady motion. The result is None if too few samples are in motion (`select_motion`), or if a
+    value or its error is not finite.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
     return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
@@ -252,6 +251,7 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resista
     design = np.delete(motion.design, TIME, axis=1)
     if without_slow_changes:
         design, difference = remove_slow_changes(motion, design, difference, recording.t)
+    # residuals may be correlated within a part
     friction, drop = fit_robustly(design, difference, [DIRECTION, SPEED], equal_parts(len(difference)))
     fit = Resistance(*friction, drop.value / motion.top_speed, drop.deviation / motion.top_speed, motion.top_speed)
     return fit if np.isfinite(fit).all() else None

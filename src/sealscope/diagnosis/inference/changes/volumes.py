@@ -223,7 +223,6 @@ def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index:
 
     This volume is the sum of the columns of motion, each times its coefficient fitted to the whole recording. A change
     of the sensor's scale of position or speed by the fraction s changes the coefficient of the new column by s.
-
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -71,7 +71,8 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
     # factors on the prior standard deviations; log(`prior.between`) is the standard deviation of their logarithm
-    widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    widths = prior.between**log_widths
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, 0))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
         excesses = [
@@ -86,7 +87,14 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * judged.conductance_of_flow, 1.0 / MAX_READING))
     return _compare_levels(
-        judged, baseline, values=values, rises=rises, errors=errors, level=level, level_error=level_error
+        judged,
+        baseline,
+        values=values,
+        rises=rises,
+        errors=errors,
+        log_widths=log_widths,
+        level=level,
+        level_error=level_error,
     )
 
 
@@ -153,6 +161,7 @@ def _compare_levels(
     values: Array,
     rises: Array,
     errors: Array,
+    log_widths: Array | float = 0.0,
     level: float,
     level_error: float,
     min_crossover: float = 0.0,
@@ -167,7 +176,8 @@ def _compare_levels(
     coefficients, or s = 1 if there is no such prior:
 
     - `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
-    - `errors` (s,): smallest plausible scatter of one rise, by its standard error;
+    - `errors` (s,): smallest plausible scatter of one rise, by its standard error; `log_widths` (s,): logarithms of the
+      widths [standard deviations], 0 without the prior;
     - `level`, `level_error`: mean coefficient of the healthy recordings, and its standard error;
     - `min_crossover`: minimum of c, large where healthy levels are about zero, which makes z linear in them;
     - `session_deviation`: prior standard deviation between sessions with the same oil, None for that of the whole
@@ -176,8 +186,6 @@ def _compare_levels(
     prior = INFERENCE.scatter
     if session_deviation is None:
         session_deviation = prior.session * judged.conductance_of_flow
-    # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
-    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
     oils = oil_hypotheses(recordings)
     # scatter that the oil does not explain: warmer oil is thinner and leaks more
@@ -198,7 +206,7 @@ def _compare_levels(
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
     healthy_z = scale.transform(rises)
     # log Jacobian of z, plus log prior of the width, for each row
-    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * log_widths**2
+    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * np.square(log_widths)
     predictions = []
     for oil in oils:
         thinned = level * np.exp(oil.thinning)  # predicted levels

@@ -29,7 +29,7 @@ SAMPLED, SLOPE_STEP = 1000, 1e-3
 class Mixture(NamedTuple):
     """Mixture of k normal distributions: their `weights`, of sum 1, standard `deviations` and `centres`, (k,) each.
 
-    A mixture that `Population.predict` returns has log weights and more axes, until `rise_of_mixture`.
+    A mixture that `Population.predict` returns has log weights and more axes; `rise_of_mixture` converts it.
     """
 
     weights: Array
