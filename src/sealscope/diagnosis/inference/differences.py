@@ -134,8 +134,7 @@ def compare_estimates(
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
     # grids of the scatter over its prior deviation, and of the factor by which the errors are too small or too large
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
-    is_exact = prior.inflation == prior.deflation == 1.0
-    inflations = np.ones(1) if is_exact else np.geomspace(1.0 / prior.deflation, prior.inflation, INFLATIONS)
+    inflations = np.geomspace(1.0 / prior.deflation, prior.inflation, INFLATIONS)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # scatter s at each point of the joint grid
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)

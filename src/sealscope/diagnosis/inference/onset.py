@@ -351,13 +351,13 @@ def step_sizes(
 class _StepFits(NamedTuple):
     """Least-squares fits of a step to n whitened values z, for each of w walks (`WALKS`) and of o onsets.
 
-    `weight` (w, n): variance of the noise over that of each z; `log_prior` (w,): log prior of each walk. Sums with
-    these weights: `total` (w,): squares of z; `moments`, `energies` (w, o): products of the steps with z and with
-    themselves.
+    `weight` (w, n): variance of the noise over that of each z; `log_factor` (w,): half the log determinant of the
+    weights, plus the log prior of the walk. Sums with these weights: `total` (w,): squares of z; `moments`, `energies`
+    (w, o): products of the steps with z and with themselves.
     """
 
     weight: Array
-    log_prior: Array
+    log_factor: Array
     total: Array
     moments: Array
     energies: Array
@@ -369,13 +369,14 @@ class _StepFits(NamedTuple):
         return np.asarray(np.maximum(total - np.maximum(self.moments, 0.0) ** 2 / self.energies, 1e-12 * total))
 
     def log_likelihood(self, squares: Array) -> Array:
-        """Compute the log likelihood from the remaining `squares` (w,) or (w, o), with the best variance of the noise.
+        """Compute the log likelihood, with the prior on the walk, from the remaining `squares` (w,) or (w, o) of z.
 
-        The log prior of the walk is added.
+        The variance of the noise is the likeliest one.
         """
         n = self.weight.shape[1]
-        by_walk = 0.5 * np.log(self.weight).sum(axis=1) + self.log_prior
-        return np.asarray((by_walk - 0.5 * n * np.log(squares.T / n)).T)  # transposed: the walk is the last axis
+        return np.asarray(
+            (self.log_factor - 0.5 * n * np.log(squares.T / n)).T
+        )  # transposed: the walk is the last axis
 
 
 def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
@@ -430,7 +431,8 @@ class _Whitening(NamedTuple):
         weight = 1.0 / (1.0 + WALKS[:, None] * self.eigen)
         total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
         energies = np.maximum(weight @ steps**2, np.finfo(float).tiny)
-        return _StepFits(weight, self.walk_log_priors, total, (weight * z) @ steps, energies)
+        log_factor = 0.5 * np.log(weight).sum(axis=1) + self.walk_log_priors
+        return _StepFits(weight, log_factor, total, (weight * z) @ steps, energies)
 
 
 def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] | None:
@@ -525,7 +527,7 @@ def _test_step(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFi
     and noise, with the prior on the walk.
     """
     fits = fits._replace(moments=sign * fits.moments)
-    weight, log_prior, total, moments, energies = fits
+    weight, _, total, moments, energies = fits
     n, unit = weight.shape[1], whitening.unit
     residual_squares = fits.residual_squares()
     log_likelihood, log_likelihood_with_step = fits.log_likelihood(total), fits.log_likelihood(residual_squares)
@@ -533,7 +535,7 @@ def _test_step(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFi
     walk, best = np.unravel_index(int(log_likelihood_with_step.argmax()), log_likelihood_with_step.shape)
     score = 2.0 * float(log_likelihood_with_step[walk, best] - log_likelihood[walk_without_step])
     # variances of the walk that the data alone, without the prior, allow: with or without a step
-    data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - log_prior
+    data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - whitening.walk_log_priors
     allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
     # length of the curve of whitened steps on the unit sphere, from the angles between neighbouring onsets
     norm = np.sqrt(energies[allowed])

@@ -64,7 +64,7 @@ def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) that move for at least `features.busy` (`priors.toml`) times as long as the busiest block.
+    """Flag the blocks (K,) in motion for at least the fraction `features.busy` (`priors.toml`) of the busiest's time.
 
     `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`).
     """

@@ -254,14 +254,14 @@ def _pressure_scale(before: Array, after: Array) -> Estimate | None:
     `before`, `after` (k, 4) [Pa]: levels of the blocks before and after the change. half_A - half_B is the friction.
     Return None if there are fewer than two blocks before or after, or if a mean friction is not positive.
     """
+    if min(len(before), len(after)) < 2:
+        return None
     frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
-    if min(len(friction) for friction in frictions) < 2:
+    means = [float(friction.mean()) for friction in frictions]
+    if not min(means) > 0.0:
         return None
-    means = np.array([friction.mean() for friction in frictions])
-    if not means.min() > 0.0:
-        return None
-    errors = [friction.std(ddof=1) / np.sqrt(len(friction)) for friction in frictions]
-    return Estimate(math.log(means[1] / means[0]), math.hypot(*(errors / means)))
+    errors = [friction.std(ddof=1) / math.sqrt(len(friction)) for friction in frictions]
+    return Estimate(math.log(means[1] / means[0]), math.hypot(errors[0] / means[0], errors[1] / means[1]))
 
 
 def _whitening_matrix(values: Array) -> Array:
