@@ -88,8 +88,7 @@ def compare_with_healthy(
     count = len(healthy_values)
     freedom = count - 1
     change = value - float(healthy_values.mean())
-    scatter_variance = float(healthy_values.var() * count) / freedom  # unbiased estimate, s^2
-    variance = (scatter_variance + error**2) * (1.0 + 1.0 / count)
+    variance = (float(healthy_values.var(ddof=1)) + error**2) * (1.0 + 1.0 / count)
     t = change / max(float(np.sqrt(variance)), TINY)
     chance = float(stdtr(freedom, -t if above else -abs(t))) * (1.0 if above else 2.0)
     score = t * t if t > 0.0 or not above else 0.0

@@ -24,6 +24,7 @@ Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -211,23 +212,19 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
     levels of the sensor's white noise, which is not filtered: a fraction (`filtered.noises` in `priors.toml`) of the
     lowest power density of an octave, averaged over the `healthy` recordings.
     """
-    from itertools import product
-
     priors, edges = CHANGES.filtered, _octave_edges(len(healthy[0].log_A))
     frequencies, widths = np.sqrt(edges[:-1] * edges[1:]), np.diff(edges)
-    unchanged = np.zeros_like(frequencies)
-    log_ratios, phases, filtered_sides, cutoffs = [unchanged], [unchanged], [0], [np.inf]  # no filter
-    grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
-    for side, noise_fraction, cutoff in product(sides, priors.noises, grid):
-        power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)  # from log_A or log_B
-        noise = noise_fraction * float(np.min(power / widths)) * widths
-        filtered_power = (power - noise) / (1.0 + (frequencies / cutoff) ** 2) + noise
-        sign = 1.0 if side == 0 else -1.0  # ratio and phase are those of A to B
-        log_ratios.append(sign * 0.5 * np.log(filtered_power / power))
-        phases.append(-sign * np.arctan(frequencies / cutoff))
-        filtered_sides.append(side)
-        cutoffs.append(cutoff)
-    return _Filters(np.stack(log_ratios), np.stack(phases), np.array(filtered_sides), np.array(cutoffs))
+    cases = [(0, 0.0, np.inf)]  # no filter
+    cases += itertools.product(sides, priors.noises, np.geomspace(priors.lowest, priors.highest, CUTOFFS))
+    side, noise_fraction, cutoff = (np.array(values) for values in zip(*cases, strict=True))
+    powers = np.exp([2.0 * np.array(octaves[:2]) for octaves in healthy]).mean(axis=0)  # of A and B, (2, k)
+    power = powers[side]  # (m, k)
+    noise = noise_fraction[:, None] * (power / widths).min(axis=1, keepdims=True) * widths
+    relative_frequency = frequencies / cutoff[:, None]
+    filtered_power = (power - noise) / (1.0 + relative_frequency**2) + noise
+    sign = np.where(side == 0, 1.0, -1.0)[:, None]  # ratio and phase are those of A to B
+    log_ratio = sign * 0.5 * np.log(filtered_power / power)
+    return _Filters(log_ratio, -sign * np.arctan(relative_frequency), side, cutoff)
 
 
 def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:

@@ -94,20 +94,19 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0
     friction, drop = sign * friction, sign * drop
     healthy_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
-    drops, log_densities, log_changed = [drop], np.zeros(1), 0.0
+    drops, log_densities = [drop], np.zeros(1)  # one for each hypothesis
     if min(healthy_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
         drops.append(drop + (friction - healthy_friction) / top_speed)
         change = float(np.log(friction[-1] / healthy_friction))
         # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
-        log_changed = float(log_densities[0])
     drops_by_hypothesis = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
     healthy_logs = np.log(drops_by_hypothesis[:, healthy])
     squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
     squares += (drop_error[healthy] / drops_by_hypothesis[:, healthy]) ** 2
     log_scatters = -0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
-    log_misleads = np.log(prior.drop_misleads) + log_changed + log_scatters
+    log_misleads = np.log(prior.drop_misleads) + log_densities[0] + log_scatters
     log_tells = np.log1p(-prior.drop_misleads) + log_densities + log_scatters
     log_sum = np.logaddexp.reduce(np.concatenate([log_tells, log_misleads]))
     log_probabilities = np.log(prior.drop_tells) + np.column_stack([log_tells, log_misleads]) - log_sum
