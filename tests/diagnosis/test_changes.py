@@ -115,13 +115,13 @@ def test_missing_positions_hide_nothing() -> None:
 
 def test_units_and_sides_do_not_matter() -> None:
     recording = machine(p_A=5e3 * WAY * LATE, p_B=-5e3 * WAY * LATE)
-    ranks = [test.rank for test in level_tests(recording)]
+    scores = [test.score for test in level_tests(recording)]
     counts = replace(
         recording, channels={n: v * (1e-3 if n.startswith("p_") else 1.0) for n, v in recording.channels.items()}
     )
     swapped = replace(recording, channels={**recording.channels, "p_A": recording["p_B"], "p_B": recording["p_A"]})
     for other in (counts, swapped):
-        assert sorted(test.rank for test in level_tests(other)) == pytest.approx(sorted(ranks), rel=0.05)
+        assert sorted(test.score for test in level_tests(other)) == pytest.approx(sorted(scores), rel=0.05)
 
 
 CHANGES: dict[str, Callable[[np.ndarray], np.ndarray]] = {

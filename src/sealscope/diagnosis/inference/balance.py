@@ -34,7 +34,7 @@ from sealscope.diagnosis.inference.onset import MIN_BLOCKS
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
-from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SUPPORT
+from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SD_PER_MEDIAN, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     OVERLAP,
     SPAN,
@@ -400,8 +400,7 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
-    # standard deviation; 1.4826: that of normal values over the median of their magnitudes
-    noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
+    noise = SD_PER_MEDIAN * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
     # 2: neighbouring increments may be means that share a sample, which doubles the variance of their sum
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 

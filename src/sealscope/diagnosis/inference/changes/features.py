@@ -4,7 +4,7 @@ Each feature is one number in each block with motion, tested against its scatter
 pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak is not taken for
 such a step:
 
-- It changes the amplitude of the command or of the motion, not of both (`signals.duty_observables`).
+- It changes the amplitude of the command or of the motion, not of both (`duty_observables`).
 - It damps the ringing, but the noise is measured at higher frequencies.
 - The hum is measured in p_A + p_B, which does not ring.
 - With a leak, too, friction keeps p_A - p_B in phase with the flow.
@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.changes.levels import MOTIONS, motion_columns, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -31,16 +32,17 @@ _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
 #: Channels of the command, in the order of preference; a single channel stands for command and motion.
 COMMANDS = ("u", "omega", "theta")
+#: Minimum ratio of the smaller to the larger of two steps: half way, as an angle, between a single step and equal ones.
+_MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 #: Distances [bins] from a spectral line to bins outside of its main lobe with a Hann window.
 _NEIGHBOURS = _PRIORS.neighbours
 
 
-def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
+def observe_duty(recording: Recording) -> Iterator[Observable]:
+    """Test the amplitudes of command and motion for a sudden lasting change (`duty_observables`).
 
-    A change of the commanded motion (the machine's duty) changes both amplitudes alike; a leak changes only one. The
-    recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of
-    whole cycles.
+    The recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks
+    of whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -50,7 +52,7 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks, is_moving = _split_blocks(recording, length)
     amplitudes = {name: values[is_moving] for name, values in log_amplitudes(blocks)}
-    return amplitude_step_tests(time[is_moving], amplitudes)
+    return duty_observables(time[is_moving], amplitudes)
 
 
 def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
@@ -87,32 +89,60 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
             yield name, np.log(high - low)
 
 
-def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
-    """Test the log amplitudes (K,) of command and motion in K blocks for a step (`feature_step_test`).
+def duty_observables(time: Array, amplitudes: Mapping[str, Array]) -> Iterator[Observable]:
+    """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `time` (K,): middles of the blocks [s]. The list has a test for each amplitude, or is empty if one cannot be tested.
+    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) of command and motion
+    (`log_amplitudes`). Both must rise, or both fall, by similar amounts (`_MIN_STEP_RATIO`), since a leak changes only
+    one amplitude. Score, onset and size are those of the test with the lower score. The p-value is twice the higher
+    one, since a step may be up or down. Nothing is yielded if an amplitude cannot be tested.
     """
-    tests = [feature_step_test(time, values) for values in amplitudes.values()]
-    possible_tests = [test for test in tests if test is not None]
-    return possible_tests if len(possible_tests) == len(tests) else []
+    tests = [test for values in amplitudes.values() if (test := feature_step_test(time, values)) is not None]
+    if len(tests) < len(amplitudes):
+        return
+    steps = np.abs([test.fitted.value for test in tests])
+    has_one_sign = len({test.sign for test in tests}) == 1
+    if has_one_sign and steps.min() > _MIN_STEP_RATIO * steps.max():
+        weakest = min(tests, key=lambda test: test.score)
+        least_certain = max(tests, key=lambda test: test.chance)
+        yield Observable(
+            name="size of the duty",
+            data="duty",
+            score=weakest.score,
+            chance=min(1.0, 2.0 * least_certain.chance),
+            onset=weakest.onset(),
+            size=weakest.sign * weakest.fitted.value,
+        )
 
 
-def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
+def observe_sensors(recording: Recording) -> Iterator[Observable]:
     """Test features of the pressures, such as their noise, for a lasting change that no leak causes.
 
-    Returns pairs of a feature's name and its test, without features that cannot be tested; none if a chamber pressure
-    is not recorded, or if p_A has no samples in one of the blocks.
+    Yields nothing if a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
     """
     if not {"p_A", "p_B"} <= recording.channels.keys():
-        return []
+        return
     time, blocks, is_moving = _split_blocks(recording, len(recording) // BLOCKS)
     if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples, in which no channel has any
-        return []
-    tests = (
-        (name, feature_step_test(time[is_moving], values[is_moving]))
-        for name, values in sensor_features(blocks, recording.rate)
-    )
-    return [(name, test) for name, test in tests if test is not None]
+        return
+    features = {name: values[is_moving] for name, values in sensor_features(blocks, recording.rate)}
+    yield from sensor_observables(time[is_moving], features)
+
+
+def sensor_observables(time: Array, features: Mapping[str, Array]) -> Iterator[Observable]:
+    """Test the values (K,) of each feature of the pressures (`sensor_features`) for a step between K blocks.
+
+    `time` (K,): middles of the blocks [s]. The p-value is doubled, as each test is the better of two, for a step up and
+    a step down. Features that cannot be tested are left out.
+    """
+    for name, values in features.items():
+        test = feature_step_test(time, values)
+        if test is None:
+            continue
+        scale = None
+        if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
+            scale = Estimate(0.25 * test.sign * test.fitted.value, 0.25 * test.fitted.deviation)
+        yield Observable.from_test(name, name.split()[0], test, n_tests=2.0, pressure_scale=scale)
 
 
 def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array], NDArray[np.bool_]]:

@@ -30,11 +30,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
+from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, Interval, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
@@ -64,22 +65,6 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     ("zero of p_A", [[A]]),
     ("zero of p_B", [[B]]),
 )
-
-
-class LevelChange(NamedTuple):
-    """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
-
-    `name`: cause that changes these levels, such as "friction"; `rank`: by which patterns are compared (see the
-    module); `chance`: probability that a healthy recording has such a step in these levels; `onset`: time of the step
-    [s], with one block to either side; `pressure_scale`: logarithm of a factor on both pressures that would cause the
-    change, None if there is none.
-    """
-
-    name: str
-    rank: float
-    chance: float
-    onset: Interval
-    pressure_scale: Estimate | None = None
 
 
 def find_motion_channel(channels: Collection[str]) -> str | None:
@@ -187,13 +172,13 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     return values
 
 
-def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
+def level_tests(recording: Recording) -> tuple[Observable, ...]:
     """Test a recording for a step in each pattern of its pressure levels (`pattern_tests`)."""
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
 
-def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
+def pattern_tests(time: Array, values: Array) -> tuple[Observable, ...]:
     """Test pressure levels for a step in each of several patterns; the most likely one (highest rank) comes first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
@@ -203,22 +188,34 @@ def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
     therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
     second pass. All else, such as the p-values, is from the first pass, with all blocks. With fewer than `MIN_BLOCKS` +
     2 blocks there is no second pass.
+
+    The score of a result is its rank (see the module). The first is the best of n patterns, so that its p-value is n
+    chance_1 (Bonferroni). That of pattern k is min(1, n chance_1 exp(rank_1 - rank_k)). The Bayes factor of pattern 1
+    over pattern k (Schwarz's approximation) counts twice, once as evidence and once as a prior, because a pattern that
+    explains only part of the change needs a second cause.
     """
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]
     if changes and len(time) >= MIN_BLOCKS + 2:
-        onset = max(changes, key=lambda change: change.rank).onset.value
-        near_onset = np.argsort(np.abs(time - onset), kind="stable")[:2]
+        onset = max(changes, key=lambda change: change.score).onset
+        assert onset is not None  # each of these results has one
+        near_onset = np.argsort(np.abs(time - onset.value), kind="stable")[:2]
         reduced_tests = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
         changes = [
-            test._replace(rank=reduced_test.rank)
+            replace(test, score=reduced_test.score)
             for test, reduced_test in zip(tests, reduced_tests, strict=True)
             if test is not None and reduced_test is not None
         ]
-    return tuple(sorted(changes, key=lambda change: -change.rank))
+    changes.sort(key=lambda change: -change.score)
+    # 700: the largest exponent whose exponential is finite
+    factors = [float(np.exp(min(changes[0].score - change.score, 700.0))) for change in changes]
+    return tuple(
+        replace(change, chance=min(1.0, len(changes) * changes[0].chance * factor))
+        for change, factor in zip(changes, factors, strict=True)
+    )
 
 
-def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
+def _test_patterns(time: Array, values: Array) -> list[Observable | None]:
     """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested.
 
     The results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
@@ -230,20 +227,20 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
     if not np.ptp(values, axis=0).any():  # constant pressures have no errors by which steps are tested
         return [None] * (len(PATTERNS) + len(scales))
     whitening = _whitening_matrix(values)
-    changes = list[LevelChange | None]()
+    changes = list[Observable | None]()
     for name, bases in (*PATTERNS, *scales):
         tests = [_test_pattern(name, np.array(basis) @ whitening.T, values @ whitening.T, time) for basis in bases]
         # the rank depends on the basis, as each direction has a random walk of its own: a pattern must be supported by
         # each of its bases, so that the lowest rank counts
-        change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
-        if change is not None:
+        change = min((test for test in tests if test is not None), key=lambda test: test.score, default=None)
+        if change is not None and change.onset is not None:
             # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
             after = time > change.onset.value
             is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
             if name == CHARGE and not is_falling:
-                change = change._replace(name=SUPPLY)
+                change = replace(change, name=SUPPLY)
             if name == FRICTION:
-                change = change._replace(pressure_scale=_pressure_scale(values[~after], values[after]))
+                change = replace(change, pressure_scale=_pressure_scale(values[~after], values[after]))
         changes.append(change)
     return changes
 
@@ -287,13 +284,13 @@ def _whitening_matrix(values: Array) -> Array:
     return matrix
 
 
-def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> LevelChange | None:
+def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Observable | None:
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
     `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if the vectors are zero, or if a direction
-    cannot be tested. The score counts only the directions of the pattern, each with its own variance. For the rank all
-    directions have one variance in common. The formulas are in the module's docstring.
+    cannot be tested. The score of the result is the rank, for which all directions have one variance in common. For the
+    p-value only the directions of the pattern count, each with its own variance (formulas: see the module).
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
@@ -325,4 +322,5 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     # up or down in each direction, by the law under which the score is the most probable
     chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return LevelChange(name, rank, min(1.0, chance), Interval(onset, onset - block, onset + block))
+    interval = Interval(onset, onset - block, onset + block)
+    return Observable(name=name, data="levels", score=rank, chance=min(1.0, chance), onset=interval)

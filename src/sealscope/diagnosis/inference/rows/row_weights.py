@@ -29,7 +29,7 @@ RIDGE = 1e-10
 #: Maximum number of iterations to a fixed point, and the mean relative change of the weights that ends them.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-2
 #: Standard deviation of normal values over the median of their magnitudes.
-_SIGMA = 1.4826
+SD_PER_MEDIAN = 1.4826
 _Indices = NDArray[np.intp]
 
 
@@ -146,7 +146,7 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
         for i in range(left):
             residual -= workspace.fit[block, i] * values[r, column_order[i]]
         workspace.residual[r] = workspace.ordered[r] = abs(residual)
-    limit, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
+    limit, change = HUBER * SD_PER_MEDIAN * median(workspace.ordered, count), 0.0
     for r in range(count):
         weight = limit / workspace.residual[r] if limit > 0.0 and workspace.residual[r] > limit else 1.0
         change += abs(weight / workspace.weights[r] - 1.0)
