@@ -93,7 +93,7 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
 
 def top_speed(motion: Array) -> float:
     """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), TINY)[0])
+    return max(float(np.nanpercentile(np.abs(motion[:, 0]), 99.0)), TINY)
 
 
 def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
