@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.diagnosis.commissioned.healthy_file import check_summary
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
-from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses, predict_thinning
+from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -74,7 +74,7 @@ def predicted_oil(*days: tuple[float, float]) -> np.ndarray:
         for friction, drop in days
     ]
     sums = [RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9, resistance=np.array(fit)) for fit in fits]
-    return predict_thinning(sums)
+    return oil_hypotheses(sums)[0].thinning
 
 
 def test_thinner_oil_leaks_more() -> None:
@@ -117,7 +117,7 @@ def test_worn_seals_are_no_colder_oil() -> None:
 def test_a_drop_that_does_not_show_tells_no_oil() -> None:
     assert abs(predicted_oil((1e5, 2e5), (1e5, 2e5), (1e5, -1e3))[-1]) < INFERENCE.oil.per_drop * np.log(200.0)
     unknown = RecordingSums(np.zeros((1, 2, 2)), 3e-4, 5e6, 1.7e9)
-    assert not predict_thinning([unknown, unknown, unknown]).any()
+    assert not oil_hypotheses([unknown, unknown, unknown])[0].thinning.any()
 
 
 @pytest.mark.parametrize("spoilt", [{"drop_error": 0.0}, {"friction_error": -1.0}, {"top_speed": 1e-300}])

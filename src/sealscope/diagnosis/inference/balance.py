@@ -1,9 +1,8 @@
 """Blocks of a volume balance from the samples of a whole recording or of a stream.
 
-A block is a few seconds of samples, reduced to Gram matrices of a linear regression (`blocks.Blocks`). Each row of the
-regression is the volume balance (`equations.terms`), integrated with one test function of the weak form
-(`rows.weak_form`). `BlockStream` computes the blocks of a live stream, `recorded_blocks` those of a whole recording,
-for valves that are open or shut while the pump rests (`regimes`).
+A block is a few seconds of samples, reduced to Gram matrices of a linear regression (`blocks.Blocks`). `BlockStream`
+computes the blocks of a live stream, `recorded_blocks` those of a whole recording, for valves that are open or shut
+while the pump rests (`regimes`).
 """
 
 from __future__ import annotations
@@ -35,7 +34,7 @@ from sealscope.diagnosis.inference.onset import MIN_BLOCKS
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
-from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SUPPORT
+from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SD_PER_MEDIAN, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     OVERLAP,
     SPAN,
@@ -80,25 +79,13 @@ class BlockStream(SavedAttributes):
 
     The blocks do not depend on how many samples arrive at a time, unless `n_first` is None.
 
-    Parameters
-    ----------
-    balances : sequence of Equation
-        Balances of the machine (`balances.equations`).
-    rate : float
-        Sampling rate [Hz].
-    block_s : float
-        Length of a block [s], rounded to whole strides of the weak form.
-    n_first : int, optional
-        Number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
-    start : float
-        Time of the first sample [s].
-    offset : float
-        Sensor offset [Pa] that is subtracted from p_A - p_B.
-    left_signs : tuple of float
-        Factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty to estimate
-        the factors from the first blocks or, of a stream, from the first ones with motion.
-    on_samples : callable, optional
-        Called with the start time [s] and the samples of each block before the block is computed.
+    - `balances`: volume balances of the machine (`balances.equations`); `rate`: sampling rate [Hz].
+    - `block_s`: length of a block [s], rounded to whole strides of the weak form.
+    - `n_first`: number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
+    - `start`: time of the first sample [s]; `offset`: sensor offset [Pa] that is subtracted from p_A - p_B.
+    - `left_signs`: factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty
+      to estimate the factors from the first blocks or, of a stream, from the first ones with motion.
+    - `on_samples`: called with the start time [s] and the samples of each block.
     """
 
     SAVED = ("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits", "_weighting")
@@ -124,12 +111,12 @@ class BlockStream(SavedAttributes):
         self._balances, self._rate, self._offset = balances, rate, offset
         self._stride = stride_samples(rate)
         self._strides_per_block = strides_in(block_s, rate)
-        # samples on either side of a block that its speeds and rests depend on; 2 for differences of neighbours
+        self._length = self._strides_per_block * self._stride  # samples in a block
+        # samples on either side of a block on which its speeds and rests depend; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._drops_rests = is_separate_at_rest(balances[0])
-        # some terms are 0 at rest
         self._finds_rests = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
-        if self._finds_rests:
+        if self._finds_rests:  # some terms are 0 at rest
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
@@ -155,17 +142,16 @@ class BlockStream(SavedAttributes):
         """Add samples of the stream and return the blocks that they complete; None if they complete none.
 
         `samples`: arrays by channel name, NaN where missing, or empty to add none; `last`: true if no samples follow.
-        The first `n_first` blocks are returned together, once all of them are complete. A block is complete when it is
-        followed by the samples on which its rows, speeds and rests depend. With `last` true, the samples for its rows
-        suffice, and even fewer than `n_first` blocks are returned.
+        The first `n_first` blocks are returned together. A block is complete when it is followed by the samples on
+        which its rows, speeds and rests depend. With `last` true, the samples for its rows suffice, and fewer than
+        `n_first` blocks are returned.
         """
         if samples:
             self._pieces.append(samples)
             self._end += len(next(iter(samples.values())))
-        length = self._strides_per_block * self._stride
-        # number of samples needed after a block: those of its last rows, and a margin for its speeds and rests
+        # samples needed after a block: those of its last rows, and a margin for its speeds and rests
         tail = (SPAN - 1) * self._stride + 1 + (0 if last else self._margin)
-        n_complete = max(0, (self._end - tail) // length)
+        n_complete = max(0, (self._end - tail) // self._length)
         is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
         min_blocks = (self._n_first or 1) if is_waiting else 1
         if n_complete <= self._n_closed or n_complete < min_blocks:
@@ -179,7 +165,7 @@ class BlockStream(SavedAttributes):
         groups = zip([self._n_closed, *group_ends[:-1]], group_ends, strict=True)
         blocks = Blocks.join([self._build_blocks(joined, first, end) for first, end in groups])
         self._n_closed = n_complete
-        first_stored = max(0, n_complete * length - self._margin)  # later blocks need these samples
+        first_stored = max(0, n_complete * self._length - self._margin)  # later blocks need these samples
         self._pieces = [{name: values[first_stored - self._first :].copy() for name, values in joined.items()}]
         self._first = first_stored
         return blocks
@@ -192,11 +178,7 @@ class BlockStream(SavedAttributes):
         return {name: np.concatenate([piece[name] for piece in self._pieces]) for name in names}
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the stream as plain values for JSON, from which `load_state` continues.
-
-        The state contains the samples that later blocks need, the values that the first samples determined (such as
-        signs of the flows and absolute minus gauge pressures), and weighted sums over all blocks.
-        """
+        """Return the state of the stream as plain values for JSON, from which `load_state` continues."""
         return {
             **super().state(),
             "samples": {name: plain_array(values) for name, values in self._join_pieces().items()},
@@ -213,8 +195,8 @@ class BlockStream(SavedAttributes):
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
 
-        `rows`: for each balance the rows (r, m) of its regression, one for each test function of the weak form. Three
-        symptoms of correct wiring are tested, and their log odds (`_sign_log_odds`) are added:
+        `rows`: for each balance the rows (r, m) of its regression. Three symptoms of correct wiring are tested, and
+        their log odds (`_sign_log_odds`) are added:
 
         - Oil leaks from high to low pressure.
         - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy.
@@ -226,7 +208,7 @@ class BlockStream(SavedAttributes):
         odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
             left = balance.flow_sign * values[:, columns.left]
-            motion = values[:, [k for k in columns.motion if columns.names[k].startswith("motion")]].sum(axis=1)
+            motion = values[:, list(columns.piston)].sum(axis=1)
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
             log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
             if (flow := np.abs(left)).any():
@@ -240,34 +222,33 @@ class BlockStream(SavedAttributes):
         return tuple(odds_by_balance)
 
     def _shows_motion(self, rows: Sequence[Array]) -> bool:
-        """Return True if the flow moves the piston, in either sense, in the `rows` of a volume balance.
+        """Return True if flow and motion correlate by `sense.moves` (`priors.toml`) standard errors, in either sense.
 
-        Flow and motion must correlate by `sense.moves` (`priors.toml`) standard errors. Also True if no balance has a
-        position.
+        `rows`: for each balance the rows (r, m) of its regression. Also True if no balance has a position.
         """
-        z_scores = []
-        for columns, values in zip(self.columns, rows, strict=True):
-            if motion := [k for k in columns.motion if columns.names[k].startswith("motion")]:
-                z_scores.append(_z_score(values[:, motion].sum(axis=1) * values[:, columns.left]))
+        z_scores = [
+            _z_score(values[:, list(columns.piston)].sum(axis=1) * values[:, columns.left])
+            for columns, values in zip(self.columns, rows, strict=True)
+            if columns.piston
+        ]
         return not z_scores or max(map(abs, z_scores)) > INFERENCE.sense.moves
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
-        weights. The first call also determines, for all blocks of the stream, absolute minus gauge pressures, and the
-        speeds below which the machine rests; the first one in which the piston moves, the signs of the left sides.
-        `on_samples` is called with the samples of each block.
+        weights. The first call also determines absolute minus gauge pressures, and the speeds below which the machine
+        rests; the first one in which the piston moves, the signs of the left sides. They hold for all blocks.
         """
-        length = self._strides_per_block * self._stride  # samples in a block
+        length = self._length
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
         if self._absolute_offsets is None:
-            self._absolute_offsets = {
-                name: _absolute_offset(samples[name][:n_first_samples]) for name in ("p_A", "p_B") if name in samples
-            }
-        if self._finds_rests and self._rest_limits is None:
             first_samples = {name: values[:n_first_samples] for name, values in samples.items()}
-            self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
+            self._absolute_offsets = {
+                name: _absolute_offset(first_samples[name]) for name in ("p_A", "p_B") if name in samples
+            }
+            if self._finds_rests:
+                self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -314,16 +295,14 @@ class BlockStream(SavedAttributes):
         - flags (r,) of the rows that count: those with a positive weight and, in a balance with terms of its own at
           rest (`is_separate_at_rest`), within the length of a test function from motion. Rows at rest repeat better
           than those in motion, and many of them would determine the scale of the errors;
-        - mean magnitudes (K,) of the first balance's left side [m^3/s];
-        - means (K, p) of p equal parts of the sorted samples of p_A - p_B [Pa].
+        - `Blocks.flow` (K,) and `Blocks.pressures` (K, p).
         """
-        length = self._strides_per_block * self._stride  # samples in a block
+        length = self._length
         # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, start - self._margin)
-        piece = {  # samples of the range, and margins on either side
-            name: values[begin - self._first : stop + self._margin - self._first] for name, values in samples.items()
-        }
+        with_margins = slice(begin - self._first, stop + self._margin - self._first)
+        piece = {name: values[with_margins] for name, values in samples.items()}
         signals = Signals(
             piece, self._rate, to_absolute=self._absolute_offsets, offset=self._offset, rest_limits=self._rest_limits
         )
@@ -336,7 +315,7 @@ class BlockStream(SavedAttributes):
             weak_rows = weak_form_rows([column[without_margins] for column in columns], self._rate)
             is_whole &= weak_rows.whole
             rows.append(weak_rows.values)
-        in_blocks = slice(start - begin, start - begin + (end - first) * length)  # ends with the last block
+        in_blocks = slice(start - begin, end * length - begin)
         # clipped pressures are used as recorded: they are closer to the true ones than the mean of the other samples
         difference = piece[CLIPPED_DIFFERENCE] if CLIPPED_DIFFERENCE in piece else piece["p_A"] - piece["p_B"]
         pressure = difference[in_blocks].reshape(-1, length)
@@ -360,22 +339,18 @@ class BlockStream(SavedAttributes):
 
 
 def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,): sum(products) / sqrt(OVERLAP sum(products^2)).
-
-    A product is that of the flow and another quantity in one row of the regression. The two have equal signs if the
-    sensors are wired correctly. Overlapping rows increase the variance of the sum by the factor `OVERLAP`.
-    """
-    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))
+    """Compute the z score of the sum of `products` (r,), each of the flow and another quantity in one row."""
+    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))  # of overlapping rows
     return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
 
 
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
     """Compute p_A - `area_ratio` p_B in each row of a regression, i.e. the pressures' force over the area of A.
 
-    `rows` (r, m): rows of a volume balance; `columns`: roles of their columns; `area_ratio`: area of the piston on side
-    B over that on side A. p_A and -p_B are the columns of the two external leaks: 0 while the pressure is negative or,
-    with a meter in a valve's supply line, while its side is not fed. If the balance lacks one of them, or if
-    `area_ratio` is 1, the result is the column of the leak, p_A - p_B. The result has the shape (r,).
+    `rows` (r, m): rows of a volume balance; `area_ratio`: area of the piston on side B over that on side A. p_A and
+    -p_B are the columns of the two external leaks: 0 while the pressure is negative or, with a meter in a valve's
+    supply line, while its side is not fed. If the balance lacks one of them, or if `area_ratio` is 1, the result is the
+    column of the leak, p_A - p_B.
     """
     names = [f"external leak {side}" for side in "AB"]
     if area_ratio == 1.0 or not set(names) <= set(columns.names):
@@ -387,10 +362,8 @@ def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Arra
 def _sign_log_odds(z: float, other_cause: float) -> float:
     """Compute the log odds that a flow has the correct sign, from the z score `z` of one symptom of correct wiring.
 
-    c = `other_cause` is the probability that something other than the sign causes the score; both signs are then
-    equally probable. With the standard normal distribution Phi,
-
-        log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
+    c = `other_cause` is the probability that something else causes the score; both signs are then equally probable.
+    With the standard normal distribution Phi, log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
     """
     from scipy.special import ndtr
 
@@ -400,15 +373,12 @@ def _sign_log_odds(z: float, other_cause: float) -> float:
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     """Compute the z score of the leak's coefficient by least squares: positive for oil from high to low pressure.
 
-    It is the coefficient over its standard error. `gram` (m, m): Gram matrix of the `n_rows` rows of the regression;
-    `roles`: roles of its columns. The result is 0 if the rows do not determine the coefficient.
+    `gram` (m, m): Gram matrix of the `n_rows` rows of the regression. The result is 0 if the rows do not determine the
+    coefficient.
     """
-    nuisance = [k for k in roles.nuisance if k != roles.leak]
-    leak_and_left = [roles.leak, roles.left]
-    coupling = gram[np.ix_(nuisance, leak_and_left)]
-    reduced = gram[np.ix_(leak_and_left, leak_and_left)] - coupling.T @ solve(
-        gram[np.ix_(nuisance, nuisance)], coupling
-    )
+    nuisance, tested = [k for k in roles.nuisance if k != roles.leak], [roles.leak, roles.left]
+    coupling = gram[np.ix_(nuisance, tested)]
+    reduced = gram[np.ix_(tested, tested)] - coupling.T @ solve(gram[np.ix_(nuisance, nuisance)], coupling)
     energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
     freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
     if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
@@ -418,12 +388,11 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
 
 
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
-    """Compute the speed [m/s] or flow [m^3/s] below which a piston or a pump counts as resting.
+    """Compute the speed [m/s] or flow [m^3/s] v below which a piston or a pump counts as resting.
 
-    With the speed v of a piston, or the flow v of a pump, it is the larger of two values: a `fraction` of the mean
-    speed in motion, sum(v^2) / sum(abs(v)), and three standard deviations of the noise of a mean of v over
-    `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or of the pump's volume [m^3] between samples;
-    `rate`: sampling rate [Hz].
+    It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
+    deviations of the noise of a mean of v over `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or
+    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
@@ -431,8 +400,7 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
-    # standard deviation; 1.4826: that of normal values over the median of their magnitudes
-    noise = 1.4826 * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
+    noise = SD_PER_MEDIAN * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
     # 2: neighbouring increments may be means that share a sample, which doubles the variance of their sum
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 
@@ -440,11 +408,10 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n,) in which the piston moves for a time although the pump rests.
 
-    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside: the oil that
-    the piston displaces does not come from the pump. A load that sinks by a leak is slower, so the piston must be
-    faster than the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, for `MIN_REST` or longer. The
-    flags extend by `AVERAGING_TIME` to either side. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3]
-    and of the position [m], of which the former may be NaN; `rate`: sampling rate [Hz].
+    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside. A load that
+    sinks by a leak is slower, so the piston must be faster than the fraction `rest.lowers` (`priors.toml`) of its mean
+    speed in motion, for `MIN_REST` or longer. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3], NaN
+    where missing, and of the position [m]; `rate`: sampling rate [Hz].
     """
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
     is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
@@ -458,8 +425,7 @@ def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.
 def _absolute_offset(pressure: Array) -> float:
     """Compute absolute minus gauge pressure [Pa] for a sensor with the readings `pressure` (n,) [Pa].
 
-    The difference is the atmospheric pressure, or more if the lowest reading would otherwise give an absolute pressure
-    below `MIN_ABSOLUTE_PRESSURE`.
+    It is the atmospheric pressure, or more where the lowest reading would otherwise lie below `MIN_ABSOLUTE_PRESSURE`.
     """
     finite = pressure[np.isfinite(pressure)]
     min_reading = float(np.min(finite)) if finite.size else 0.0
@@ -467,23 +433,19 @@ def _absolute_offset(pressure: Array) -> float:
 
 
 def samples_without_holes(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples (n,) of the channels `names`, NaN in long gaps (`flag_holes`) and in clipped pressures.
-
-    As in `bridged_samples`, there is an entry `CLIPPED_DIFFERENCE` if pressures are clipped.
-    """
+    """Return the samples (n,) of the channels `names` as `bridged_samples` does, but NaN in long gaps."""
     samples = bridged_samples(recording, names)
     is_hole = samples.pop(HOLE, np.zeros(0)) > 0.0
     return {name: np.where(is_hole, np.nan, values) for name, values in samples.items()} if is_hole.any() else samples
 
 
 def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, Array]:
-    """Return the samples (n,) of the channels `names`, in which holes are bridged and clipped pressures are NaN.
+    """Return the samples (n,) of those channels `names` that are recorded, with clipped pressures as NaN.
 
-    Names that the recording lacks are left out. Holes, i.e. long gaps of missing samples, are bridged: they keep the
-    values with which the inspection filled them (`corrections.gaps`). If there are holes, the additional entry `HOLE`
-    is 1 there and 0 elsewhere. If a pressure is clipped, and the result has p_A and p_B, the additional entry
-    `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values are closer to the
-    true ones than the mean of the other samples.
+    Holes, i.e. long gaps of missing samples, keep the values with which the inspection filled them
+    (`corrections.gaps`); the additional entry `HOLE` is then 1 there and 0 elsewhere. If p_A or p_B is clipped, the
+    additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values
+    are closer to the true ones than the mean of the other samples.
     """
     samples, is_clipped = {}, False
     is_hole = flag_holes(recording)
@@ -507,9 +469,9 @@ def derive_drive_signals(
 
     `rate`: sampling rate [Hz]. The added entry `START` is exp(-t/lag) at the time t since the first sample: the effect
     of the drive's unknown initial state decays with the time constant lag. If only the command u shows the pump's flow,
-    the speed of the pump is added as "omega" [rad/s]. It is the drive's response to u, NaN where u is missing. If
-    `loaded` is true, the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load
-    counts as leakage.
+    the drive's response to u is added as the pump's speed "omega" [rad/s], NaN where u is missing. If `loaded` is true,
+    the drive responds to the load p_A - p_B as well. Otherwise the droop of the real speed under load counts as
+    leakage.
     """
     drive = Drive.from_rig(rig)
     derived = {START: np.exp(-np.arange(len(samples["p_A"])) / (rate * drive.lag))}
@@ -534,12 +496,10 @@ def _hold_missing(values: Array) -> Array:
 def min_samples_for_step(rate: float) -> int:
     """Compute the minimum number of samples, at a `rate` [Hz], to test for a leak that begins within a recording.
 
-    A test needs `MIN_BLOCKS` blocks of minimum length, and the samples beyond the last block over which its test
-    functions extend. A test function begins at each multiple of the stride, and is `SPAN` strides long.
+    A test needs `MIN_BLOCKS` blocks of minimum length, and the samples to the end of the last test function.
     """
-    stride = stride_samples(rate)
-    block = strides_in(MIN_BLOCK_TIME, rate) * stride  # [samples]
-    return MIN_BLOCKS * block + (SPAN - 1) * stride + 1
+    strides = MIN_BLOCKS * strides_in(MIN_BLOCK_TIME, rate) + SPAN - 1
+    return strides * stride_samples(rate) + 1
 
 
 class RegimeBlocks(NamedTuple):
@@ -556,11 +516,10 @@ class RegimeBlocks(NamedTuple):
     columns: tuple[ColumnRoles, ...]
     shut: bool = False
 
-    def reverse_flow(self, is_reversed: Sequence[bool]) -> RegimeBlocks:
+    def reverse_flow(self, is_reversed: NDArray[np.bool_]) -> RegimeBlocks:
         """Reverse the sign of the left side, a recorded flow, in each balance that is flagged in `is_reversed` (E,)."""
         signs = np.ones((len(self.columns), self.blocks.gram.shape[-1]))
-        for e, roles in enumerate(self.columns):
-            signs[e, roles.left] = -1.0 if is_reversed[e] else 1.0
+        signs[is_reversed, -1] = -1.0  # the left side is the last column
         factors = signs[:, :, None] * signs[:, None, :]  # of products of two columns
         blocks, plain = (replace(series, gram=series.gram * factors) for series in (self.blocks, self.plain))
         return self._replace(blocks=blocks, plain=plain)
@@ -582,21 +541,18 @@ class RecordedBlocks(NamedTuple):
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
         """Reverse the flows whose more probable sign changes when the evidence of other recordings is added.
 
-        `log_odds` (E,): for each of the E balances, log odds from other recordings that its recorded flow has the right
-        sign. They are added to those of this recording; the field `sign_log_odds` stays unchanged.
+        `log_odds` (E,): log odds from other recordings that each balance's recorded flow has the right sign. The field
+        `sign_log_odds` stays unchanged.
         """
-        is_right = np.array(self.sign_log_odds) >= 0.0
-        is_reversed = ((np.array(self.sign_log_odds) + log_odds >= 0.0) != is_right).tolist()
-        if not any(is_reversed):
+        recorded = np.array(self.sign_log_odds)
+        is_reversed = (recorded >= 0.0) != (recorded + log_odds >= 0.0)
+        if not is_reversed.any():
             return self
         shut = None if self.shut is None else self.shut.reverse_flow(is_reversed)
         return self._replace(open=self.open.reverse_flow(is_reversed), shut=shut)
 
     def regime(self, odds: float) -> RegimeBlocks:
-        """Return the blocks for shut valves if there are any and `odds`, the log odds of shut valves, is positive.
-
-        Otherwise return those for open valves.
-        """
+        """Return the blocks for shut valves if there are any and `odds`, their log odds, is positive; else for open."""
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
@@ -623,7 +579,6 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         samples = _without_lowering(samples, recording.rate, balances[0])
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
-
     make_stream = partial(BlockStream, stream_balances, recording.rate, block_s, n_first=None, start=start)
     stream = make_stream()
     recorded = stream.push(samples, last=True)
@@ -639,8 +594,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         assert blocks is not None  # as many samples as for `recorded`
         return blocks
 
-    columns = ColumnRoles(stream_balances[0])
-
+    columns = stream.columns[0]
     odds = shut_odds(recorded, columns) if may_shut else 0.0
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.lasting
 
@@ -676,7 +630,7 @@ def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equati
 def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) -> float:
     """Find the longest time [s] for which the piston rests while the pump turns to hold a load; 0 if it never does.
 
-    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    `samples`, `rate`, `balance`: as in `_without_lowering`.
     """
     signals = Signals(samples, rate, rest_limits=_find_rest_limits(samples, rate, balance))
     _, lengths = find_runs(signals.holding(balance.left) > 0.0).T  # [samples]
@@ -688,16 +642,13 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 
     Both are those of `max_rest_rate`, with two exceptions:
 
-    - A balance with terms of its own at rest (`is_separate_at_rest`) needs the stops of the piston only. The limit
-      `pump`, of the left side, is `NEVER`: the flow never counts as resting, and a stop of the piston is `holding`. The
-      piston's limit is the fraction `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than
-      `MIN_REST` count.
+    - A balance with terms of its own at rest (`is_separate_at_rest`) needs the stops of the piston only. The flow never
+      counts as resting (`NEVER`), so that a stop of the piston is `holding`. The piston's limit is the fraction
+      `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
     - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
-      valves are taken as shut, and a piston that still moves creeps by a leak. The piston's limit is then `NEVER`: the
-      piston never counts as resting.
+      valves are taken as shut, and a piston that still moves creeps by a leak: it never counts as resting.
 
-    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the flow of the
-    pump or of the meter.
+    `samples`, `rate`, `balance`: as in `_without_lowering`.
     """
     signals = Signals(samples, rate)
     if is_separate_at_rest(balance):
@@ -712,16 +663,14 @@ def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equati
 def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
-    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The offset is
-    estimated from the blocks as recorded and removed from their Gram matrices. If it exceeds `NEGLIGIBLE_OFFSET`
-    standard deviations of its prior, the blocks are instead computed again after subtracting it, and the remaining
-    offset is removed. Neighbouring blocks of a long recording are merged (`Blocks.merge`).
+    `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The estimated offset
+    is removed from the Gram matrices, which assumes terms that are linear in it. If it exceeds `NEGLIGIBLE_OFFSET`
+    standard deviations of its prior, the blocks are computed again after subtracting it, and the rest is removed.
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded
     blocks = remove_pressure_offset(plain, columns)
     offset = float(blocks.zero[0])
-    # removal from the Gram matrices assumes terms that are linear in the offset, as they nearly are for a small one
     if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:
         blocks = remove_pressure_offset(compute_blocks(offset), columns)
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

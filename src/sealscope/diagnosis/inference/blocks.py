@@ -1,15 +1,13 @@
 """Likelihood of a volume balance's coefficients in blocks of a recording, from sums over the rows of each block.
 
-A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A
-block is a few seconds of a recording. It stores the Gram matrix of its rows over all columns (terms and left side). A
-row is the balance integrated with one test function of the weak form (`rows.weak_form`). The Gram matrix of several
-blocks together is the sum of their Gram matrices. A stream and a whole recording are therefore handled alike, and a
-recording of hours costs no more than one of minutes. Rows are weighted once, when their block is closed
-(`row_weights`).
+A volume balance (`terms`) is linear: its left side is a sum of terms, each a coefficient times a column of data. A row
+is the balance integrated with one test function of the weak form (`rows.weak_form`). A block is a few seconds of a
+recording, of which only the Gram matrix of its rows over all columns (terms and left side) is stored. Gram matrices of
+several blocks add up, so that a stream and a recording of hours are handled alike. Rows are weighted once, when their
+block is closed (`row_weights`).
 
 All samples of the balance's channels count, also those that bridge a short gap. A row with a clipped sample does not
-count, and one beside a long gap by its share outside of the gap (`balance.BlockStream`). A step is sought from the
-first motion on (`RecordedBalance.running_blocks`).
+count, and one beside a long gap by its share outside of the gap (`balance.BlockStream`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).
@@ -17,14 +15,14 @@ level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a n
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.inference.onset import Information
@@ -55,23 +53,17 @@ _MAX_OFFSET_STEPS = 3
 class Blocks:
     """Consecutive blocks of a recording, each a few seconds long and reduced to a regression's Gram matrices.
 
-    Parameters
-    ----------
-    start, end : array of float, shape (K,)
-        Times of the first and the last row of each block [s], i.e. of the middles of their test functions.
-    gram : array of float, shape (K, E, m, m)
-        Gram matrices of each block for each of E equations: weighted sums, over the rows, of the products of the m
-        columns with each other. The left side is the last column.
-    rows : array of float, shape (K,)
-        Number of the regression's rows (one for each test function of the weak form) without missing samples; a row
-        next to a hole counts as a fraction of one.
-    flow : array of float, shape (K,)
-        Mean magnitude of the first equation's left side, as a flow [m^3/s].
-    pressures : array of float, shape (K, p)
-        Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
-    zero : array of float, shape (K,)
-        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`), the
-        same in all blocks of a recording.
+    - `start`, `end` (K,): times of the first and the last row of each block [s], i.e. of the middles of their test
+      functions.
+    - `gram` (K, E, m, m): Gram matrices of each block for each of E equations: weighted sums, over the rows, of the
+      products of the m columns with each other. The left side is the last column.
+    - `rows` (K,): number of the regression's rows (one for each test function of the weak form) without missing
+      samples; a row next to a hole counts as a fraction of one.
+    - `flow` (K,): mean magnitude of the first equation's left side, as a flow [m^3/s].
+    - `pressures` (K, p): means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded
+      (`sorted_part_means`).
+    - `zero` (K,): sensor offset [Pa] that was subtracted from p_A - p_B in `gram`
+      (`pressure_offset.remove_pressure_offset`), the same in all blocks of a recording.
     """
 
     start: Array
@@ -115,10 +107,9 @@ class Blocks:
 
     @property
     def is_moving(self) -> NDArray[np.bool_]:
-        """Flags (K,) of the blocks in which the pump moves the piston.
+        """Flags (K,) of the blocks in which the pump moves the piston; all are flagged if all flows are 0.
 
-        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less. If
-        all flows are 0, all blocks are flagged.
+        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less.
         """
         return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
 
@@ -134,8 +125,7 @@ class Blocks:
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
         """Merge neighbouring blocks in groups of equal size, so that at most `max_blocks` blocks remain.
 
-        The last group may be smaller. Gram matrices and numbers of rows are added, flow is averaged with the numbers of
-        rows as weights, and pressures with `pressure_weights`; `zero` is the same in all blocks.
+        The last group may be smaller. Gram matrices and numbers of rows are added; flow and pressures are averaged.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
@@ -165,22 +155,16 @@ class Blocks:
         return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
-        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,).
-
-        The flow through an orifice is proportional to it.
-        """
+        """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,), for an orifice."""
         return np.asarray(np.sqrt(np.abs(self.pressures - self.zero[:, None])).mean(axis=1))
 
     def driving_pressure(self, names: Sequence[str], term: str) -> float:
         """Estimate the root mean square (rms) [Pa] of the pressure that drives the flow of a leak or another `term`.
 
         This pressure is p_B, for example, for a leak out of side B. `term`: name of the term; `names`: names of the
-        columns of `gram`. The result is
-
-            rms(p_A - p_B) s_term / s_leak,
-
-        where s_term^2 and s_leak^2 are sums of squares of two columns: that of the term, and that of the leak, whose
-        increments are (p_A - p_B) dt. The sums are over the equations that contain the term.
+        columns of `gram`. The result is rms(p_A - p_B) s_term / s_leak. s_term^2 and s_leak^2 are sums of squares of
+        the columns of the term and of the leak, whose increments are (p_A - p_B) dt, over the equations that contain
+        the term.
         """
         squares = np.einsum("keii->ei", self.gram)  # (E, m): sum of squares of each column in each equation
         squares = squares[squares[:, names.index(term)] > 0.0].sum(axis=0)  # equations that contain the term
@@ -202,7 +186,8 @@ class ColumnRoles:
     - `left`: left side; `leak`: laminar leak, or the term that is tested in its place; `bias`: flow offset, or None;
     - `nuisance`: terms whose coefficients are unknown in any machine, the leak among them;
     - `compared`: the nuisance terms, and those that are fitted only to compare recordings;
-    - `motion`: motion of the piston, or flow of the valve's edges; `compliance`: the chambers' oil and its air;
+    - `piston`: motion of the piston; `motion`: the same with its delay, or the flow of the valve's edges;
+    - `compliance`: the chambers' oil and its air;
     - `hold_leak`: leakage of a pump that holds the load, left out in a comparison of recordings (`regimes`); None
       unless valves shut at rest;
     - `fast`, `slow`: terms whose coefficients are free in each block, or common to all, while rows are weighted.
@@ -219,36 +204,40 @@ class ColumnRoles:
     """
 
     def __init__(self, equation: Equation) -> None:
-        self.names = tuple(term.name for term in equation.terms)
-        self.left = len(self.names)
-        self.nuisance = tuple(k for k, term in enumerate(equation.terms) if term.is_fitted)
-        self.compared = tuple(k for k, term in enumerate(equation.terms) if term.is_fitted or term.is_compared)
-        # true for a balance that `balances.shut_at_rest` made
-        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
-        self.hold_leak = self.names.index(HOLDING) if is_shut else None
-        self.leak = self.names.index(LEAK)
-        drift_priors = vars(INFERENCE.drift)
-        self.drift_rate = np.array([drift_priors[term.drift] if term.is_fitted else 0.0 for term in equation.terms])
-        between_priors = vars(INFERENCE.between)
-        self.between_deviation = np.zeros(len(equation.terms))
-        self.between_deviation[list(self.compared)] = [between_priors[equation.terms[k].drift] for k in self.compared]
-        self.level_deviation = np.array(
-            [INFERENCE.level.outside if term.drift == "outside" else np.inf for term in equation.terms]
-        )
-        self.motion = tuple(k for k in self.nuisance if equation.terms[k].drift in ("motion", "edge"))
-        self.compliance = tuple(k for k in self.nuisance if equation.terms[k].drift in ("compliance", "air"))
-        self.fast = tuple(k for k in self.nuisance if equation.terms[k].drift in UNSTEADY)
+        terms = equation.terms
+        self.names, self.drivers = tuple(term.name for term in terms), tuple(term.driver for term in terms)
+        self.healthy_conductance = equation.healthy
+        self.left, self.leak = len(terms), self.names.index(LEAK)
+        self.bias = self.names.index(BIAS) if BIAS in self.names else None
+        self.nuisance = tuple(k for k, term in enumerate(terms) if term.is_fitted)
+        self.compared = tuple(k for k, term in enumerate(terms) if term.is_fitted or term.is_compared)
+
+        def fitted_columns(*drifts: str) -> tuple[int, ...]:
+            """List the nuisance columns with the given kinds of drift."""
+            return tuple(k for k in self.nuisance if terms[k].drift in drifts)
+
+        self.motion, self.compliance = fitted_columns("motion", "edge"), fitted_columns("compliance", "air")
+        self.piston = tuple(k for k in self.motion if self.names[k].startswith("motion"))
+        self.fast = fitted_columns(*UNSTEADY)
         # columns that are zero at rest; HOLDING is left out, since separate leakages of holds and other rests would
         # follow outliers
         in_motion = [self.names.index(name) for name in (TURNING, MOVING_BIAS)] if MOVING_BIAS in self.names else []
         self.slow = (*(k for k in self.nuisance if k not in self.fast), *in_motion)
-        self.bias = self.names.index(BIAS) if BIAS in self.names else None
+        # true for a balance that `balances.shut_at_rest` made
+        is_shut = HOLDING in self.names and MOVING_BIAS not in self.names
+        self.hold_leak = self.names.index(HOLDING) if is_shut else None
+        drift, between = vars(INFERENCE.drift), vars(INFERENCE.between)
+        self.drift_rate = np.array([drift[term.drift] if term.is_fitted else 0.0 for term in terms])
+        self.level_deviation = np.array(
+            [INFERENCE.level.outside if term.drift == "outside" else np.inf for term in terms]
+        )
+        self.between_deviation = np.array(
+            [between[term.drift] if k in self.compared else 0.0 for k, term in enumerate(terms)]
+        )
         # a flow offset repeats in all recordings, unless its term stands for an external leak (drift "outside") or,
         # if valves shut at rest, for losses of the pump in motion
-        if self.bias is not None and equation.terms[self.bias].drift == "bias" and not is_shut:
+        if self.bias is not None and terms[self.bias].drift == "bias" and not is_shut:
             self.between_deviation[self.bias] = 0.0
-        self.drivers = tuple(term.driver for term in equation.terms)
-        self.healthy_conductance = equation.healthy
 
     @property
     def unshared(self) -> list[int]:
@@ -264,13 +253,12 @@ class ColumnRoles:
         `level.lag` [s] times the area, the rms flow over the rms speed. `total` (m, m): Gram matrix of the recording.
         """
         deviations, energies = self.level_deviation.copy(), np.diag(total)
-        piston = [k for k in self.motion if self.names[k].startswith("motion")]
-        if not piston:  # behind a servo valve, or in a balance without motion
+        if not self.piston:  # behind a servo valve, or in a balance without motion
             return deviations
         # finite for an external leak, which has a prior of its own (`level.outside`)
         if self.bias is not None and not np.isfinite(deviations[self.bias]) and energies[self.bias] > 0.0:
             deviations[self.bias] = INFERENCE.level.bias * np.sqrt(energies[self.left] / energies[self.bias])
-        motion_energy = float(energies[piston].sum())
+        motion_energy = float(energies[list(self.piston)].sum())
         if LAG in self.names and motion_energy > 0.0:
             deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / motion_energy)
         return deviations
@@ -279,12 +267,10 @@ class ColumnRoles:
         """Compute the prior precisions (c,) of the differences of c coefficients from those of other recordings.
 
         `indices` (c,): columns of the coefficients; `coefficients` (c,): their values in the other recordings;
-        `leak_coefficient`: the leak's value in the other recordings [m^3/(s Pa)].
-
-        The prior deviation is the magnitude of the coefficient times `between_deviation`, or for the leak times
-        `between.pump` (`priors.toml`). A flow offset that repeats in all recordings (`between_deviation` 0) is an
-        exception. Its deviation is the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor
-        offset of p_A - p_B. The precision is infinite if the deviation is 0.
+        `leak_coefficient`: the leak's value there [m^3/(s Pa)]. The prior deviation is the magnitude of the coefficient
+        times `between_deviation`, or for the leak times `between.pump` (`priors.toml`). That of a flow offset that
+        repeats in all recordings (`between_deviation` 0) is the leak's flow at the pressure `zero.pressure`, the
+        standard deviation of a sensor offset of p_A - p_B. The precision is infinite if the deviation is 0.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
@@ -307,8 +293,7 @@ class ColumnRoles:
     def replace_leak(self, name: str) -> ColumnRoles:
         """Return a copy in which the term `name` takes the place of the leak, which becomes an ordinary term.
 
-        The prior deviation of the old leak between recordings, infinite for the tested term, becomes `between.pump`
-        (`priors.toml`).
+        The prior deviation of the old leak between recordings becomes `between.pump` (`priors.toml`).
         """
         roles = copy(self)
         roles.leak, roles.between_deviation = self.names.index(name), self.between_deviation.copy()
@@ -318,10 +303,9 @@ class ColumnRoles:
     def leak_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the leak coefficient of `column` in a healthy machine.
 
-        The result is in the unit of the coefficient. It is infinite if no pressure drives the flow of this column, and
-        for a laminar leak if `healthy_conductance` is. The coefficient of an orifice is converted from a laminar
-        conductance by equal mean flows over `blocks`. This conductance is at most that of a healthy piston, since the
-        pump's leakage is laminar.
+        It is infinite if no pressure drives the flow of this column, and for a laminar leak if `healthy_conductance`
+        is. The coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`.
+        This conductance is at most that of a healthy piston, since the pump's leakage is laminar.
         """
         driver = self.drivers[column]
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -334,13 +318,11 @@ class ColumnRoles:
     def offset_deviation(self, column: int, blocks: Blocks) -> float:
         """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
 
-        The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice, and
-        0 if no pressure drives the column's term. It also counts as 0 in an equation without flow offset, since the
-        column of the flow offset is needed to remove the error (`_shift_offset`). The prior standard deviation of the
-        sensor's offset [Pa] is limited to the mean of abs(p_A - p_B) over `blocks`: pressures recorded in counts are
-        much smaller numbers.
+        The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice. It
+        is 0 if no pressure drives the column's term, and in an equation without flow offset, whose column is needed to
+        remove the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the
+        mean of abs(p_A - p_B) over `blocks`: pressures recorded in counts are much smaller numbers.
         """
-        # what drives the flow of the column's term: "pressure", "root" (square root of a pressure), or "" for neither
         driver = self.drivers[column] if self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
         # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))
@@ -351,8 +333,7 @@ class ColumnRoles:
 class Weighting(SavedAttributes):
     """Huber's weights of the rows of successive blocks, which limit the effect of outliers.
 
-    The weights follow from a fit to the rows and to weighted sums over earlier blocks. These sums are the state of the
-    object.
+    The weights follow from a fit to the rows and to weighted sums over earlier blocks, the state of the object.
     """
 
     SAVED = ("_count", "_earlier_sums")
@@ -368,11 +349,11 @@ class Weighting(SavedAttributes):
         return self._count > 0
 
     def compute_gram_matrices(self, values: Sequence[Array], ends: NDArray[np.intp]) -> Array:
-        """Compute the Gram matrices (K, E, m, m) of K blocks, in which outlying rows have smaller weights.
+        """Compute the Gram matrices (K, E, m, m) of K blocks, and add these blocks to the sums over earlier ones.
 
         `values`: for each equation the rows (r, m) of all blocks; `ends` (K,): index past the last row of each block.
         The weights follow from one fit to these and earlier blocks. The coefficients of fast columns are free in each
-        block, those of slow columns common to all (`ColumnRoles`). The sums over earlier blocks are updated.
+        block, those of slow columns common to all (`ColumnRoles`).
         """
         self._count += len(ends)
         update_fraction = min(1.0, SUPPORT / self._count)  # the last fifth of many blocks has two thirds of the weight
@@ -398,32 +379,20 @@ def solve(matrix: Array, right: Array) -> Array:
     scaled_right = right / right_scale
     if not scaled_right.size:  # nothing to solve
         return np.asarray(scaled_right)
-    _, solution, has_failed = _positive_definite_solver()(scaled, scaled_right)
+    # of LAPACK, which is faster for a few columns than NumPy
+    _, solution, has_failed = dposv(scaled, scaled_right)
     if has_failed:  # not positive definite, by rounding
         solution = np.asarray(np.linalg.solve(scaled, scaled_right))
     return np.asarray(solution / right_scale)
 
 
-@cache
-def _positive_definite_solver() -> Callable[[Array, Array], tuple[Array, Array, int]]:
-    """Return LAPACK's solver for positive definite matrices, which is faster for a few columns than NumPy's."""
-    from scipy.linalg.lapack import dposv
-
-    return dposv  # type: ignore[no-any-return]
-
-
-def information(
-    blocks: Blocks,
-    columns: Sequence[ColumnRoles],
-    test: int,
-    with_expansion: bool = False,
-) -> Information:
+def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, with_expansion: bool = False) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
-    The likelihoods of the equations are multiplied. The result also contains the prior standard deviation of the
-    coefficient in a healthy machine (`level`), infinite unless it is that of a leak (`ColumnRoles.leak_deviation`).
-    `columns`: roles of the columns of each equation; `test`: index of the coefficient's column; `with_expansion`: add
-    the errors of the coefficient by an imperfect model of the oil's expansion (`_expansion_errors`).
+    `test`: index of the coefficient's column; `with_expansion`: add the errors of the coefficient by an imperfect model
+    of the oil's expansion (`_expansion_errors`). The likelihoods of the equations are multiplied. The result also
+    contains the prior standard deviation of the coefficient in a healthy machine (`level`,
+    `ColumnRoles.leak_deviation`).
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
@@ -456,10 +425,9 @@ def information(
 def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     """Compute the error (K,) that an imperfect model of the oil's expansion causes in the tested coefficient.
 
-    `fit`: fit of one equation to K blocks; `roles`: roles of its columns. The error in a block is the fitted volume of
-    expansion, converted to the equivalent value of the tested coefficient, times the relative error `blocks.expansion`
-    (`priors.toml`). The terms of the compliance hardly describe air at low pressures. The error is small where
-    pressures rise and fall again, and large where they only relax.
+    The error in a block is the fitted volume of expansion, as a value of the tested coefficient with the same effect,
+    times the relative error `blocks.expansion` (`priors.toml`). The terms of the compliance hardly describe air at low
+    pressures. The error is small where pressures rise and fall again, and large where they only relax.
     """
     n_polynomials = fit.polynomials.shape[1]
     # a flag for each polynomial of each nuisance column, and of the offset's, which is the last
@@ -472,16 +440,6 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     has_energy = fit.normal.energy > 0.0
     products = np.where(has_energy, np.sqrt(np.maximum(squares, 0.0)), 0.0)
     return np.asarray(INFERENCE.blocks.expansion * products / np.where(has_energy, fit.normal.energy, 1.0))
-
-
-def _drift_polynomials(blocks: Blocks) -> tuple[Array, float]:
-    """Compute the polynomials (K, DRIFT_DEGREE + 1) of slow drifts over K blocks, and the recording's length [min].
-
-    A single block has only the constant polynomial.
-    """
-    minutes = max(float(blocks.end[-1] - blocks.start[0]), 1e-9) / 60.0
-    position = (blocks.time - blocks.start[0]) / (60.0 * minutes) * 2.0 - 1.0  # -1 to 1, the polynomials' range
-    return np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0), minutes
 
 
 class _NormalEquations(NamedTuple):
@@ -534,61 +492,41 @@ def _build_normal_equations(
     )
 
 
-class _Prior(NamedTuple):
-    """Prior standard deviations of c nuisance coefficients: `level` of their constant parts and `drift`, (c,) each.
-
-    The last coefficient is the error [Pa] that remains of the sensor offset of p_A - p_B. The prior standard deviation
-    of the whole offset is `offset` [Pa], 0 if it has no effect. `current_offset` [Pa] is already subtracted, so that
-    the remaining error has the prior mean -`current_offset`. If an orifice is tested, all three are errors of the root
-    of p_A - p_B [Pa^0.5].
-    """
-
-    level: Array
-    drift: Array
-    offset: float
-    current_offset: float = 0.0
-
-
 def _fit_nuisance(
-    normal: _NormalEquations, prior: _Prior, n_polynomials: int, n_rows: float
+    normal: _NormalEquations, deviations: Array, prior_mean: Array, n_rows: float
 ) -> tuple[Array, Array, Array, float]:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
-    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `prior`: priors on
-    the c other coefficients, with `n_polynomials` each; `n_rows`: number of rows in all blocks. The variance weights
-    the prior, and so determines the fit: both are found by iteration, until the variance changes by at most the
+    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `deviations`,
+    `prior_mean` (c,): normal priors on the c other coefficients; `n_rows`: number of rows in all blocks. The variance
+    weights the prior, and so determines the fit: both are found by iteration, until the variance changes by at most the
     fraction `TOLERANCE`. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
     variance = max(left_square / n_rows, min_variance)
     for _ in range(MAX_ITERATIONS):
-        # prior of each coefficient: its mean, and its precision times the variance of a row; rows that overlap are
-        # correlated, as if their variance were OVERLAP times as large
-        precision, mean = np.zeros((2, len(prior.drift), n_polynomials))
+        # precision times the variance of a row; rows that overlap are correlated, as if their variance were OVERLAP
+        # times as large. A drift is relative to the coefficient, which may be 0: the precision is then infinite
         with np.errstate(divide="ignore", over="ignore"):
-            # infinite for a deviation of 0: the drift is relative to the coefficient, which may be 0
-            precision[:, 0] = OVERLAP * variance / prior.level**2
-            precision[:, 1:] = (OVERLAP * variance / prior.drift**2)[:, None]
-        if prior.offset > 0.0:  # the last coefficient is the error of the sensor offset (`_Prior`)
-            precision[-1, 0], mean[-1, 0] = OVERLAP * variance / prior.offset**2, -prior.current_offset
-        # limited to a precision that is enough to fix a coefficient
-        prior_precision = np.minimum(precision.ravel(), 1e9 * np.diag(normal.gram))
-        prior_moment = prior_precision * mean.ravel()
+            precision = OVERLAP * variance / deviations**2
+        prior_precision = np.minimum(precision, 1e9 * np.diag(normal.gram))  # enough to fix a coefficient
+        prior_moment = prior_precision * prior_mean
         coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
         previous, variance = variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
         if abs(variance - previous) <= TOLERANCE * previous:
             break
-    row_variance = max(OVERLAP * variance, np.finfo(float).tiny)
-    return coefficients, prior_precision, prior_moment, row_variance
+    return coefficients, prior_precision, prior_moment, max(OVERLAP * variance, np.finfo(float).tiny)
 
 
 class _EquationFit(NamedTuple):
     """Fit of one equation to K blocks: sensor offset of p_A - p_B and nuisance coefficients.
 
     - `nuisance`: indices of the nuisance columns; `polynomials` (K, n): those of their drifts;
-    - `normal`: normal equations after subtracting `offset` (unit: see `_Prior`), relative to that already removed;
-    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the offset's error;
+    - `normal`: normal equations after subtracting `offset` [Pa], relative to that already removed. If an orifice is
+      tested, it is an error of the root of p_A - p_B [Pa^0.5];
+    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the error that remains of the
+      offset, which does not drift;
     - `prior_precision` (c,): prior precision times `variance`; `prior_moment` (c,): its product with the prior mean;
     - `variance`: variance of a row's residual, inflated for overlapping rows.
     """
@@ -610,27 +548,31 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `equation`: index of the equation; `test`: column of g, by default the leak's.
+    `test`: column of g, by default the leak's.
     """
     gram, test = blocks.gram[:, equation], roles.leak if test is None else test
     nuisance = [k for k in roles.nuisance if k != test]
-    polynomials, minutes = _drift_polynomials(blocks)
+    seconds = max(float(blocks.end[-1] - blocks.start[0]), 1e-9)
+    position = (blocks.time - blocks.start[0]) / seconds * 2.0 - 1.0  # -1 to 1, the range of Legendre polynomials
+    polynomials = np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0)  # of the drifts
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     level = roles.level_deviations(total)[nuisance]
     magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation, which `constants` may exceed
-    # standard deviations of the drifts over the recording; the last is 0, since the sensor offset does not drift
-    drift = np.append(magnitudes * roles.drift_rate[nuisance] * minutes, 0.0)
     offset_deviation = roles.offset_deviation(test, blocks)
-    # inf for the constant part of the offset: its prior standard deviation is `offset_deviation` instead
-    prior = _Prior(np.append(level, np.inf), drift, offset_deviation)
+    # prior standard deviations of constants and drifts, last of the offset: without a prior if it has no effect
+    deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
+    deviations[:-1, 0] = level
+    deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
+    deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
     for iteration in range(_MAX_OFFSET_STEPS + 1):
         shifted = _shift_offset(gram, roles, test, tested_coefficients, offset)
         normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
-        nuisance_fit = _fit_nuisance(normal, prior._replace(current_offset=offset), n_polynomials, n_rows)
+        prior_mean[-1, 0] = -offset  # of the remaining error
+        nuisance_fit = _fit_nuisance(normal, deviations.ravel(), prior_mean.ravel(), n_rows)
         fit = _EquationFit(nuisance, polynomials, normal, offset, *nuisance_fit)
         step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
         is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
@@ -649,8 +591,8 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure or its root times the
     sampling interval dt, from which `offset` [Pa] or [Pa^0.5] times dt is subtracted; `coefficients` (K,): coefficient
     g of this column in each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the
-    volume balance with respect to the offset. In a balance without a flow offset, whose column is dt, nothing is
-    corrected, and the last column is zero.
+    volume balance with respect to the offset. Without a flow offset, whose column is dt, nothing is corrected, and the
+    last column is zero.
     """
     size = gram.shape[1]
     transform = np.zeros((len(gram), size, size + 1))
@@ -676,8 +618,8 @@ def offset_cost(offset: Any) -> Any:
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 
-    Only a leak that changes between blocks reveals the offset. Otherwise the estimate stays near `blocks.zero`, the
-    offset already removed.
+    Only a leak that changes between blocks reveals it; otherwise it stays near `blocks.zero`, the offset already
+    removed.
     """
     offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
     return float(np.mean(blocks.zero)) + float(np.mean(offsets))
@@ -689,10 +631,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     The flow offset is the constant flow in the balance, in the column `roles.bias`. Returns
 
     - `precision` (2 K, 2 K) and `vector` (2 K,) as in `onset.Information`, for the K leaks and then the K flow offsets;
-    - the mean of p_A - p_B (K,) [Pa] in each block, 0 in blocks without a flow offset.
-
-    The flow offset of a block is its constant flow at this mean of p_A - p_B, not at p_A = p_B. The columns of leak and
-    offset are then orthogonal in each block.
+    - the mean of p_A - p_B (K,) [Pa] in each block, 0 in blocks without a flow offset. The flow offset of a block is
+      its constant flow at this mean, not at p_A = p_B, which makes the columns of leak and offset orthogonal.
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
@@ -700,10 +640,9 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     gram = blocks.gram[:, 0]
     bias_energy = gram[:, bias, bias]
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
-    # mean of p_A - p_B in each block: the leak's column is (p_A - p_B) dt, that of the flow offset is dt
+    # the leak's column is (p_A - p_B) dt, that of the flow offset is dt
     mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
     fit = _fit_equation(blocks, 0, roles)
-    # subtract this mean from p_A - p_B in the leak's column, which makes it orthogonal to that of the flow offset
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
@@ -721,8 +660,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
 def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1. Only the constant parts
-    of the coefficients count, without the drifts.
+    `weights`: weight of each coefficient, without its drift, by the index of its nuisance column; the sum is 1.
     """
     fit = _fit_equation(blocks, 0, roles)
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit
@@ -736,10 +674,7 @@ def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[
 
 
 def scale_grams(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:
-    """Divide the Gram matrices of K blocks by the residual variance of a row, for each of E equations.
-
-    The result has the shape (K, E, m, m); the m columns are the terms of the balance and, last, its left side.
-    """
+    """Divide the Gram matrices (K, E, m, m) of K blocks by the residual variance of a row in each of E equations."""
     variances = [_fit_equation(blocks, e, roles).variance for e, roles in enumerate(columns)]
     return np.asarray(blocks.gram / np.array(variances)[:, None, None])
 

@@ -7,8 +7,6 @@ chance:
 
     t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
 
-Five values that agree to a thousandth thus show that a sixth differs by a few thousandths; two show next to nothing.
-
 *With a prior on the scatter* (`compare_estimates`): each value y_i has an error e_i and varies about an unknown mean mu
 by the scatter s, y_i ~ N(mu, s^2 + (k e_i)^2). s^2 has a scaled inverse chi-square prior, with the weight of m
 recordings whose scatter is s_0. The errors may be too small or too large by a factor k, which is 1 or has a log-uniform
@@ -33,27 +31,24 @@ import numpy as np
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.inference import StepSize
+from sealscope.signals.smoothing import TINY
 
 #: Minimum number of healthy recordings for a scatter.
 MIN_HEALTHY = 3
 #: Number of grid points of the scatter.
 NODES = 64
-#: Ratio of the grid's largest scatter to the prior's scatter, and of the prior's scatter to the grid's smallest one.
-MAX_RATIO = 100.0
-#: Minimum ratio of the grid's largest scatter to the standard deviation of the healthy values.
-MAX_RATIO_TO_VALUES = 10.0
+#: Reach of the grid: ratio of its ends to the prior's scatter, and least ratio of its upper end to the values' scatter.
+MAX_RATIO, MAX_RATIO_TO_VALUES = 100.0, 10.0
 #: Number of grid points of the factor by which errors are too small or too large.
 INFLATIONS = 9
-#: Smallest positive number that is divided by.
-TINY = float(np.finfo(float).tiny)
 
 
 class PriorScatter(NamedTuple):
     """Prior on the scatter of a quantity between recordings of one machine.
 
     `deviation`: expected standard deviation of the quantity; `recordings`: number of recordings that would tell as much
-    about the scatter as this prior; `inflation`, `deflation`: largest common factors by which the errors may be too
-    small, and too large.
+    about the scatter; `inflation`, `deflation`: largest common factors by which the errors may be too small, and too
+    large.
     """
 
     deviation: float
@@ -93,8 +88,7 @@ def compare_with_healthy(
     count = len(healthy_values)
     freedom = count - 1
     change = value - float(healthy_values.mean())
-    scatter_variance = float(healthy_values.var() * count) / freedom  # unbiased estimate, s^2
-    variance = (scatter_variance + error**2) * (1.0 + 1.0 / count)
+    variance = (float(healthy_values.var(ddof=1)) + error**2) * (1.0 + 1.0 / count)
     t = change / max(float(np.sqrt(variance)), TINY)
     chance = float(stdtr(freedom, -t if above else -abs(t))) * (1.0 if above else 2.0)
     score = t * t if t > 0.0 or not above else 0.0
@@ -139,8 +133,7 @@ def compare_estimates(
     max_ratio = max(MAX_RATIO, MAX_RATIO_TO_VALUES * float(values.std()) / prior.deviation)
     # grids of the scatter over its prior deviation, and of the factor by which the errors are too small or too large
     ratios = np.exp(np.linspace(-np.log(MAX_RATIO), np.log(max_ratio), NODES))
-    is_exact = prior.inflation == prior.deflation == 1.0
-    inflations = np.ones(1) if is_exact else np.geomspace(1.0 / prior.deflation, prior.inflation, INFLATIONS)
+    inflations = np.geomspace(1.0 / prior.deflation, prior.inflation, INFLATIONS)
     ratios, inflations = (grid.ravel() for grid in np.meshgrid(ratios, inflations))
     scatter = prior.deviation * ratios  # scatter s at each point of the joint grid
     weights = 1.0 / (scatter[:, None] ** 2 + (inflations[:, None] * errors) ** 2)  # (grid points, n)
@@ -164,8 +157,8 @@ def compare_estimates(
 def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
     """Compute the part of a value's standard error `error` that must be added to the scatter of healthy values.
 
-    The scatter already contains an error as large as the median of `healthy_errors`. The result is sqrt(`error`^2 -
-    median^2), or 0 if `error` is below the median. Without healthy values it is `error`.
+    The scatter already contains an error as large as the median of `healthy_errors`: the result is sqrt(`error`^2 -
+    median^2), at least 0.
     """
     if not healthy_errors:
         return error

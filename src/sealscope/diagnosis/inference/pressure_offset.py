@@ -1,12 +1,12 @@
 """Sensor offset (constant error) of the recorded p_A - p_B, estimated from a change of the leakage and removed.
 
-With a sensor offset z, the flow of a leak with the coefficient g is g (d - z), where d is the recorded difference
-p_A - p_B. A change of g then also changes the constant flow, by -g z. A small z is a term of every fit (`blocks`). Here
-z is estimated even if it is larger than the pressure difference itself. In block k the Gram matrix determines two
-values: g_k, from the dependence of the flow on d within the block, and the flow o_k at the block's mean difference d_k.
-The leak's coefficient has a slow change F a (level and slope), a random walk w, and a step delta whose shape s is 0
-before the onset and 1 after it. The constant flow has a slow change B b (level, slope and curvature). With the variance
-kappa of the noise and q kappa of the walk in a block,
+With a sensor offset z, the flow of a leak with the coefficient g is g (d - z), where d is the recorded difference p_A -
+p_B. A change of g then also changes the constant flow (the flow offset of the balance), by -g z. A small z is a term of
+every fit (`blocks`). Here z is estimated even if it is larger than the pressure difference itself. In block k the Gram
+matrix determines two values: g_k, from the dependence of the flow on d within the block, and the flow o_k at the
+block's mean difference d_k. The leak's coefficient has a slow change F a (level and slope), a random walk w, and a step
+delta whose shape s is 0 before the onset and 1 after it. The constant flow has a slow change B b (level, slope and
+curvature). With the variance kappa of the noise and q kappa of the walk in a block,
 
     g_k = F_k a + w_k + delta s_k,    o_k = (d_k - z) g_k + B_k b,    cov(w_k, w_l) = kappa q min(k, l);
 
@@ -40,9 +40,8 @@ N_GRID = 21
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
     """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
 
-    The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa], the offset removed so
-    far. The blocks are returned unchanged if too few of them determine the leak, or if an equation has no column for a
-    constant flow. `columns`: roles of the columns of each equation.
+    The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa]. The blocks are returned
+    unchanged if too few of them determine the leak, or if an equation has no column for a constant flow.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
         return blocks
@@ -94,15 +93,12 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
 
     def cost(position: float) -> float:
-        """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant.
-
-        In the prior, a relative offset of 1 is `usual` [Pa], also for pressures in counts.
-        """
+        """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant."""
+        # in the prior, a relative offset of 1 is `usual` [Pa], also for pressures in counts
         return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - log_likelihood(position)
 
     positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
-    # indices of the positions to search about: offset 0, where the prior has its maximum, and the maximum of the
-    # likelihood, since a far offset may have a high likelihood and a low prior
+    # search about offset 0, where the prior has its maximum, and about the maximum of the likelihood
     starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
     minima = []
     for start in starts:
@@ -150,14 +146,10 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Arr
 def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
     """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the leak's random walk.
 
-    The model of the residuals is that of `_find_relative_offset`:
-
-        residuals = size S[:, k] + noise,    cov noise = kappa (I + q S S').
-
-    For each q the likelihood is maximised over the block k in which the leak begins, its size and the variance kappa.
-    Only sizes > 0 count, as a leak does not heal. `steps` (n, K): matrix S, whose column k is the change of the
-    residuals if the leak's coefficient rises by 1 from block k on. `walks` (w,): variances q relative to the one for
-    which walk and noise have the same mean variance over the residuals.
+    The model is that of `_find_relative_offset`. For each q the likelihood is maximised over the block k in which the
+    leak begins, its size and the variance kappa. Only sizes > 0 count, as a leak does not heal. `steps` (n, K): matrix
+    S; `walks` (w,): variances q relative to the one for which walk and noise have the same mean variance over the
+    residuals.
     """
     # I + q S S' is diagonal in the basis of S times the eigenvectors of S' S
     eigen, basis = np.linalg.eigh(steps.T @ steps)

@@ -36,20 +36,20 @@ from sealscope.recordings.recording import Array
 
 #: Fraction of the sum of squares of p_A - p_B below which a state of the machine does not occur, but for rounding.
 NEGLIGIBLE = 1e-6
-#: Least number of blocks with motion, and without, from which the leakage of either state is estimated by itself.
+#: Least number of blocks with motion, and without, for an estimate of the leakage of either state.
 MIN_STATE_BLOCKS = 2
 
 
 def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
     """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
 
-    `roles`: roles of the columns of `blocks`, among them the columns `STATES` that `balances.with_rests` adds.
+    `roles` includes the columns `STATES` that `balances.with_rests` adds.
 
     - Open valves: the columns `STATES` are dropped from the Gram matrices.
     - Shut valves: the column of the flow offset in motion (`MOVING_BIAS`) replaces that of the flow offset at all times
-      (`BIAS`), as in `balances.shut_at_rest`. The column `HOLDING`, the leakage of a pump that turns only to hold the
-      load, remains if some hold lasts for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set
-      to zero, and the leak's coefficient describes the holds as well.
+      (`BIAS`). The column `HOLDING`, the leakage of a pump that turns only to hold the load, remains if some hold lasts
+      for seconds (`has_holds`) and the pump is off at other times. Otherwise it is set to zero, and the leak's
+      coefficient describes the holds as well.
 
     If all holds are short and the pump is off at other times, the machine is a press, whose pump builds up the pressure
     through open valves in these holds. If its valves are certainly shut at rest (`is_certain`), holds count as motion:
@@ -88,15 +88,12 @@ def add_pump_columns(gram: Array, names: Sequence[str]) -> Array:
 
 
 def has_rests(blocks: Blocks, roles: ColumnRoles) -> bool:
-    """Return True if pump or piston rest under pressure at times.
-
-    The columns (`roles`) must include those of `balances.with_rests`.
-    """
+    """Return True if pump or piston rest under pressure at times; `roles` include those of `balances.with_rests`."""
     return _rest_share(blocks, roles, TURNING) > NEGLIGIBLE
 
 
 def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
-    """Compute the fraction of the sum of squares of p_A - p_B that falls outside the given states of the machine.
+    """Compute the fraction of the sum of squares of p_A - p_B outside the given states of the machine.
 
     `states`: names of columns that equal p_A - p_B in one state and 0 otherwise, such as `TURNING` (pump in motion).
     """
@@ -108,11 +105,11 @@ def _rest_share(blocks: Blocks, roles: ColumnRoles, *states: str) -> float:
 def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     """Compute the log odds that valves cut the pump off from the cylinder while the pump rests (`rest_log_odds`).
 
-    `roles`: roles of the columns of `blocks`, among them those of `balances.with_rests`. All coefficients are estimated
-    from blocks with motion; then leakage and flow offset at rest are estimated from the other blocks, given all other
-    coefficients. A single regression could make both leakage and compliance zero at rest, since the rate at which the
-    pressures relax shows only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the
-    other columns Z and their coefficients b in motion, the leakage r at rest is the first of
+    `roles` includes the columns of `balances.with_rests`. All coefficients are estimated from blocks with motion; then
+    leakage and flow offset at rest are estimated from the other blocks, given all other coefficients. A single
+    regression could make both leakage and compliance zero at rest, since the rate at which the pressures relax shows
+    only their ratio. With the columns X of leakage and flow offset at rest, the left side y, the other columns Z and
+    their coefficients b in motion, the leakage r at rest is the first of
 
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
@@ -160,11 +157,11 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
 
     With the leakage r = `rest` at rest, the leakage g = `motion` in motion, and the normal density N(x; variance),
 
-        log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2).
+        log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2),
 
-    `rest_variance` and `difference_variance` are the variances of the errors of r and of r - g. s and w are the prior
-    scatters of r relative to g (`rest.shut` and `rest.open` of `priors.toml`). All leakages are conductances
-    [m^3/(s Pa)], or all are flows [m^3/s]. The result is limited to +-`rest.most`.
+    limited to +-`rest.most` (`priors.toml`). The variances are those of the errors of r and of r - g; s and w are the
+    prior scatters of r relative to g (`rest.shut` and `rest.open`). All leakages are conductances [m^3/(s Pa)], or all
+    are flows [m^3/s].
     """
     prior = INFERENCE.rest
     if_shut = normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)

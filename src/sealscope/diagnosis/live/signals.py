@@ -12,27 +12,21 @@ import numpy as np
 
 from sealscope.diagnosis.inference.changes.features import (
     SENSOR_FEATURES,
-    amplitude_step_tests,
-    feature_step_test,
+    duty_observables,
     is_in_motion,
     log_amplitudes,
     sensor_features,
+    sensor_observables,
     time_in_motion,
 )
 from sealscope.diagnosis.inference.changes.levels import (
-    LevelChange,
     fit_pressure_levels,
     motion_columns,
     pattern_tests,
     pressure_level_rows,
     top_speed,
 )
-from sealscope.diagnosis.inference.changes.signals import (
-    duty_observables,
-    level_observables,
-    run_tests,
-    sensor_observables,
-)
+from sealscope.diagnosis.inference.changes.signals import run_tests
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.live import LIVE
@@ -103,14 +97,13 @@ class SignalWindow(SavedAttributes):
         moving_time, columns = time[is_moving], zip(FEATURES, rows[is_moving, _FEATURES].T, strict=True)
         features = {name: values for name, values in columns if np.isfinite(values).any()}
         duty = {name: features.pop(name) for name in DUTY if name in features}
-        sensors = ((name, feature_step_test(moving_time, values)) for name, values in features.items())
         return run_tests(  # if numbers overflow in one test, the other tests still run
-            lambda: duty_observables(amplitude_step_tests(moving_time, duty)),
-            lambda: sensor_observables((name, test) for name, test in sensors if test is not None),
-            lambda: level_observables(self._test_levels(rows, time)),
+            lambda: duty_observables(moving_time, duty),
+            lambda: sensor_observables(moving_time, features),
+            lambda: self._test_levels(rows, time),
         )
 
-    def _test_levels(self, rows: Array, time: Array) -> tuple[LevelChange, ...]:
+    def _test_levels(self, rows: Array, time: Array) -> tuple[Observable, ...]:
         """Test the mean pressures in each direction of motion for steps.
 
         `rows` are the stored features of n blocks, and `time` (n,) their centres [s]. The blocks are averaged in groups

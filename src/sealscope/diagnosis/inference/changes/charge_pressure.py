@@ -39,7 +39,7 @@ from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.smoothing import average_over
+from sealscope.signals.smoothing import TINY, average_over
 from sealscope.units import P_ATM
 
 #: `Observable.data` of all drifts, and names of a fall of both low pressures and of a drift of one low pressure.
@@ -58,44 +58,23 @@ ABOVE = 0.1
 WEIGHT_SCALE, MIN_SCALE = 2.0, 300.0
 #: Number of gas volumes of the accumulator over which a likelihood is averaged.
 N_VOLUMES = 25
-#: Smallest number that is divided by.
-TINY = 1e-300
-
-
-class LowDrifts(NamedTuple):
-    """Drifts of p_A and p_B near the charge pressure, with standard errors [Pa/s]; NaN for a chamber rarely near it."""
-
-    low_A: float
-    low_A_error: float
-    low_B: float
-    low_B_error: float
-
-    def estimate(self, side: str) -> Estimate | None:
-        """Return the drift [Pa/s] of the low pressure of chamber `side`, "A" or "B"; None if it is unknown."""
-        drift = Estimate(*(self[:2] if side == "A" else self[2:]))
-        return drift if np.isfinite(drift).all() else None
-
-    @property
-    def known_drifts(self) -> dict[str, Estimate]:
-        """Known drifts [Pa/s] by chamber, "A" and "B"."""
-        return {side: drift for side in "AB" if (drift := self.estimate(side)) is not None}
 
 
 @np.errstate(all="ignore")
-def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
-    """Estimate the drifts [Pa/s] of the lowest pressures of both chambers.
+def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
+    """Estimate the drifts [Pa/s] of the lowest pressures of the chambers, by their names "A" and "B".
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
     `charge.near` (`priors.toml`) of the chamber's lowest pressure, its quantile `LOWEST`, and change more slowly than
     `charge.steady` [Pa/s]: a load that swings through zero lowers the pressure only for a moment. While the pump rests
-    no sample counts, as shut valves may enclose any pressure. The drift of a chamber is unknown if its lowest pressure
-    exceeds that of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples
-    of a turning pump counts. Return None if neither drift is known, if the recording is shorter than `MIN_SAMPLES`, or
-    if a pressure, or both angle and speed of the pump, are not recorded.
+    no sample counts, as shut valves may enclose any pressure. A chamber is left out if its lowest pressure exceeds that
+    of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples of a turning
+    pump counts. The result is empty for a recording shorter than `MIN_SAMPLES`, and if a pressure, or both angle and
+    speed of the pump, are not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
-        return None
+        return {}
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
     drive, rate = recording[flow_channel], recording.rate
     turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate  # [rad] in each interval
@@ -104,25 +83,17 @@ def estimate_low_drifts(recording: Recording) -> LowDrifts | None:
     is_known = np.isfinite(regressors).all(axis=1) & is_turning
     pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]
-    drifts = list[float]()
-    for p, low in zip(pressures, lowest, strict=True):
-        is_steady = np.abs(_rate_of_change(p, rate)) < prior.steady
-        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & is_steady
-        is_at_charge = low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum()  # else drift NaN
-        drifts += _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low & is_at_charge))
-    return LowDrifts(*drifts) if np.isfinite(drifts).any() else None
-
-
-def _rate_of_change(pressure: Array, rate: float) -> Array:
-    """Compute the rate of change [Pa/s] of a pressure (n,) that is averaged over `charge.seconds`; NaN near its ends.
-
-    At each sample it is the difference of the values `charge.seconds` later and earlier, over the time between them.
-    """
-    window = max(1, round(CHANGES.charge.seconds * rate))
-    slope = np.full(len(pressure), np.nan)
-    if len(pressure) > 2 * window:
-        slope[window:-window] = (pressure[2 * window :] - pressure[: -2 * window]) * rate / (2 * window)
-    return slope
+    window = max(1, round(prior.seconds * rate))
+    drifts = dict[str, Estimate]()
+    for side, p, low in zip("AB", pressures, lowest, strict=True):
+        slope = np.full(len(p), np.nan)  # over twice `charge.seconds`
+        slope[window:-window] = (p[2 * window :] - p[: -2 * window]) * rate / (2 * window)
+        is_low = is_known & np.isfinite(p) & (p < low + prior.near) & (np.abs(slope) < prior.steady)
+        if low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum():
+            drift = _fit_drift(recording.t, p, regressors, np.flatnonzero(is_low))
+            if drift is not None:
+                drifts[side] = drift
+    return drifts
 
 
 class ChargeTrend(NamedTuple):
@@ -167,13 +138,11 @@ class ChargeTrend(NamedTuple):
 def estimate_charge_trend(recording: Recording) -> ChargeTrend | None:
     """Estimate the rate [Pa/s] at which the charge pressure of a closed circuit falls, from both low pressures.
 
-    The rate is minus the mean of the drifts of both pressures (`estimate_low_drifts`), weighted by their precisions.
-    Return None where `estimate_low_drifts` does, or if no drift has a finite standard error.
+    It is minus the mean of both drifts (`estimate_low_drifts`), weighted by their precisions. Return None if no drift
+    is known.
     """
     drifts = estimate_low_drifts(recording)
-    if drifts is None:
-        return None
-    fall = _mean_fall(drifts, {side: max(drift.deviation**2, TINY) for side, drift in drifts.known_drifts.items()})
+    fall = _mean_fall(drifts, {side: max(drift.deviation**2, TINY) for side, drift in drifts.items()})
     if fall is None:
         return None
     lowest = min(float(np.nanquantile(recording[name], LOWEST)) for name in ("p_A", "p_B"))
@@ -198,17 +167,18 @@ def _regressors(recording: Recording, flow_channel: str) -> Array:
     return np.column_stack(columns)
 
 
-def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> tuple[float, float]:
+def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.intp]) -> Estimate | None:
     """Estimate the drift [Pa/s] of the lower envelope of a pressure (n,) [Pa] at times `t` [s], and its standard error.
 
     The envelope is a robust fit in which samples above it count less than those below. `regressors` (n, k): pump flow
     and position, which are fitted together with the drift; `rows`: indices of the samples to fit, which are thinned out
-    if they are many. Both results are NaN for fewer than `MIN_SAMPLES` samples, and for a drift larger than samples can
-    have that lie within `charge.near` of their lowest pressure: few visits to the charge pressure do not determine it.
+    if they are many. Return None for fewer than `MIN_SAMPLES` samples, without a finite standard error, and for a drift
+    larger than samples can have that lie within `charge.near` of their lowest pressure: few visits to the charge
+    pressure do not determine it.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:
-        return np.nan, np.nan
+        return None
     time, values = t[rows] - t[rows].mean(), pressure[rows]
     varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]  # a constant one cannot be told from level
     design = np.column_stack([time, np.ones(len(rows)), varying])
@@ -226,10 +196,9 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     slope = 0  # index of the column of the time, whose coefficient is the drift
     parts = equal_parts(len(rows))
     (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
-    error = np.hypot(jackknife_error, _envelope_error(time, residual))
-    drift = float(coefficients[slope])
-    is_determined = abs(drift) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.near
-    return (drift, float(error)) if is_determined else (np.nan, np.nan)
+    drift = Estimate(float(coefficients[slope]), float(np.hypot(jackknife_error, _envelope_error(time, residual))))
+    is_determined = abs(drift.value) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.near
+    return drift if is_determined and np.isfinite(drift).all() else None
 
 
 def _envelope_error(time: Array, residual: Array) -> float:
@@ -241,18 +210,20 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
-    parts = [part for part in np.array_split(np.arange(len(residual)), GROUPS) if part.size]
+    parts = np.array_split(np.arange(len(residual)), GROUPS)
     levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
     times = np.array([time[part].mean() for part in parts])
     return float(levels.std() / np.sqrt(len(parts) - 2) / max(float(times.std()), TINY))
 
 
-def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Iterator[Observable]:
-    """Compare the drifts of the lowest readings of p_A and p_B with those of healthy recordings.
+def compare_low_drifts(
+    judged: Mapping[str, Estimate], healthy: Sequence[Mapping[str, Estimate]]
+) -> Iterator[Observable]:
+    """Compare the drifts of the lowest readings (`estimate_low_drifts`) with those of healthy recordings.
 
     Yields a test for each of three explanations, if enough healthy recordings have the drift: the sensor of p_A drifts,
     the sensor of p_B drifts, or the charge pressure falls, which lowers both pressures alike. The `advantage` of each
-    comes from a prior on its size. A fall does not explain a difference between the two drifts; if both are known, its
+    comes from a prior on its size. A fall does not explain a difference between the two drifts: if both are known, its
     p-value is
 
         chance = min(1, chance of the weighted mean of both drifts / chance of their difference),
@@ -261,11 +232,8 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     """
     prior = CHANGES.charge
     scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
-    known = {
-        side: [other.known_drifts[side] for other in healthy if side in other.known_drifts]
-        for side in judged.known_drifts
-    }
-    drifts = {side: drift for side, drift in judged.known_drifts.items() if len(known[side]) >= MIN_HEALTHY}
+    known = {side: [other[side] for other in healthy if side in other] for side in judged}
+    drifts = {side: drift for side, drift in judged.items() if len(known[side]) >= MIN_HEALTHY}
     if not drifts:
         return
     for side, drift in drifts.items():
@@ -282,20 +250,20 @@ def compare_low_drifts(judged: LowDrifts, healthy: Sequence[LowDrifts]) -> Itera
     if fall is None:
         return
     if len(drifts) > 1:
-        differences = [_drift_difference(other) for other in healthy if np.isfinite(other).all()]
-        difference = compare_estimates(FALL, DRIFT, _drift_difference(judged), differences, scatter)
+        differences = [subtract_drifts(other) for other in healthy if len(other) > 1]
+        difference = compare_estimates(FALL, DRIFT, subtract_drifts(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
     yield replace(fall, advantage=-size_penalty(CHANGES.charge_fall, fall.size))
 
 
-def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | None:
+def _mean_fall(drifts: Mapping[str, Estimate], variances: Mapping[str, float]) -> Estimate | None:
     """Compute the rate at which the charge pressure falls [Pa/s], as a mean of both chambers, with its standard error.
 
     The rate is -sum(drift / variance) / sum(1 / variance) over chambers with a known drift and variance [Pa^2/s^2].
     Return None if there is no such chamber.
     """
-    known = [(drift, 1.0 / variances[side]) for side, drift in drifts.known_drifts.items() if side in variances]
+    known = [(drift, 1.0 / variances[side]) for side, drift in drifts.items() if side in variances]
     if not known:
         return None
     total_weight = sum(weight for _, weight in known)
@@ -304,7 +272,7 @@ def _mean_fall(drifts: LowDrifts, variances: Mapping[str, float]) -> Estimate | 
     return Estimate(-mean, error)
 
 
-def _drift_difference(drifts: LowDrifts) -> Estimate:
-    """Compute the drift of p_A minus that of p_B [Pa/s] with its standard error; NaN if one is unknown."""
-    error = float(np.hypot(drifts.low_A_error, drifts.low_B_error))
-    return Estimate(drifts.low_A - drifts.low_B, error)
+def subtract_drifts(drifts: Mapping[str, Estimate]) -> Estimate:
+    """Compute the drift of p_A minus that of p_B, with its standard error."""
+    (drift_A, error_A), (drift_B, error_B) = drifts["A"], drifts["B"]
+    return Estimate(drift_A - drift_B, float(np.hypot(error_A, error_B)))

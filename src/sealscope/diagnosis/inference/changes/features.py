@@ -4,7 +4,7 @@ Each feature is one number in each block with motion, tested against its scatter
 pump's ripple, a held load or a drive that is off, cannot be compared with blocks in motion. A leak is not taken for
 such a step:
 
-- It changes the amplitude of the command or of the motion, not of both (`signals.duty_observables`).
+- It changes the amplitude of the command or of the motion, not of both (`duty_observables`).
 - It damps the ringing, but the noise is measured at higher frequencies.
 - The hum is measured in p_A + p_B, which does not ring.
 - With a leak, too, friction keeps p_A - p_B in phase with the flow.
@@ -19,9 +19,10 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.levels import motion_columns, top_speed
+from sealscope.diagnosis.inference.changes.levels import MOTIONS, motion_columns, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
@@ -29,19 +30,19 @@ from sealscope.signals.smoothing import TINY, average_over
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
-#: Channels of the command and of the motion, in the order of preference; a single channel stands for both.
-COMMANDS, MOTIONS = ("u", "omega", "theta"), ("x", "theta", "omega", "u")
+#: Channels of the command, in the order of preference; a single channel stands for command and motion.
+COMMANDS = ("u", "omega", "theta")
+#: Minimum ratio of the smaller to the larger of two steps: half way, as an angle, between a single step and equal ones.
+_MIN_STEP_RATIO = math.tan(math.pi / 8.0)
 #: Distances [bins] from a spectral line to bins outside of its main lobe with a Hann window.
 _NEIGHBOURS = _PRIORS.neighbours
 
 
-def duty_tests(recording: Recording) -> list[StepTest]:
-    """Test the amplitudes of command and motion for a step, a sudden lasting change (`amplitude_step_tests`).
+def observe_duty(recording: Recording) -> Iterator[Observable]:
+    """Test the amplitudes of command and motion for a sudden lasting change (`duty_observables`).
 
-    Returns a test for each amplitude; an empty list if one cannot be tested, as with too few blocks in motion. A change
-    of what the machine is commanded to do (its duty) changes both amplitudes alike; a leak changes only one. The
-    recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks of
-    whole cycles.
+    The recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks
+    of whole cycles.
     """
     length, cycle = len(recording) // BLOCKS, find_cycle(recording)
     if "x" in recording and cycle is not None:
@@ -49,40 +50,27 @@ def duty_tests(recording: Recording) -> list[StepTest]:
         # cycle, and would look like another duty in blocks of whole cycles.
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
-    time, blocks = _split_blocks(recording, length)
-    is_moving = _find_moving_blocks(recording, length)
+    time, blocks, is_moving = _split_blocks(recording, length)
     amplitudes = {name: values[is_moving] for name, values in log_amplitudes(blocks)}
-    return amplitude_step_tests(time[is_moving], amplitudes)
+    return duty_observables(time[is_moving], amplitudes)
 
 
 def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
     """Compute the fraction of each block's samples in which the piston moves, (K,).
 
     `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz], in any unit, NaN where missing. The speed,
-    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`; a time
-    without any known speed counts as rest.
+    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`.
     """
     mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
     return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
 
 
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in which the piston moves for long enough.
+    """Flag the blocks (K,) in motion for at least the fraction `features.busy` (`priors.toml`) of the busiest's time.
 
-    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`). It must be at least
-    `features.busy` (`priors.toml`) times that of the busiest block.
+    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`).
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
-
-
-def _find_moving_blocks(recording: Recording, length: int) -> NDArray[np.bool_]:
-    """Flag the K blocks of `length` samples in which the piston moves, (K,); all blocks if no motion is recorded."""
-    count = len(recording) // length
-    motion = motion_columns(recording.channels, recording.rate)
-    if motion is None:
-        return np.ones(count, dtype=bool)
-    speeds = motion[: count * length, 0].reshape(count, length)  # the first column is the speed
-    return is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
@@ -90,7 +78,7 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 
     The amplitude is the range from the 10 % to the 90 % quantile, which neither a short transient nor a short rest
     changes much. Its log is NaN for a block without samples, and -inf for constant samples. `blocks`: samples (K,
-    length) by channel. "command" or "motion" is left out if none of its channels is recorded.
+    length) by channel. A name is left out if none of its channels is recorded.
     """
     for name, candidates in (("command", COMMANDS), ("motion", MOTIONS)):
         if channel := next((candidate for candidate in candidates if candidate in blocks), None):
@@ -101,48 +89,79 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
             yield name, np.log(high - low)
 
 
-def amplitude_step_tests(time: Array, amplitudes: Mapping[str, Array]) -> list[StepTest]:
-    """Test the log amplitudes (K,) of command and motion in K blocks for a step; one test for each.
+def duty_observables(time: Array, amplitudes: Mapping[str, Array]) -> Iterator[Observable]:
+    """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `time` (K,): middles of the blocks [s]. The list is empty if one of the amplitudes cannot be tested
-    (`feature_step_test`).
+    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) of command and motion
+    (`log_amplitudes`). Both must rise, or both fall, by similar amounts (`_MIN_STEP_RATIO`), since a leak changes only
+    one amplitude. Score, onset and size are those of the test with the lower score. The p-value is twice the higher
+    one, since a step may be up or down. Nothing is yielded if an amplitude cannot be tested.
     """
-    tests = [feature_step_test(time, values) for values in amplitudes.values()]
-    possible_tests = [test for test in tests if test is not None]
-    return possible_tests if len(possible_tests) == len(tests) else []
+    tests = [test for values in amplitudes.values() if (test := feature_step_test(time, values)) is not None]
+    if len(tests) < len(amplitudes):
+        return
+    steps = np.abs([test.fitted.value for test in tests])
+    has_one_sign = len({test.sign for test in tests}) == 1
+    if has_one_sign and steps.min() > _MIN_STEP_RATIO * steps.max():
+        weakest = min(tests, key=lambda test: test.score)
+        least_certain = max(tests, key=lambda test: test.chance)
+        yield Observable(
+            name="size of the duty",
+            data="duty",
+            score=weakest.score,
+            chance=min(1.0, 2.0 * least_certain.chance),
+            onset=weakest.onset(),
+            size=weakest.sign * weakest.fitted.value,
+        )
 
 
-def sensor_tests(recording: Recording) -> list[tuple[str, StepTest]]:
+def observe_sensors(recording: Recording) -> Iterator[Observable]:
     """Test features of the pressures, such as their noise, for a lasting change that no leak causes.
 
-    Returns pairs of a feature's name and its test, without features that cannot be tested. The list is empty if a
-    chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
+    Yields nothing if a chamber pressure is not recorded, or if p_A has no samples in one of the blocks.
     """
     if not {"p_A", "p_B"} <= recording.channels.keys():
-        return []
-    length = len(recording) // BLOCKS
-    time, blocks = _split_blocks(recording, length)
+        return
+    time, blocks, is_moving = _split_blocks(recording, len(recording) // BLOCKS)
     if np.isnan(blocks["p_A"]).all(axis=1).any():  # a block without samples, in which no channel has any
-        return []
-    is_moving = _find_moving_blocks(recording, length)
-    tests = (
-        (name, feature_step_test(time[is_moving], values[is_moving]))
-        for name, values in sensor_features(blocks, recording.rate)
-    )
-    return [(name, test) for name, test in tests if test is not None]
+        return
+    features = {name: values[is_moving] for name, values in sensor_features(blocks, recording.rate)}
+    yield from sensor_observables(time[is_moving], features)
 
 
-def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array]]:
-    """Split the channels of a recording into K blocks of `length` samples, without samples after the last whole block.
+def sensor_observables(time: Array, features: Mapping[str, Array]) -> Iterator[Observable]:
+    """Test the values (K,) of each feature of the pressures (`sensor_features`) for a step between K blocks.
 
-    Returns the middles of the blocks (K,) [s], and the samples (K, length) by channel name, NaN where missing.
+    `time` (K,): middles of the blocks [s]. The p-value is doubled, as each test is the better of two, for a step up and
+    a step down. Features that cannot be tested are left out.
+    """
+    for name, values in features.items():
+        test = feature_step_test(time, values)
+        if test is None:
+            continue
+        scale = None
+        if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
+            scale = Estimate(0.25 * test.sign * test.fitted.value, 0.25 * test.fitted.deviation)
+        yield Observable.from_test(name, name.split()[0], test, n_tests=2.0, pressure_scale=scale)
+
+
+def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, Array], NDArray[np.bool_]]:
+    """Split the channels of a recording into K whole blocks of `length` samples.
+
+    Returns the middles of the blocks (K,) [s], the samples (K, length) by channel name, NaN where missing, and flags
+    (K,) of the blocks in which the piston moves, all if no motion is recorded.
     """
     count = len(recording) // length
     blocks = {name: values[: count * length].reshape(count, length) for name, values in recording.channels.items()}
     if recording.bridged is not None:
         missing = recording.bridged[: count * length].reshape(count, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
-    return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks
+    motion = motion_columns(recording.channels, recording.rate)
+    is_moving = np.ones(count, dtype=bool)
+    if motion is not None:
+        speeds = motion[: count * length, 0].reshape(count, length)
+        is_moving = is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
+    return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks, is_moving
 
 
 #: Name of the noise of both pressures together.
@@ -157,15 +176,13 @@ SENSOR_FEATURES = (
 
 
 def sensor_features(blocks: Mapping[str, Array], rate: float) -> Iterator[tuple[str, Array]]:
-    """Yield the name and the values (K,) of each feature of the pressures: sense, noise and hum, which no leak shifts.
+    """Yield the name and the values (K,) of each feature of the pressures, which no leak shifts (`SENSOR_FEATURES`).
 
-    The features (`SENSOR_FEATURES`) are the sense of p_A - p_B, the noise of both pressures, the difference of their
-    noise, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
-    into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. A change of a sensor
-    shifts the features, and a load that changes its side shifts the sense. The sense is left out if no motion is
-    recorded, and a hum if the sampling rate is too low. Noise is a log variance. The first word of a name is its kind
-    of data (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate
-    [Hz].
+    The features are the sense of p_A - p_B, the log variance of the noise of both pressures, its difference between
+    them, and the hum at the frequencies of the mains. With d, p_A - p_B minus its mean over all blocks, and the flow q
+    into A, up to a factor, the sense is <d q> / sqrt(<d^2> <q^2>), with the mean <> over a block. The sense is left out
+    if no motion is recorded, and a hum if the sampling rate is too low. The first word of a name is its kind of data
+    (`Observable.data`). `blocks`: samples (K, length) by channel, NaN where missing; `rate`: sampling rate [Hz].
     """
     p_A, p_B = blocks["p_A"], blocks["p_B"]
     if channel := next((name for name in ("omega", "u", "theta", "x") if name in blocks), None):
@@ -210,8 +227,8 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:
     """Compute a statistic of the known values of each row (K, n); NaN for a row without known values.
 
-    `statistic`: function for rows without missing values, such as `np.median`; `without_missing`: the ten times slower
-    function that skips missing values, such as `np.nanmedian`, for the other rows.
+    `statistic`: function for complete rows, such as `np.median`; `without_missing`: the ten times slower function that
+    skips missing values, such as `np.nanmedian`.
     """
     results = np.full(len(values), np.nan)
     is_known = np.isfinite(values)
@@ -225,8 +242,8 @@ def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..
 def feature_step_test(time: Array, values: Array) -> StepTest | None:
     """Test the values (K,) of a feature in K blocks for a step up or down, against their scatter between blocks.
 
-    `time` (K,): middles of the blocks [s]. Return None if the values are constant or fewer than `MIN_BLOCKS`, or if one
-    of them is not finite.
+    `time` (K,): middles of the blocks [s]. Return None if the values are constant, not finite or fewer than
+    `MIN_BLOCKS`.
     """
     if len(values) < MIN_BLOCKS or not np.isfinite(values).all() or not np.ptp(values) > 0.0:
         return None

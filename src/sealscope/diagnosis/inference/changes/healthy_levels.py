@@ -13,7 +13,7 @@ chamber pressures.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -21,17 +21,14 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
-    LowDrifts,
     compare_low_drifts,
     estimate_low_drifts,
+    subtract_drifts,
 )
 from sealscope.diagnosis.inference.changes.motion_fit import (
     TIME,
-    Motion,
     fit_difference,
     fit_robustly,
-    influence_factor,
-    jackknife_errors,
     select_motion,
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
@@ -40,15 +37,15 @@ from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter,
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Recording, compute_once
+from sealscope.signals.smoothing import TINY
 
-#: Smallest number that is divided by.
-TINY = 1e-300
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
 FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
-#: Keys of the drifts of p_A and p_B in motion, and of their standard errors.
-DRIFT_KEYS = ("drift_A", "drift_A_error", "drift_B", "drift_B_error")
+#: Kinds of drifts of p_A and p_B in a recording's summary: in motion, and of the lowest readings.
+MOTION, LOW = "drift", "low"
+#: Keys of the drifts, and of their standard errors.
+DRIFT_KEYS = tuple(f"{kind}_{side}{suffix}" for kind in (MOTION, LOW) for side in "AB" for suffix in ("", "_error"))
 #: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_log_frictions`).
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
@@ -65,7 +62,7 @@ class HealthyLevels:
         """Summarise a recording by friction, drifts and spectra; None if nothing can be estimated.
 
         The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
-        channels) to spectra: an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
+        channels) to an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
         """
         return compute_once(recording, ("healthy levels",), _estimate_levels)
 
@@ -79,9 +76,7 @@ class HealthyLevels:
         if judged is None:
             return
         healthy = healthy_summaries(self, baseline)
-        if (low_drifts := _read_low_drifts(judged)) is not None:
-            healthy_drifts = [drifts for summary in healthy if (drifts := _read_low_drifts(summary)) is not None]
-            yield from compare_low_drifts(low_drifts, healthy_drifts)
+        yield from compare_low_drifts(_read_drifts(judged, LOW), [_read_drifts(summary, LOW) for summary in healthy])
         healthy_spectra = [_read_octaves(summary) for summary in healthy]
         if (spectra := compare_spectra(_read_octaves(judged), healthy_spectra)) is not None:
             yield spectra
@@ -95,29 +90,29 @@ def _read_octaves(summary: Summary) -> dict[str, Octaves]:
     return {name: Octaves(*np.asarray(summary[name], dtype=float)) for name in PAIRS if name in summary}
 
 
-def _read_low_drifts(summary: Summary) -> LowDrifts | None:
-    """Read the drifts of the low pressures from a recording's summary; None if it contains no such drift."""
-    if not set(LowDrifts._fields) & set(summary):
-        return None
-    return LowDrifts(*(float(summary.get(name, np.nan)) for name in LowDrifts._fields))
+def _read_drifts(summary: Summary, kind: str) -> dict[str, Estimate]:
+    """Read the known drifts of p_A and p_B, by "A" and "B", from a recording's summary; `kind`: `MOTION` or `LOW`."""
+    keys = {side: (f"{kind}_{side}", f"{kind}_{side}_error") for side in "AB"}
+    return {
+        side: Estimate(float(summary[key]), float(summary[error_key]))
+        for side, (key, error_key) in keys.items()
+        if {key, error_key} <= set(summary)
+    }
 
 
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    `judged`, `healthy`: summaries of the recordings. Of up to two estimates of the friction (`FRICTION_KEYS`), the one
-    whose logarithm scatters less between the healthy recordings is compared. Return None if this estimate is not usable
-    in the judged recording, or if neither estimate is usable in `MIN_HEALTHY` healthy recordings.
+    Of up to two estimates of the friction (`FRICTION_KEYS`), the one whose logarithm scatters less between the healthy
+    recordings is compared. Return None if this estimate is not usable in the judged recording, or if neither estimate
+    is usable in `MIN_HEALTHY` healthy recordings.
     """
     prior = CHANGES.healthy
-    choices = [
-        (float(np.std([friction.value for friction in healthy_logs], ddof=1)), judged_log, healthy_logs)
-        for judged_log, healthy_logs in (_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS)
-        if len(healthy_logs) >= MIN_HEALTHY
-    ]
-    if not choices:
+    estimates = [_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS]
+    comparable = [(judged_log, logs) for judged_log, logs in estimates if len(logs) >= MIN_HEALTHY]
+    if not comparable:
         return None
-    _, judged_log, healthy_logs = min(choices, key=lambda choice: choice[0])  # choice with the smallest scatter
+    judged_log, healthy_logs = min(comparable, key=lambda estimate: np.std([log.value for log in estimate[1]], ddof=1))
     if judged_log is None:
         return None
     scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
@@ -171,33 +166,25 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     that what remains is the score of their mean; a p-value is about exp(-z^2 / 2). The size of "drift of both" is still
     that of the difference.
     """
-    judged_drifts = _read_drifts(judged)
-    if judged_drifts is None:
+    judged_drifts = _read_drifts(judged, MOTION)
+    if len(judged_drifts) < 2:
         return
-    healthy_drifts = [drifts for summary in healthy if (drifts := _read_drifts(summary)) is not None]
+    healthy_drifts = [drifts for summary in healthy if len(drifts := _read_drifts(summary, MOTION)) > 1]
     prior = CHANGES.healthy
     scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
-    drift_A, drift_B, difference = (
-        compare_estimates(name, DRIFT, judged_drifts[k], [drifts[k] for drifts in healthy_drifts], scatter)
-        for k, name in enumerate(DRIFTS)
+    drift_A, drift_B = (
+        compare_estimates(name, DRIFT, judged_drifts[side], [drifts[side] for drifts in healthy_drifts], scatter)
+        for side, name in zip("AB", DRIFTS[:2], strict=True)
     )
+    differences = [subtract_drifts(drifts) for drifts in healthy_drifts]
+    difference = compare_estimates(DRIFTS[2], DRIFT, subtract_drifts(judged_drifts), differences, scatter)
     if drift_A is None or drift_B is None or difference is None:
         return
     for drift in (drift_A, drift_B):  # a drift that is fast for the zero of a sensor is rather one of the load
         yield replace(drift, advantage=-size_penalty(CHANGES.zero_drift, drift.size / duration, above=True))
     chance = drift_A.chance * drift_B.chance / max(difference.chance, TINY)
     score = max(drift_A.score + drift_B.score - difference.score, 0.0)
-    yield replace(difference, chance=min(chance, 1.0), score=score)  # named DRIFTS[2], "drift of both"
-
-
-def _read_drifts(summary: Summary) -> tuple[Estimate, Estimate, Estimate] | None:
-    """Read the drifts [Pa] of p_A, p_B and p_A - p_B in motion from a recording's summary; None if it has none."""
-    if not set(summary) >= set(DRIFT_KEYS):
-        return None
-    values = [float(summary[key]) for key in DRIFT_KEYS]
-    drift_A, drift_B = Estimate(*values[:2]), Estimate(*values[2:])
-    difference = Estimate(drift_A.value - drift_B.value, float(np.hypot(drift_A.deviation, drift_B.deviation)))
-    return drift_A, drift_B, difference
+    yield replace(difference, chance=min(chance, 1.0), score=score)
 
 
 @np.errstate(all="ignore")
@@ -209,11 +196,14 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         if fit is not None:
             levels |= dict(zip(keys, (fit.friction, fit.friction_error), strict=True))
     if (motion := select_motion(recording)) is not None:
-        drifts = [_estimate_drift(motion, recording[name]) for name in CHAMBERS]
-        if np.isfinite(drifts).all():
-            levels |= dict(zip(DRIFT_KEYS, np.ravel(drifts).tolist(), strict=True))
-    if (low_drifts := estimate_low_drifts(recording)) is not None:
-        levels |= {name: value for name, value in low_drifts._asdict().items() if np.isfinite(value)}
+        # residuals may be correlated within a stroke
+        drifts = {
+            side: fit_robustly(motion.design, recording[f"p_{side}"][motion.rows], [TIME], motion.strokes)[0]
+            for side in "AB"
+        }
+        if np.isfinite([*drifts.values()]).all():
+            levels |= _list_drifts(drifts, MOTION)
+    levels |= _list_drifts(estimate_low_drifts(recording), LOW)
     spectra = {
         name: np.stack(octaves)
         for name, pair in PAIRS.items()
@@ -222,14 +212,7 @@ def _estimate_levels(recording: Recording) -> Summary | None:
     return {**levels, **spectra} or None
 
 
-def _estimate_drift(motion: Motion, pressure: Array) -> Estimate:
-    """Estimate the drift [Pa] of a `pressure` (n,) over the whole recording, from the samples in `motion`.
-
-    The error allows for residuals that are correlated within a stroke. It is infinite if the motion does not determine
-    the drift.
-    """
-    values = pressure[motion.rows]
-    coefficients, weight = fit_robustly(motion.design, values)
-    # TIME is the column of the time over the duration: its coefficient is the drift over the whole recording
-    (error,) = jackknife_errors(motion.design * weight[:, None], values * weight, [TIME], motion.strokes)
-    return Estimate(float(coefficients[TIME]), influence_factor(weight) * float(error))
+def _list_drifts(drifts: Mapping[str, Estimate], kind: str) -> dict[str, float]:
+    """List drifts and their standard errors for a recording's summary, from which `_read_drifts` reads them."""
+    values = {f"{kind}_{side}": drift.value for side, drift in drifts.items()}
+    return values | {f"{kind}_{side}_error": drift.deviation for side, drift in drifts.items()}

@@ -29,30 +29,32 @@ Each further coefficient costs log n (G. Schwarz, Ann. Statist. 6 (1978) 461).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, step_test
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, Interval, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import TINY
 
 _PRIORS = CHANGES.levels
 #: Iterations of the scatter of differences between blocks.
 _SCATTER_ITERATIONS = 20
-_TINY = float(np.finfo(float).tiny)
-#: Unit changes of level_A, level_B, half_A and half_B.
+#: Channels that show a motion, in the order of preference.
+MOTIONS = ("x", "theta", "omega", "u")
+#: Unit changes of the four numbers of a block, level_A, level_B, half_A and half_B.
 A, B, HALF_A, HALF_B = np.eye(4)
 #: Names of a fall of both levels, by a loss of oil, and of a rise, which has many causes.
 CHARGE, SUPPLY = "a loss of oil", "what feeds both chambers"
 #: Name of a change of the friction, which changes with the direction of motion.
 FRICTION = "friction"
-#: Name of each pattern, and bases of its subspace. If the subspace of the load contains simpler patterns, each of them
-#: supplies the first vector of one basis (`_test_patterns`). Friction has three patterns: both half differences change,
-#: with the mean level, alone and oppositely, or with any levels.
+#: Name of each pattern, and bases of its subspace: the load has three, each of which begins with a simpler pattern.
+#: Friction has three patterns: both half changes, with the mean level, alone and oppositely, or with any levels.
 PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
     (CHARGE, [[A + B]]),
     (FRICTION, [[A + B, HALF_A, HALF_B]]),
@@ -65,33 +67,9 @@ PATTERNS: tuple[tuple[str, list[list[Array]]], ...] = (
 )
 
 
-class PressureLevels(NamedTuple):
-    """Levels of both chamber pressures in K blocks of a recording, at the times `time` (K,) [s].
-
-    `values` (K, 4) [Pa]: level_A and level_B, the mean of each pressure over both directions of motion, and half_A and
-    half_B = (p for v > 0 - p for v < 0) / 2 of each pressure, at the same motion otherwise.
-    """
-
-    time: Array
-    values: Array
-
-
-class LevelChange(NamedTuple):
-    """Result of the test for a step of the pressure levels in one pattern, i.e. one combination of levels.
-
-    `name`: cause that changes these levels, such as "friction"; `rank`: by which patterns are compared (see the
-    module); `score`: twice the log likelihood ratio of a step to no step in these levels alone; `chance`: probability
-    that a healthy recording scores as high; `onset`: time of the step [s]; `block`: length of a block [s];
-    `pressure_scale`: logarithm of a factor on both pressures that would cause the change, None if there is none.
-    """
-
-    name: str
-    rank: float
-    score: float
-    chance: float
-    onset: float
-    block: float
-    pressure_scale: Estimate | None = None
+def find_motion_channel(channels: Collection[str]) -> str | None:
+    """Return the name of the channel that shows the motion best; None if none is recorded."""
+    return next((name for name in MOTIONS if name in channels), None)
 
 
 def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
@@ -101,7 +79,7 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     the acceleration is the difference of the speed over that time; the position is relative to its mean. Missing values
     are NaN. Return None if none of these channels is recorded.
     """
-    name = next((channel for channel in ("x", "theta", "omega", "u") if channel in channels), None)
+    name = find_motion_channel(channels)
     if name is None:
         return None
     values = channels[name]
@@ -115,17 +93,16 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
 
 def top_speed(motion: Array) -> float:
     """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    return float(np.maximum(np.nanpercentile(np.abs(motion[:, :1]), 99.0, axis=0), _TINY)[0])
+    return max(float(np.nanpercentile(np.abs(motion[:, 0]), 99.0)), TINY)
 
 
-def estimate_levels(recording: Recording) -> PressureLevels | None:
-    """Estimate each pressure's mean over both directions of motion, and half its change with the direction, in blocks.
+def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
+    """Estimate the levels of both pressures and their half changes with the direction of motion, in K blocks.
 
-    The samples in motion are fitted by p = level + half sign(v) + b v + c dv/dt + d x. Level and half difference are
-    free in each block; the slopes b, c and d on speed v, acceleration and position x are common to the recording.
-    Without a recorded motion the levels are means and the half differences zero. Several block lengths are tried, whole
-    cycles first; the first with enough samples of both directions in every block is used. Return None if there is no
-    such length, or if a pressure is not recorded.
+    Returns the middles of the blocks (K,) [s], and level_A, level_B, half_A and half_B of each, (K, 4) [Pa]. The slopes
+    b, c and d of the module are common to the recording. Without a recorded motion the levels are means and the half
+    changes zero. Several block lengths are tried, whole cycles first; the first with enough samples of both directions
+    in every block is used. Return None if there is no such length, or if a pressure is not recorded.
     """
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
@@ -145,7 +122,7 @@ def estimate_levels(recording: Recording) -> PressureLevels | None:
         gram = blocks.transpose(0, 2, 1) @ blocks
         values = fit_pressure_levels(gram, length, means)
         if values is not None:
-            return PressureLevels(recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values)
+            return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
     return None
 
 
@@ -156,8 +133,7 @@ def pressure_level_rows(
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
     `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures, against rounding; `max_speed`: highest
-    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of
-    `max_speed`.
+    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of it.
     """
     motion = motion_columns(channels, rate)
     pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
@@ -172,9 +148,8 @@ def pressure_level_rows(
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
-    """Fit each pressure's mean over both directions of motion, and half its change with the direction, in K blocks.
+    """Fit level_A, level_B, half_A and half_B in K blocks, (K, 4) [Pa]; None if a block has too few of one direction.
 
-    The result (K, 4) contains `PressureLevels.values`. It is None if a block has too few samples of one direction.
     `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,): means of the
     pressures that were subtracted in these rows [Pa].
     """
@@ -188,73 +163,84 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     free = np.linalg.solve(gram[:, :n_free, :n_free], gram[:, :n_free, n_free:])
     # eliminate the free coefficients of each block, then fit the motion's slopes to all blocks together
     reduced = (gram[:, n_free:, n_free:] - gram[:, n_free:, :n_free] @ free).sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], _TINY))[:, None]
+    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], TINY))[:, None]
     normalised, right_sides = reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale
     slopes = np.linalg.lstsq(normalised, right_sides, rcond=None)[0] / scale
-    values = np.zeros((len(gram), 4))  # half differences stay 0 without a recorded motion
+    values = np.zeros((len(gram), 4))  # half changes stay 0 without a recorded motion
     values[:, : 2 * n_free] = (free[:, :, -2:] - free[:, :, :-2] @ slopes).reshape(len(gram), -1)
     values[:, :2] += means
     return values
 
 
-def level_tests(recording: Recording) -> tuple[LevelChange, ...]:
-    """Test a recording for a step in each pattern of pressure levels (`pattern_tests`); empty if they are unknown."""
+def level_tests(recording: Recording) -> tuple[Observable, ...]:
+    """Test a recording for a step in each pattern of its pressure levels (`pattern_tests`)."""
     levels = estimate_levels(recording)
     return () if levels is None else pattern_tests(*levels)
 
 
-def pattern_tests(time: Array, values: Array) -> tuple[LevelChange, ...]:
+def pattern_tests(time: Array, values: Array) -> tuple[Observable, ...]:
     """Test pressure levels for a step in each of several patterns; the most likely one (highest rank) comes first.
 
     A pattern (`PATTERNS`) is the combination of levels that one cause changes, such as friction or a sensor's offset.
-    Those that cannot be tested are left out. `time` (K,), `values` (K, 4): times [s] and levels of `PressureLevels`.
+    Those that cannot be tested are left out. `time` (K,), `values` (K, 4): as from `estimate_levels`.
 
     A step takes time, so that the block in which it begins shows neither the old nor the new levels. The tests are
     therefore repeated without the two blocks nearest to the most likely onset, and the order follows the ranks of this
     second pass. All else, such as the p-values, is from the first pass, with all blocks. With fewer than `MIN_BLOCKS` +
     2 blocks there is no second pass.
+
+    The score of a result is its rank (see the module). The first is the best of n patterns, so that its p-value is n
+    chance_1 (Bonferroni). That of pattern k is min(1, n chance_1 exp(rank_1 - rank_k)). The Bayes factor of pattern 1
+    over pattern k (Schwarz's approximation) counts twice, once as evidence and once as a prior, because a pattern that
+    explains only part of the change needs a second cause.
     """
     tests = _test_patterns(time, values)
     changes = [test for test in tests if test is not None]
     if changes and len(time) >= MIN_BLOCKS + 2:
-        onset = max(changes, key=lambda change: change.rank).onset
-        near_onset = np.argsort(np.abs(time - onset), kind="stable")[:2]
+        onset = max(changes, key=lambda change: change.score).onset
+        assert onset is not None  # each of these results has one
+        near_onset = np.argsort(np.abs(time - onset.value), kind="stable")[:2]
         reduced_tests = _test_patterns(np.delete(time, near_onset), np.delete(values, near_onset, axis=0))
         changes = [
-            test._replace(rank=reduced_test.rank)
+            replace(test, score=reduced_test.score)
             for test, reduced_test in zip(tests, reduced_tests, strict=True)
             if test is not None and reduced_test is not None
         ]
-    return tuple(sorted(changes, key=lambda change: -change.rank))
+    changes.sort(key=lambda change: -change.score)
+    # 700: the largest exponent whose exponential is finite
+    factors = [float(np.exp(min(changes[0].score - change.score, 700.0))) for change in changes]
+    return tuple(
+        replace(change, chance=min(1.0, len(changes) * changes[0].chance * factor))
+        for change, factor in zip(changes, factors, strict=True)
+    )
 
 
-def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
+def _test_patterns(time: Array, values: Array) -> list[Observable | None]:
     """Test pressure levels for a step in each pattern (`pattern_tests`); None for a pattern that cannot be tested.
 
-    A pattern has one or more bases, i.e. alternative sets of vectors that span the changes of the four levels. The
-    results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
+    The results are in the order of `PATTERNS`, followed by those for the scales of p_A and p_B.
     """
     mean = values.mean(axis=0)
     sum_of_levels = values[:, :2].sum(axis=1)
-    # a step of a sensor's scale changes level and half difference of that pressure in proportion to their means
+    # a step of a sensor's scale changes level and half change of that pressure in proportion to their means
     scales = (("scale of p_A", [[mean * (A + HALF_A)]]), ("scale of p_B", [[mean * (B + HALF_B)]]))
     if not np.ptp(values, axis=0).any():  # constant pressures have no errors by which steps are tested
         return [None] * (len(PATTERNS) + len(scales))
     whitening = _whitening_matrix(values)
-    changes = list[LevelChange | None]()
+    changes = list[Observable | None]()
     for name, bases in (*PATTERNS, *scales):
-        tests = [_test_pattern(name, np.array(rows) @ whitening.T, values @ whitening.T, time) for rows in bases]
+        tests = [_test_pattern(name, np.array(basis) @ whitening.T, values @ whitening.T, time) for basis in bases]
         # the rank depends on the basis, as each direction has a random walk of its own: a pattern must be supported by
         # each of its bases, so that the lowest rank counts
-        change = min((test for test in tests if test is not None), key=lambda test: test.rank, default=None)
-        if change is not None:
+        change = min((test for test in tests if test is not None), key=lambda test: test.score, default=None)
+        if change is not None and change.onset is not None:
             # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
-            after = time > change.onset
+            after = time > change.onset.value
             is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
             if name == CHARGE and not is_falling:
-                change = change._replace(name=SUPPLY)
+                change = replace(change, name=SUPPLY)
             if name == FRICTION:
-                change = change._replace(pressure_scale=_pressure_scale(values[~after], values[after]))
+                change = replace(change, pressure_scale=_pressure_scale(values[~after], values[after]))
         changes.append(change)
     return changes
 
@@ -262,18 +248,17 @@ def _test_patterns(time: Array, values: Array) -> list[LevelChange | None]:
 def _pressure_scale(before: Array, after: Array) -> Estimate | None:
     """Compute the logarithm of the factor on both pressures that would explain a change of the friction.
 
-    `before`, `after` (k, 4) [Pa]: `PressureLevels.values` of the blocks before and after the change. The friction shows
-    in the difference of half_A and half_B. Return None if there are fewer than two blocks before or after, or if a mean
-    friction is not positive.
+    `before`, `after` (k, 4) [Pa]: levels of the blocks before and after the change. half_A - half_B is the friction.
+    Return None if there are fewer than two blocks before or after, or if a mean friction is not positive.
     """
+    if min(len(before), len(after)) < 2:
+        return None
     frictions = [values @ (HALF_A - HALF_B) for values in (before, after)]
-    if min(len(friction) for friction in frictions) < 2:
+    means = [float(friction.mean()) for friction in frictions]
+    if not min(means) > 0.0:
         return None
-    means = np.array([friction.mean() for friction in frictions])
-    if not means.min() > 0.0:
-        return None
-    errors = [friction.std(ddof=1) / np.sqrt(len(friction)) for friction in frictions]
-    return Estimate(math.log(means[1] / means[0]), math.hypot(*(errors / means)))
+    errors = [friction.std(ddof=1) / math.sqrt(len(friction)) for friction in frictions]
+    return Estimate(math.log(means[1] / means[0]), math.hypot(errors[0] / means[0], errors[1] / means[1]))
 
 
 def _whitening_matrix(values: Array) -> Array:
@@ -281,8 +266,8 @@ def _whitening_matrix(values: Array) -> Array:
 
     The matrix W is a root of the inverse of S, W' W = S^-1. S is the maximum-likelihood estimate of the scatter matrix
     of the differences between neighbouring blocks, under a multivariate t distribution, so that the large differences
-    at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4):
-    `PressureLevels.values`; c: number of its columns that are not constant.
+    at a step have little weight (K. L. Lange et al., J. Am. Statist. Assoc. 84 (1989) 881). `values` (K, 4): levels of
+    the blocks; c: number of its columns that are not constant.
     """
     varying = np.flatnonzero(np.ptp(values, axis=0) > 0.0)  # a machine that never moves has constant levels
     differences = np.diff(values[:, varying], axis=0)
@@ -299,15 +284,13 @@ def _whitening_matrix(values: Array) -> Array:
     return matrix
 
 
-def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> LevelChange | None:
+def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Observable | None:
     """Test the pressure levels for a step in one pattern, i.e. within a subspace of their possible changes.
 
     `rows` (m, c): vectors that span the subspace; `whitened` (K, c): levels in K blocks, both multiplied by the
     `_whitening_matrix`; `time` (K,): times of the blocks [s]. Return None if the vectors are zero, or if a direction
-    cannot be tested.
-
-    The score counts only the directions of the pattern, each with its own variance. For the rank, by which patterns are
-    compared, all directions have one variance in common. The formulas are in the module's docstring.
+    cannot be tested. The score of the result is the rank, for which all directions have one variance in common. For the
+    p-value only the directions of the pattern count, each with its own variance (formulas: see the module).
     """
     basis, triangle = np.linalg.qr(rows.T)
     # orthonormal directions, without those of vectors that depend on earlier ones
@@ -339,4 +322,5 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Level
     # up or down in each direction, by the law under which the score is the most probable
     chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
     onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
-    return LevelChange(name, rank, score, min(1.0, chance), onset, block)
+    interval = Interval(onset, onset - block, onset + block)
+    return Observable(name=name, data="levels", score=rank, chance=min(1.0, chance), onset=interval)

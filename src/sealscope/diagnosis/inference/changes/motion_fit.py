@@ -5,12 +5,10 @@ A pressure, or p_A - p_B, is fitted by
     p = level(x) + half sign(v) + b v + c dv/dt [+ drift t/T],
 
 with position x, speed v, and the time t over the recording's duration T. The level is linear in the position between
-`KNOTS` values. The drift is fitted only on request: few strokes do not distinguish it from friction. Loads that
-change slowly, as work does, are removed on request (`remove_slow_changes`), and friction reverses faster. The fit is
-iteratively reweighted least squares with redescending weights, so that contact with a workpiece hardly counts. Standard
-errors are those of a jackknife, which leaves out groups of rows in turn: strokes for a drift, else equal parts of the
-rows. They are infinite for a coefficient that the motion does not determine, such as the friction of a piston that
-moves in one direction only. Called for friction and drifts (`healthy_levels`) and for the oil's viscosity (`volumes`).
+`KNOTS` values. The drift is fitted only on request: few strokes do not distinguish it from friction. Loads that change
+slowly, as work does, are removed on request (`remove_slow_changes`), and friction reverses faster. The fit is
+iteratively reweighted least squares with redescending weights, so that contact with a workpiece hardly counts. Called
+for friction and drifts (`healthy_levels`) and for the oil's viscosity (`volumes`).
 
 Sources: S. Geman, D. E. McClure, Bull. Int. Stat. Inst. 52 (1987) 5 (the weights); B. Efron, C. Stein,
 Ann. Statist. 9 (1981) 586 (the jackknife).
@@ -27,12 +25,14 @@ from numpy.typing import NDArray
 from scipy.linalg import qr
 
 from sealscope.diagnosis.inference.balance import max_rest_rate
+from sealscope.diagnosis.inference.changes.levels import find_motion_channel
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, MIN_REST
+from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once
-from sealscope.signals.smoothing import average_over
+from sealscope.signals.smoothing import TINY, average_over
 
 #: Maximum number of positions between which the level is linear, and minimum number of rows for each.
 KNOTS, ROWS_PER_KNOT = 24, 10
@@ -40,10 +40,8 @@ KNOTS, ROWS_PER_KNOT = 24, 10
 MAX_ROWS, MIN_ROWS, ITERATIONS = 4000, 60, 8
 #: Scale of the weights' decrease with the residual, over the median residual.
 WEIGHT_SCALE = 2.0
-#: Smallest length that is divided by, and smallest scale of residuals [Pa].
-TINY, MIN_RESIDUAL = 1e-300, 1.0
-#: Relative rounding error of a double; a singular value below it times the number of rows counts as zero.
-ROUNDING = float(np.finfo(float).eps)
+#: Smallest scale of residuals [Pa].
+MIN_RESIDUAL = 1.0
 #: Maximum number of groups of rows whose residuals count as independent.
 GROUPS = 20
 #: Eigenvalue of a normalised normal matrix, over the largest one, below which a combination of coefficients is free.
@@ -57,8 +55,8 @@ class Motion(NamedTuple):
 
     `rows` (n,): indices of the samples; `design` (n, m): sign of the speed; time over the duration; speed and
     acceleration, each over the 99 % quantile of its magnitude; and a hat function of the position for each knot
-    (`_hat_functions`). `strokes` (n,): number of the stroke, a motion in one direction without a rest; `top_speed`:
-    this quantile of the speed.
+    (`_hat_functions`). `strokes` (n,): number of the stroke, a motion in one direction without a rest; `top_speed`: the
+    quantile of the speed.
     """
 
     rows: NDArray[np.intp]
@@ -70,13 +68,13 @@ class Motion(NamedTuple):
 def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit.
 
-    The motion is that of the first recorded channel of x, theta, omega and u. The piston moves if the speed, averaged
-    over `AVERAGING_TIME`, exceeds both three standard deviations of its noise and the fraction `healthy.slowest`
-    (`priors.toml`) of the mean speed (`max_rest_rate`). Samples at rest are left out, since friction may then have any
-    value between those of both directions. Samples in motion are thinned out if they are many. Return None if a chamber
-    pressure or the motion is not recorded, or if the piston moves in fewer than `MIN_ROWS` samples.
+    The piston moves if the speed, averaged over `AVERAGING_TIME`, exceeds both three standard deviations of its noise
+    and the fraction `healthy.slowest` (`priors.toml`) of the mean speed (`max_rest_rate`). Samples at rest are left
+    out, since friction may then have any value between those of both directions. Samples in motion are thinned out if
+    they are many. Return None if a chamber pressure or the motion is not recorded, or if the piston moves in fewer than
+    `MIN_ROWS` samples.
     """
-    name = next((channel for channel in ("x", "theta", "omega", "u") if channel in recording.channels), None)
+    name = find_motion_channel(recording.channels)
     if name is None or len(recording) < MIN_ROWS or not set(CHAMBERS) <= set(recording.channels):
         return None
     values, rate = recording[name], recording.rate
@@ -115,7 +113,7 @@ def _hat_functions(position: Array, n_knots: int) -> Array:
     """Evaluate hat functions at positions (n,), without those that are 0 at every position; shape (n, k).
 
     A hat function is 1 at its knot and falls linearly to 0 at the neighbouring knots. The `n_knots` knots are equally
-    spaced from the least to the largest position. If all positions are equal, the result is one column of ones.
+    spaced from the least to the largest position.
     """
     distance = (n_knots - 1) * (position - position.min()) / max(float(np.ptp(position)), TINY)
     hats = np.maximum(1.0 - np.abs(distance[:, None] - np.arange(n_knots)), 0.0)
@@ -130,23 +128,24 @@ def stack_equations(design: Array, values: Array) -> Array:
 def solve_weighted(equations: Array, weight: Array) -> Array:
     """Solve a weighted least-squares problem by a QR decomposition; return the coefficients c (m,).
 
-    They minimise sum((weight (values - design c))^2). If the weighted design does not have full rank, c is the shortest
-    of all solutions, as from `numpy.linalg.lstsq`. `equations` (m + 1, n): columns of the design and values
-    (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
+    They minimise sum((weight (values - design c))^2); if several do, c is the shortest of them. `equations` (m + 1, n):
+    columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
     """
     _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
     # R of the design and, in the last column, the values multiplied by Q^T
-    solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=ROUNDING * len(weight))
+    solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=np.finfo(float).eps * len(weight))
     return np.asarray(solution[0])
 
 
-def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
-    """Fit coefficients c (m,) of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
+def fit_robustly(design: Array, values: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> list[Estimate]:
+    """Fit coefficients c of `design` (n, m) to `values` (n,), values = design c, by reweighted least squares.
 
     The weights, by which the rows are multiplied, are 1/(1 + (residual/scale)^2), where the scale is `WEIGHT_SCALE`
-    times the median of abs(residual), plus `MIN_RESIDUAL`. The fit is run twice: from equal weights, and from weights
-    that are small for values far from their median, such as those in contact with a workpiece. Returns the coefficients
-    and weights (n,) of the run with the smaller median.
+    times the median of abs(residual), plus `MIN_RESIDUAL`. The fit is run from equal weights, and from weights that are
+    small for values far from their median, such as those in contact with a workpiece; the run with the smaller median
+    counts. Returns the coefficients of the given `columns`, with the errors of a jackknife over `groups` of rows
+    (`jackknife_errors`). An error is infinite if the motion does not determine the coefficient, such as the friction of
+    a piston that moves in one direction only.
     """
     equations = stack_equations(design, values)
     fits = list[tuple[float, Array, Array]]()
@@ -157,26 +156,19 @@ def fit_robustly(design: Array, values: Array) -> tuple[Array, Array]:
             residual = np.abs(values - design @ coefficients)
         fits.append((float(np.median(residual)), coefficients, _robust_weight(residual)))
     _, coefficients, weight = min(fits, key=lambda fit: fit[0])
-    return coefficients, weight
+    errors = jackknife_errors(design * weight[:, None], values * weight, columns, groups)
+    # With u = residual / scale and w = 1/(1 + u^2), the robust coefficients make the sum of psi(u) times the row of the
+    # design zero, where psi = u w^2. Its slope is 4 w^3 - 3 w^2, with the fixed weights of the jackknife w^2. The
+    # errors are larger by the ratio of the means of both, at most by 10.
+    squares, slopes = float((weight**2).mean()), float((4.0 * weight**3 - 3.0 * weight**2).mean())
+    errors *= squares / max(slopes, 0.1 * squares)
+    return [Estimate(*pair) for pair in zip(coefficients[columns].tolist(), errors.tolist(), strict=True)]
 
 
 def _robust_weight(residual: Array) -> Array:
-    """Compute the weights (n,) of rows from the magnitudes of their residuals (n,) [Pa], as in `fit_robustly`."""
+    """Compute the weights (n,) of rows from the magnitudes of their residuals (n,) [Pa] (`fit_robustly`)."""
     scale = WEIGHT_SCALE * float(np.median(residual)) + MIN_RESIDUAL
     return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
-
-
-def influence_factor(weight: Array) -> float:
-    """Compute the factor by which a robust fit has larger standard errors than a fit with fixed weights.
-
-    `weight` (n,): final weights of the robust fit (`fit_robustly`). With u = residual / scale and w = 1/(1 + u^2), the
-    robust coefficients make the sum of psi(u) times the row of the design zero, where psi = u w^2. The slope of psi is
-    4 w^3 - 3 w^2; with fixed weights it would be w^2. The factor is the mean of w^2 over the mean of the slope, at most
-    10.
-    """
-    squares = float((weight**2).mean())
-    slopes = float((4.0 * weight**3 - 3.0 * weight**2).mean())
-    return squares / max(slopes, 0.1 * squares)
 
 
 def equal_parts(n_rows: int) -> NDArray[np.intp]:
@@ -192,10 +184,9 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
         error^2 = (P - 1) / P sum over groups of (c_k - c)^2.
 
     Residuals may be correlated within a group. An error is infinite if the coefficient is not determined by all rows,
-    or by all but those of one group. All errors are infinite for a single group. `design` (n, m), `values` (n,): the
-    rows in the order of time, multiplied by the weights of the fit; `columns`: indices of the coefficients; `groups`
-    (n,): number of each row's group, from 0, in increasing order. More than `GROUPS` groups are merged with their
-    neighbours.
+    or by all but those of one group. `design` (n, m), `values` (n,): the rows in the order of time, multiplied by the
+    weights of the fit; `columns`: indices of the coefficients; `groups` (n,): number of each row's group, from 0, in
+    increasing order. More than `GROUPS` groups are merged with their neighbours.
     """
     n_groups = min(int(groups[-1]) + 1, GROUPS)
     if n_groups < 2:
@@ -208,8 +199,9 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
     matrices = np.array([normalised[part].T @ normalised[part] for part in parts])
     moments = np.array([normalised[part].T @ values[part] for part in parts])
     # normal equations without each of the groups in turn, and last those of all rows
-    matrices = np.concatenate([matrices.sum(axis=0) - matrices, matrices.sum(axis=0)[None]])
-    moments = np.concatenate([moments.sum(axis=0) - moments, moments.sum(axis=0)[None]])
+    matrices, moments = (
+        np.concatenate([[sums.sum(axis=0)] - sums, [sums.sum(axis=0)]]) for sums in (matrices, moments)
+    )
     eigenvalues, vectors = np.linalg.eigh(matrices)
     is_free = eigenvalues < FREE * eigenvalues[:, -1:]  # combinations of coefficients that the rows do not determine
     inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
@@ -227,9 +219,8 @@ def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) 
 
         (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
 
-    as if the residuals were an Ornstein-Uhlenbeck process, whose innovations are independent. `design` (n, m), `values`
-    (n,): rows of the samples `motion.rows`; `t`: times of all samples of the recording [s]; tau: `healthy.load_seconds`
-    of `priors.toml`. The results have n - 1 rows.
+    as if the residuals were an Ornstein-Uhlenbeck process, whose innovations are independent. `t`: times of all samples
+    of the recording [s]; tau: `healthy.load_seconds` of `priors.toml`. The results have one row less.
     """
     correlation = np.exp(-np.diff(t[motion.rows]) / CHANGES.healthy.load_seconds)
     scale = 1.0 / np.sqrt(1.0 - correlation**2)
@@ -242,9 +233,8 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
     `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
-    viscous drop of a steady motion. The result is computed only once for a recording. It is None if too few samples are
-    in motion (`select_motion`), or if a value or its error is not finite, as for a piston that moves in one direction
-    only.
+    viscous drop of a steady motion. The result is None if too few samples are in motion (`select_motion`), or if a
+    value or its error is not finite.
     """
     key = ("motion fit of p_A - p_B", without_slow_changes)
     return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
@@ -252,11 +242,7 @@ def fit_difference(recording: Recording, *, without_slow_changes: bool = False) 
 
 @np.errstate(all="ignore")
 def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
-    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`).
-
-    The standard errors allow for residuals that are correlated within each of the `equal_parts` of the rows. Return
-    None in the same cases as `fit_difference`.
-    """
+    """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`)."""
     motion = select_motion(recording)
     if motion is None:
         return None
@@ -265,16 +251,7 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resista
     design = np.delete(motion.design, TIME, axis=1)
     if without_slow_changes:
         design, difference = remove_slow_changes(motion, design, difference, recording.t)
-    coefficients, weight = fit_robustly(design, difference)
-    columns = [DIRECTION, SPEED]
-    friction_error, speed_error = influence_factor(weight) * jackknife_errors(
-        design * weight[:, None], difference * weight, columns, equal_parts(len(weight))
-    )
-    fit = Resistance(
-        friction=float(coefficients[DIRECTION]),
-        friction_error=float(friction_error),
-        drop=float(coefficients[SPEED] / motion.top_speed),
-        drop_error=float(speed_error / motion.top_speed),
-        top_speed=motion.top_speed,
-    )
+    # residuals may be correlated within a part
+    friction, drop = fit_robustly(design, difference, [DIRECTION, SPEED], equal_parts(len(difference)))
+    fit = Resistance(*friction, drop.value / motion.top_speed, drop.deviation / motion.top_speed, motion.top_speed)
     return fit if np.isfinite(fit).all() else None

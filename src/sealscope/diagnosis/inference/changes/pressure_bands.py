@@ -24,6 +24,7 @@ Data, 4th ed. (2010), section 9.2 (error of a phase); K. V. Mardia, P. E. Jupp, 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -38,8 +39,6 @@ from sealscope.recordings.recording import Array, Recording
 
 #: `Observable.data` of the comparison of spectra.
 SIDES = "sides"
-#: `Observable.name` of a filter, by the filtered pressure.
-FILTER_NAMES = {channel: f"filter of {channel}" for channel in CHAMBERS}
 #: Pairs of channels whose spectra are compared, by their names in a recording's summary.
 PAIRS = {
     "octaves": CHAMBERS,
@@ -50,8 +49,6 @@ PAIRS = {
 }
 #: Minimum number of octaves.
 MIN_OCTAVES = 3
-#: Number of samples of the median that removes single wrong ones.
-GLITCH = 3
 #: Power added before dividing or taking a logarithm: of pressures [Pa^2], position [m^2], pump's speed [rad^2/s^2].
 MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
 #: Minimum coherence, since its square is a divisor.
@@ -80,9 +77,9 @@ def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> O
     """Compute the log amplitudes of both channels of a `pair` in octaves of frequency, and the phase between them.
 
     The power in an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows of time, since a machine
-    may often rest; the phase [rad], with its variance, is that of the sum over all windows. Return None if a channel is
-    not recorded, if the recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all
-    windows have missing samples.
+    may often rest; the phase is that of the sum over all windows. Return None if a channel is not recorded, if the
+    recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all windows have missing
+    samples.
     """
     priors = CHANGES.octaves
     if not set(pair) <= set(recording.channels):
@@ -120,13 +117,14 @@ def _octave_powers(
 ) -> tuple[Array, Array, NDArray[np.complex128]] | None:
     """Compute powers and cross-power of a pair of channels A and B in half-overlapping Hann windows, in octaves.
 
-    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. A median of three removes single wrong
-    samples. The results are sums of abs(A)^2, abs(B)^2 and A B* over the lines of each octave, (windows, k) each.
-    Windows with missing samples are left out; None if no window is left.
+    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. The results are sums of abs(A)^2,
+    abs(B)^2 and A B* over the lines of each octave, (windows, k) each. Windows with missing samples are left out; None
+    if no window is left.
     """
     from scipy.ndimage import median_filter
 
-    values = np.stack([median_filter(recording[name], GLITCH, mode="nearest") for name in pair])
+    # the median of three removes single wrong samples
+    values = np.stack([median_filter(recording[name], 3, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
     hann, powers = np.hanning(length), []
     for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
@@ -148,8 +146,7 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
     `judged`, `healthy`: spectra of each recording for pairs of channels, by their names in `PAIRS`. The result is named
     after the pressure that is most probably filtered. Its size is the most probable cut-off frequency [Hz], its p-value
     the inverse of the Bayes factor of a filter, averaged over the pairs, or 1 for a factor below 1. Its score is twice
-    the log of this factor, or 0. Healthy recordings with fewer octaves of a pair than the judged one are left out.
-    Return None if too few remain for every pair.
+    the log of this factor, or 0. Return None if too few healthy recordings remain for every pair (`_compare_pair`).
     """
     from scipy.special import logsumexp
 
@@ -164,7 +161,7 @@ def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str
     log_factor = float(logsumexp([log_factor for log_factor, _, _ in filters]) - np.log(len(filters)))
     _, channel, cutoff = max(filters, key=lambda comparison: comparison[0])
     return Observable(
-        name=FILTER_NAMES[channel],
+        name=f"filter of {channel}",
         data=SIDES,
         score=max(2.0 * log_factor, 0.0),
         chance=float(np.exp(-max(log_factor, 0.0))),
@@ -215,23 +212,19 @@ def _filter_effects(healthy: Sequence[Octaves], sides: Sequence[int]) -> _Filter
     levels of the sensor's white noise, which is not filtered: a fraction (`filtered.noises` in `priors.toml`) of the
     lowest power density of an octave, averaged over the `healthy` recordings.
     """
-    from itertools import product
-
     priors, edges = CHANGES.filtered, _octave_edges(len(healthy[0].log_A))
     frequencies, widths = np.sqrt(edges[:-1] * edges[1:]), np.diff(edges)
-    unchanged = np.zeros_like(frequencies)
-    log_ratios, phases, filtered_sides, cutoffs = [unchanged], [unchanged], [0], [np.inf]  # no filter
-    grid = np.geomspace(priors.lowest, priors.highest, CUTOFFS)
-    for side, noise_fraction, cutoff in product(sides, priors.noises, grid):
-        power = np.exp([2.0 * octaves[side] for octaves in healthy]).mean(axis=0)  # from log_A or log_B
-        noise = noise_fraction * float(np.min(power / widths)) * widths
-        filtered_power = (power - noise) / (1.0 + (frequencies / cutoff) ** 2) + noise
-        sign = 1.0 if side == 0 else -1.0  # ratio and phase are those of A to B
-        log_ratios.append(sign * 0.5 * np.log(filtered_power / power))
-        phases.append(-sign * np.arctan(frequencies / cutoff))
-        filtered_sides.append(side)
-        cutoffs.append(cutoff)
-    return _Filters(np.stack(log_ratios), np.stack(phases), np.array(filtered_sides), np.array(cutoffs))
+    cases = [(0, 0.0, np.inf)]  # no filter
+    cases += itertools.product(sides, priors.noises, np.geomspace(priors.lowest, priors.highest, CUTOFFS))
+    side, noise_fraction, cutoff = (np.array(values) for values in zip(*cases, strict=True))
+    powers = np.exp([2.0 * np.array(octaves[:2]) for octaves in healthy]).mean(axis=0)  # of A and B, (2, k)
+    power = powers[side]  # (m, k)
+    noise = noise_fraction[:, None] * (power / widths).min(axis=1, keepdims=True) * widths
+    relative_frequency = frequencies / cutoff[:, None]
+    filtered_power = (power - noise) / (1.0 + relative_frequency**2) + noise
+    sign = np.where(side == 0, 1.0, -1.0)[:, None]  # ratio and phase are those of A to B
+    log_ratio = sign * 0.5 * np.log(filtered_power / power)
+    return _Filters(log_ratio, -sign * np.arctan(relative_frequency), side, cutoff)
 
 
 def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters: _Filters) -> Array:

@@ -6,17 +6,14 @@ recording, whichever detector measures the leak.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable
 from contextlib import suppress
-from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.changes.features import BLOCKS, NOISE, ORDER, duty_tests, sensor_tests
-from sealscope.diagnosis.inference.changes.levels import LevelChange, level_tests
+from sealscope.diagnosis.inference.changes.features import BLOCKS, ORDER, observe_duty, observe_sensors
+from sealscope.diagnosis.inference.changes.levels import level_tests
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -35,86 +32,17 @@ def _test_signals(recording: Recording) -> Observed:
     if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
         return Observed(SIGNALS, lack="too short to test its signals for changes")
     observables = run_tests(
-        lambda: duty_observables(duty_tests(recording)),
-        lambda: sensor_observables(sensor_tests(recording)),
-        lambda: level_observables(level_tests(recording)),
+        lambda: observe_duty(recording),
+        lambda: observe_sensors(recording),
+        lambda: level_tests(recording),
     )
     return Observed(SIGNALS, observables)
 
 
-def run_tests(*tests: Callable[[], Iterator[Observable]]) -> tuple[Observable, ...]:
+def run_tests(*tests: Callable[[], Iterable[Observable]]) -> tuple[Observable, ...]:
     """Collect what all `tests` yield; a test in which numbers overflow or a matrix is singular ends early."""
     observables: list[Observable] = []
     for test in tests:
         with suppress(ArithmeticError, np.linalg.LinAlgError):
             observables += test()
     return tuple(observables)
-
-
-#: Minimum ratio of the smaller to the larger of two steps (a, b). As an angle of the vector (a, b) it is half way
-#: between a single step, 0 degrees, and equal steps, 45 degrees.
-_MIN_STEP_RATIO = math.tan(math.pi / 8.0)
-
-
-def duty_observables(tests: Sequence[StepTest]) -> Iterator[Observable]:
-    """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
-
-    `tests`: step tests of the log amplitudes of command and motion (`duty_tests`). Both must rise, or both fall: the
-    smaller step must exceed `_MIN_STEP_RATIO` times the larger one, since a leak changes only one amplitude. Score,
-    onset and size are those of the test with the lower score. The p-value is twice the higher one, since a step may be
-    up or down.
-    """
-    steps = np.abs([test.fitted.value for test in tests])
-    has_one_sign = len({test.sign for test in tests}) == 1
-    if has_one_sign and steps.min() > _MIN_STEP_RATIO * steps.max():
-        weakest = min(tests, key=lambda test: test.score)
-        least_certain = max(tests, key=lambda test: test.chance)
-        yield Observable(
-            name="size of the duty",
-            data="duty",
-            score=weakest.score,
-            chance=min(1.0, 2.0 * least_certain.chance),
-            onset=weakest.onset(),
-            size=weakest.sign * weakest.fitted.value,
-        )
-
-
-def sensor_observables(tests: Iterable[tuple[str, StepTest]]) -> Iterator[Observable]:
-    """Convert step tests of sensor features, such as noise and hum, to observables (test results).
-
-    `tests`: pairs of a feature's name, whose first word is the kind of data, and its test. The p-value is doubled, as
-    each test is the better of two, for a step up and a step down.
-    """
-    for name, test in tests:
-        observable = Observable.from_test(name, name.split()[0], test, n_tests=2.0)
-        if name == NOISE:  # log variance of p_A + that of p_B: a scale k of both adds 2 log(k) to each
-            scale = Estimate(0.25 * observable.size, 0.25 * test.fitted.deviation)
-            observable = replace(observable, pressure_scale=scale)
-        yield observable
-
-
-#: Largest exponent whose exponential fits into a float.
-_MAX_EXPONENT = 700.0
-
-
-def level_observables(changes: Sequence[LevelChange]) -> Iterator[Observable]:
-    """Convert tests for steps of the pressure levels to observables (test results).
-
-    `changes`: a test for each pattern, the combination of levels that a cause changes, with the highest rank first. The
-    rank (`LevelChange`) becomes the score. The first is the best of n patterns, so that its p-value is n chance_1
-    (Bonferroni). That of change k is min(1, n chance_1 exp(rank_1 - rank_k)). The Bayes factor of change 1 over
-    change k (Schwarz's approximation) counts twice, once as evidence and once as a prior, because a pattern that
-    explains only part of the change needs a second cause. The interval of an onset is one block to either side.
-    """
-    for change in changes:
-        onset = Interval(change.onset, change.onset - change.block, change.onset + change.block)
-        deficit = min(changes[0].rank - change.rank, _MAX_EXPONENT)
-        chance = min(1.0, len(changes) * changes[0].chance * float(np.exp(deficit)))
-        yield Observable(
-            name=change.name,
-            data="levels",
-            score=change.rank,
-            chance=chance,
-            onset=onset,
-            pressure_scale=change.pressure_scale,
-        )

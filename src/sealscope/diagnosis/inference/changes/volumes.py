@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.equations.terms import (
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_tests
+from sealscope.diagnosis.inference.onset import Estimate, Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -71,9 +71,8 @@ def volume_observables(
     The piston's leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A -
     p_B below 1. A scale of both pressures looks like a step of it or of the pump's leak, so that their results state
     the scale (`_pressure_scale`). A laminar leak has no prior on its size, but pays for an improbable sensor offset.
-    The coefficients of the motion are tested together, for a change of their common scale. The `advantage` of a result
-    comes from the priors on its size and on the power, from the sensor offset, and from the oil that the accumulator
-    lost or the fall of the charge pressure.
+    The `advantage` of a result comes from the priors on its size and on the power, from the sensor offset, and from the
+    oil that the accumulator lost or the fall of the charge pressure.
 
     - `blocks`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks.
     - `plain`: its blocks with the pressures as recorded, for all other tests.
@@ -89,38 +88,31 @@ def volume_observables(
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
     leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
+    law_prior_of = dict(zip(EXPONENTS, law_priors(), strict=True))
     observables = []
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
     for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
-        steps = step_tests(coefficient, signs, shape)
-        if not steps:
+        step = step_test(coefficient, signs, shape)
+        if step is None:
             continue
-        step = max(steps, key=lambda test: test.score)
-        pressure_scale = None
-        if name in (PUMP, *_LEAK_EXPONENTS):
-            pressure_scale = _pressure_scale(coefficient, step)
+        pressure_scale = _pressure_scale(coefficient, step) if name in (PUMP, *_LEAK_EXPONENTS) else None
         if name in (LEAK, PUMP):
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
-        advantage += 2.0 * _law_log_prior(name)
-        # MADE_UP at the end of a name marks a leak whose lost oil a check valve replaces
-        if (accumulator_test := oil_loss.get(name.removesuffix(MADE_UP))) is not None:
+        prior = law_prior_of[_LEAK_EXPONENTS.get(name, 1.0)]
+        advantage += 2.0 * float(np.log(prior / law_prior_of[1.0]))
+        term = name.removesuffix(MADE_UP)  # the end of a name that marks a leak whose lost oil a check valve replaces
+        if (accumulator_test := oil_loss.get(term)) is not None:
             advantage += _accumulator_support(step, accumulator_test)
         elif charge is not None and (name == OUTSIDE or name.startswith("external leak")):
-            term = name.removesuffix(MADE_UP)
             # the coefficient of a loss to the outside (OUTSIDE) is a flow, that of other leaks a flow per pressure
             unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
             flow = step.fitted.value * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
         observables.append(
             Observable.from_test(
-                name,
-                VOLUMES,
-                step,
-                n_tests=len(steps),
-                advantage=advantage,
-                pressure_scale=pressure_scale,
+                name, VOLUMES, step, n_tests=len(signs), advantage=advantage, pressure_scale=pressure_scale
             )
         )
     return tuple(sorted(observables, key=lambda observable: -observable.score))
@@ -129,9 +121,9 @@ def volume_observables(
 def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None:
     """Compute the logarithm of a factor on both pressures that would make a leak's conductance appear to step up.
 
-    If both pressures are scaled and the leakage stays the same, the apparent conductance becomes G_2 = G_1 / factor
-    instead of G_1. `conductance`: its likelihood in the blocks of the recording; `step`: test for the step. Return None
-    if no block lies before or after the onset, or if the mean conductance of these blocks is not positive.
+    With such a factor and the same leakage, the apparent conductance G_1 becomes G_2 = G_1 / factor. `conductance`: its
+    likelihood in the blocks of the recording; `step`: test for the step. Return None if no block lies before or after
+    the onset, or if the mean conductance of these blocks is not positive.
     """
     history = fit_history(conductance, step, with_step=True)
     is_after = np.asarray(conductance.time > step.onsets[step.best])
@@ -140,18 +132,18 @@ def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None
     before, after = (history.average(flags / np.count_nonzero(flags)) for flags in (~is_after, is_after))
     if not min(before.value, after.value) > 0.0:
         return None
-    relative_errors = [(mean.high - mean.value) / (WITHIN_95 * mean.value) for mean in (before, after)]
+    relative_errors = [mean.deviation / mean.value for mean in (before, after)]
     return Estimate(math.log(before.value / after.value), math.hypot(*relative_errors))
 
 
 def _size_penalty(
     name: str, size: float, blocks: Blocks, names: Sequence[str], volume_ratio: float, flow_scale: float
 ) -> float:
-    """Compute how improbable the size of a step is: -2 log(prior density / largest density).
+    """Compute how improbable the size of a step is: -2 log(prior density / largest density), 0 without a prior.
 
-    It is 0 without a prior on the size. A prior that only limits the size (`above`) also gives 0 for steps below its
-    limit. `name`: name of the coefficient in the volume balance that changes by `size`; `names`: names of the columns
-    of `blocks`. `volume_ratio` and `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
+    A prior that only limits the size (`above`) also gives 0 for steps below its limit. `name`: name of the coefficient
+    in the volume balance that changes by `size`; `names`: names of the columns of `blocks`. `volume_ratio` and
+    `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
     """
     if name == SCALE:
         return size_penalty(INFERENCE.scale, size)
@@ -166,25 +158,15 @@ def _size_penalty(
     return 0.0
 
 
-def _law_log_prior(name: str) -> float:
-    """Compute the log prior odds of a leak whose flow follows a power of p_A - p_B to a laminar leak.
-
-    `name`: name of the tested step, which states the power. The result is 0 for a laminar leak and for other steps.
-    """
-    laminar, *_ = priors = law_priors()
-    return float(np.log(priors[EXPONENTS.index(_LEAK_EXPONENTS.get(name, 1.0))] / laminar))
-
-
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
 ) -> Iterator[tuple[str, Sequence[float], Information, Array | None]]:
     """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
-    `centred`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks;
-    `recorded`: blocks with the pressures as recorded, for all other tests; `terms`: terms of the first equation;
-    `columns`: roles of the columns of each equation; `has_accumulator`: true if the accumulator's volume shows external
-    leaks. Yields for each step its name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K
-    blocks, and the change (K,) of the coefficient by a unit step, None if it is 1 in every block.
+    `centred`, `recorded`: the blocks `blocks` and `plain` of `volume_observables`; `terms`: terms of the first
+    equation; `has_accumulator`: true if the recording shows the volume of an accumulator. Yields for each step its
+    name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, and the change (K,) of the
+    coefficient by a unit step, None if it is 1 in every block.
     """
     first = columns[0]
     for term in terms:
@@ -210,8 +192,7 @@ def _step_hypotheses(
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:
     """Return True if the coefficient of a term of the volume balance is tested for a step by itself.
 
-    A coefficient is left out if it changes only together with others, or if another test covers its steps. `roles`:
-    roles of the balance's columns; `has_accumulator`: true if the recording shows the volume of an accumulator.
+    `has_accumulator`: true if the recording shows the volume of an accumulator.
     """
     # The coefficients of motion change together, with an area, the displacement or a sensor's scale: the test of SCALE
     # covers them. The motion of one recording varies too little to test SPEED_LOSS. A leaking piston raises HOLDING as
@@ -240,9 +221,8 @@ def _accumulator_support(balance_test: StepTest, accumulator_test: StepTest) -> 
 def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index: int) -> Blocks:
     """Replace the column `index` of the Gram matrices by the volume of the piston's motion; return the new blocks.
 
-    This volume is the sum of the columns of motion, which are nuisance terms, each times its coefficient fitted to the
-    whole recording. A change of the sensor's scale of position or speed by the fraction s changes the coefficient of
-    the new column by s. `columns`: roles of the columns of each equation.
+    This volume is the sum of the columns of motion, each times its coefficient fitted to the whole recording. A change
+    of the sensor's scale of position or speed by the fraction s changes the coefficient of the new column by s.
     """
     gram = blocks.gram.copy()
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):

@@ -16,18 +16,18 @@ from itertools import compress
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.comparison.rise import TINY
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
 
 
 def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None) -> Array:
     """Eliminate the coefficients of c columns from a Gram matrix (m, m), whose rows and columns become zero.
 
     The result is the Schur complement G - C' (D + P)^-1 C, where C are the rows of G in `eliminated`, and D those of
-    their entries that lie in these columns. Of a column k that remains alone, the coefficient is then estimated as
-    entry (k, left) / entry (k, k), with the precision of entry (k, k). `prior` (c,): precisions P of normal priors on
-    the coefficients, about 0; None without priors.
+    their entries that lie in these columns. The coefficient of a remaining column k alone is then entry (k, left) /
+    entry (k, k), with the precision of entry (k, k). `prior` (c,): precisions P of normal priors on the coefficients,
+    about 0; None without priors.
     """
     cross, matrix = gram[eliminated], gram[np.ix_(eliminated, eliminated)]
     if prior is not None:
@@ -45,9 +45,8 @@ def _limit_precisions(prior: Array, gram: Array) -> Array:
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    `gram` (E, m, m): Gram matrices of E equations, with the coefficients that recordings do not share already
-    eliminated (`eliminate_unshared`); `columns`: roles of their columns. Both results are 0 without information on the
-    leak.
+    `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`. Both results are 0 without information on
+    the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -66,9 +65,8 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     `judged`, `healthy`: Gram matrices (m, m) of the volume balance in the recording and of the sum of the healthy ones.
     Each of the two fits gives a coefficient for each direction of the motion and each loaded side. Their mean, weighted
     by the sums of squares of these columns in the recording, is the motion coefficient [m^2]. In the recording's fit
-    the coefficients of the motion, of its delay (`terms.LAG`) and of the leak are free. Without a free leak, the motion
-    would absorb leakage in proportion to the speed. All other coefficients have normal priors about the healthy ones
-    (`between` in `priors.toml`).
+    the coefficients of the motion, of its delay (`terms.LAG`) and of the leak are free: otherwise the motion would
+    absorb leakage. All other coefficients have normal priors about the healthy ones (`between` in `priors.toml`).
     """
     motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -90,24 +88,29 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
-    Their `between_deviation` is infinite, i.e. nothing is known of their differences between recordings. The leakage of
-    a pump that holds the load, which counts only within a recording, is not eliminated but set to zero first
-    (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations; `columns`: roles of their columns. In the
+    Their `between_deviation` is infinite. The leakage of a pump that holds the load, which counts only within a
+    recording, is set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations. In the
     result the rows and columns of these coefficients are zero.
     """
+    reduced = _remove_hold_leaks(gram, columns)
+    for e, roles in enumerate(columns):
+        reduced[e] = eliminate(reduced[e], roles.unshared)
+    return reduced
+
+
+def _remove_hold_leaks(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
+    """Return Gram matrices (..., E, m, m) with zeros for the leakage of a pump that only holds the load."""
     reduced = gram.copy()
     for e, roles in enumerate(columns):
         if roles.hold_leak is not None:
-            reduced[e][roles.hold_leak] = reduced[e][:, roles.hold_leak] = 0.0
-        reduced[e] = eliminate(reduced[e], roles.unshared)
+            reduced[..., e, roles.hold_leak, :] = reduced[..., e, :, roles.hold_leak] = 0.0
     return reduced
 
 
 def subtract_fit(gram: Array, fitted: Sequence[int], coefficients: Array, left: int) -> Array:
     """Replace the left side of a regression, in its Gram matrix (m, m), by the residual of a fit.
 
-    The residual is the left side minus the sum of the columns `fitted` times the `coefficients` (c,). `left`: index of
-    the column of the left side.
+    The residual is the left side, column `left`, minus the columns `fitted` times the `coefficients` (c,).
     """
     transform = np.eye(len(gram))
     transform[fitted, left] = -coefficients
@@ -119,20 +122,19 @@ def subtract_reference(
 ) -> tuple[Array, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings; `roles`:
-    roles of their columns. Returns three items:
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings. Returns the
+    arguments of `eliminate`:
 
     - Gram matrix (m, m) of the recording with the residual in place of the left side;
-    - indices of the c columns whose coefficients may differ between recordings;
-    - precisions (c,) of the priors on these differences.
+    - indices of the c columns whose coefficients may differ between recordings, with the leak only if `has_leak`;
+    - precisions (c,) of the priors on these differences; that of a laminar leak is the pump's (`between.pump`).
 
     The leak is always fitted to the reference recordings. Behind a servo valve, whose overlap can look like a leak, it
     then has the prior of a healthy piston. Other columns are fitted unless they may differ between recordings without
-    limit (infinite `between_deviation`). The c columns are the fitted ones, with the leak only if `has_leak` is true;
-    the prior on the difference of a laminar leak is that of the pump's leakage, `between.pump` (`priors.toml`).
+    limit (infinite `between_deviation`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
-    matrix, leak = reference[np.ix_(compared, compared)].copy(), compared.index(roles.leak)
+    matrix, leak = reference[np.ix_(compared, compared)], compared.index(roles.leak)
     matrix[leak, leak] += roles.healthy_conductance**-2  # precision of the prior; 0 if the healthy leakage is unknown
     coefficients = solve(matrix, reference[compared, roles.left])
     # of the laminar leak, even if another term takes its place in `roles.leak` (`ColumnRoles.replace_leak`)
@@ -149,12 +151,10 @@ def estimate_leak_excess(
     """Estimate the excess of a recording's leak coefficient over that of reference recordings, and the standard errors.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the reference recordings, for E
-    equations; `columns`: roles of their columns; `widths` (s,): factors on the prior standard deviations of the
-    differences between recordings in the coefficients of all terms but the leak. Both results (s,) are 0 where there is
-    no information.
-
-    The excess is fitted to the residual under the coefficients of the reference recordings (`subtract_reference`). The
-    coefficients of all other terms are eliminated. The precisions and moments of the equations are added up.
+    equations; `widths` (s,): factors on the prior standard deviations of the differences between recordings in the
+    coefficients of all terms but the leak. Both results (s,) are 0 where there is no information. The excess is fitted
+    to the residual under the coefficients of the reference recordings (`subtract_reference`); the precisions and
+    moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
@@ -181,22 +181,18 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
     information all weights are equal.
 
     `grams` (K, E, m, m): Gram matrices of the blocks for E equations; `reference` (E, m, m): that of the sum of the
-    reference recordings; `columns`: roles of their columns.
+    reference recordings.
     """
-    grams = grams.copy()
-    for e, roles in enumerate(columns):
-        if roles.hold_leak is not None:
-            grams[:, e, roles.hold_leak] = grams[:, e, :, roles.hold_leak] = 0.0
+    grams = _remove_hold_leaks(grams, columns)
     totals = grams.sum(axis=0)
     shared = eliminate_unshared(totals, columns)
     weights = np.zeros(len(grams))
     for e, roles in enumerate(columns):
         _, nuisance, prior = subtract_reference(shared[e], reference[e], roles)
         eliminated = [*nuisance, *roles.unshared]
-        prior = np.append(
-            _limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]), np.zeros(len(roles.unshared))
-        )
-        matrix = totals[e][np.ix_(eliminated, eliminated)] + np.diag(prior)
+        matrix = totals[e][np.ix_(eliminated, eliminated)]
+        n = len(nuisance)
+        matrix[:n, :n] += np.diag(_limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]))
         factors = solve(matrix, totals[e][eliminated, roles.leak])
         weights += grams[:, e, roles.leak, roles.leak] - grams[:, e, roles.leak][:, eliminated] @ factors
     total = float(weights.sum())

@@ -64,42 +64,48 @@ MAX_Z = 30.0
 def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
-    `columns`: roles of the columns of each equation, the same for all recordings. The rise and its standard deviation
-    are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The other coefficients may differ
-    between recordings within a prior. The result is an average over widths of this prior (`_compare_levels`).
+    The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The
+    result is an average over widths of the prior on the differences of the other coefficients between recordings
+    (`_compare_levels`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
     # factors on the prior standard deviations; log(`prior.between`) is the standard deviation of their logarithm
-    widths = prior.between ** np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
+    widths = prior.between**log_widths
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, 0))
     if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
-        projections = [
+        excesses = [
             estimate_leak_excess(recording.sums, healthy_sums - recording.sums, columns, widths)
             for recording in baseline
         ]
-        rises, rise_errors = (
-            np.array(estimates).T * ((count - 1) / count) for estimates in zip(*projections, strict=True)
-        )
+        rises, rise_errors = np.array(excesses).transpose(1, 2, 0) * ((count - 1) / count)
     values, error = estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = coefficient_level(healthy_sums, columns)
     # smallest scatter of the rises for each width: a fraction of their typical standard error, at least the fraction
     # `prior.finest` of the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * judged.conductance_of_flow, 1.0 / MAX_READING))
-    return _compare_levels(judged, baseline, _Estimates(values, rises, errors, level, level_error))
+    return _compare_levels(
+        judged,
+        baseline,
+        values=values,
+        rises=rises,
+        errors=errors,
+        log_widths=log_widths,
+        level=level,
+        level_error=level_error,
+    )
 
 
 def held_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
     """Estimate the rise of the leakage past the piston over healthy recordings, measured while valves hold a load.
 
-    The leak may have begun within the recording, whose mean then contains only a part of it (`Rise.may_be_partial`).
     Return None if no load is held in the judged recording, or in fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
     # a healthy piston alone leaks about nothing: such levels compare by their differences, not by their ratios
     min_crossover = INFERENCE.scatter.largest * judged.conductance_of_flow
-    held = _compare_held(judged, baseline, "held", min_crossover=min_crossover)
-    return None if held is None else held._replace(may_be_partial=True)
+    return _compare_held(judged, baseline, "held", min_crossover=min_crossover)
 
 
 def held_pump_rise(judged: RecordingSums, baseline: Sequence[RecordingSums]) -> Rise | None:
@@ -120,10 +126,10 @@ def _compare_held(
 ) -> Rise | None:
     """Estimate the rise of a leak, measured while valves hold a load, over its mean in the healthy recordings.
 
-    `baseline`: the healthy recordings; `name`: field of `RecordingSums` whose first two values are the leak's
-    conductance and standard deviation [m^3/(s Pa)]; `min_crossover`: as in `_Estimates`; `session_share`: standard
-    deviation between sessions, over the healthy mean, or None (`_Estimates.session_deviation`). Return None if the
-    field is None in the judged recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
+    `name`: field of `RecordingSums` whose first two values are the leak's conductance and standard deviation
+    [m^3/(s Pa)]; `min_crossover`: as in `_compare_levels`; `session_share`: standard deviation between sessions, over
+    the healthy mean, or None for its usual prior. Return None if the field is None in the judged recording, or known in
+    fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
     baseline = [recording for recording in baseline if getattr(recording, name) is not None]
     if getattr(judged, name) is None or len(baseline) < MIN_WITH_HOLDS:
@@ -133,7 +139,9 @@ def _compare_held(
     level = float(np.mean(healthy_leaks))
     min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)  # above 0
     error = np.maximum(np.median(leaks[:, 1]), min_error)
-    estimates = _Estimates(
+    rise = _compare_levels(
+        judged,
+        baseline,
         values=np.array([leak - level]),
         rises=(np.array(healthy_leaks) - level)[None],
         errors=error[None],
@@ -143,47 +151,41 @@ def _compare_held(
         session_deviation=None if session_share is None else session_share * abs(level),
     )
     # `error` is included already; a less precise judged recording adds the difference
-    return _compare_levels(judged, baseline, estimates).widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
+    return rise.widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
 
 
-class _Estimates(NamedTuple):
-    """Rises of the leak coefficient, estimated with each of s prior standard deviations of the other coefficients.
+def _compare_levels(
+    judged: RecordingSums,
+    baseline: Sequence[RecordingSums],
+    *,
+    values: Array,
+    rises: Array,
+    errors: Array,
+    log_widths: Array | float = 0.0,
+    level: float,
+    level_error: float,
+    min_crossover: float = 0.0,
+    session_deviation: float | None = None,
+) -> Rise:
+    """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
 
-    The priors are on differences between recordings. All fields have the unit of the coefficient.
+    The coefficients a, the sums of healthy mean and rise, are compared as z = asinh(a / (2 c)), which is logarithmic
+    for large a (`_LevelScale`). From z the predicted effect of the oil is subtracted. The rest is normal about an
+    unknown mean, with an unknown standard deviation sigma of single recordings; sessions, oil and unusual conditions
+    add covariances (see the module). In the unit of the coefficient, for s widths of the prior on the other
+    coefficients, or s = 1 if there is no such prior:
 
     - `values` (s,): rises of the judged recording; `rises` (s, n): rises of n healthy recordings over their mean;
-    - `errors` (s,): smallest plausible scatter of one rise, by its standard error;
+    - `errors` (s,): smallest plausible scatter of one rise, by its standard error; `log_widths` (s,): logarithms of the
+      widths [standard deviations], 0 without the prior;
     - `level`, `level_error`: mean coefficient of the healthy recordings, and its standard error;
-    - `min_crossover`: minimum of `_LevelScale.crossover`, large where healthy levels are about zero, which makes z
-      linear in them;
+    - `min_crossover`: minimum of c, large where healthy levels are about zero, which makes z linear in them;
     - `session_deviation`: prior standard deviation between sessions with the same oil, None for that of the whole
       leakage (`scatter.session` of `priors.toml`).
     """
-
-    values: Array
-    rises: Array
-    errors: Array
-    level: float
-    level_error: float
-    min_crossover: float = 0.0
-    session_deviation: float | None = None
-
-
-def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], estimates: _Estimates) -> Rise:
-    """Estimate by how much the judged leak coefficient exceeds the coefficient that the healthy recordings predict.
-
-    Each of the s rows of `estimates` belongs to one width of the prior on the other coefficients; there is one row if
-    no such prior is used. The coefficients a, the sums of healthy mean and rise, are compared as z = asinh(a / (2 c)),
-    which is logarithmic for large a (`_LevelScale`). From z the predicted effect of the oil is subtracted. The rest is
-    normal about an unknown mean, with an unknown standard deviation sigma of single recordings; sessions, oil and
-    unusual conditions add covariances (see the module).
-    """
-    values, rises, errors, level, level_error, min_crossover, session_deviation = estimates
     prior = INFERENCE.scatter
     if session_deviation is None:
         session_deviation = prior.session * judged.conductance_of_flow
-    # log width of the prior in each row, in standard deviations; estimates from holds have no such prior
-    log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES) if len(values) == SCALES else np.zeros(len(values))
     recordings = [*baseline, judged]
     oils = oil_hypotheses(recordings)
     # scatter that the oil does not explain: warmer oil is thinner and leaks more
@@ -202,9 +204,9 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
     max_scatter = min(steepness * prior.largest * judged.conductance_of_flow, prior.relative)
     max_sigma = np.maximum(max_scatter, 10.0 * steepness * errors)
     sigma = np.geomspace(steepness * errors, max_sigma, NODES, axis=1)
-    judged_z, healthy_z = scale.transform(values), scale.transform(rises)
+    healthy_z = scale.transform(rises)
     # log Jacobian of z, plus log prior of the width, for each row
-    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * log_widths**2
+    log_priors = np.log(scale.slope(level + rises)).sum(axis=1) - 0.5 * np.square(log_widths)
     predictions = []
     for oil in oils:
         thinned = level * np.exp(oil.thinning)  # predicted levels
@@ -217,10 +219,10 @@ def _compare_levels(judged: RecordingSums, baseline: Sequence[RecordingSums], es
             condition_deviation=relative_slope * (log_condition_excess * INFERENCE.conditions.leak),
         )
         shifts = scale.transform(thinned - level) - scale.transform(np.zeros(1))  # effect of the oil on z
-        predicted = Population(*candidates).predict(
-            judged_z - shifts[-1], healthy_z - shifts[:-1], sigma, log_priors + oil.log_probability
-        )
-        predictions.append(scale.to_levels(predicted, judged_z))  # with the effect of the oil again
+        log_weights = (log_priors + oil.log_probability)[:, None]
+        predicted = Population(*candidates).predict(healthy_z - shifts[:-1], sigma, log_weights)
+        with_oil = predicted._replace(centres=predicted.centres + shifts[-1])
+        predictions.append(scale.to_rises(with_oil))
     all_oils = Mixture(*(np.concatenate(parts, axis=1) for parts in zip(*predictions, strict=True)))
     return rise_of_mixture(all_oils, values)
 
@@ -236,10 +238,9 @@ def _candidate_covariances(
 ) -> tuple[Array, Array]:
     """Build g candidate covariances (g, n + 1, n + 1) of transformed leak coefficients, with log priors (g,).
 
-    The transform z = asinh(a / (2 c)) of a leak coefficient a (`_LevelScale`) is logarithmic for large coefficients.
     The candidates differ in the standard deviation between sessions. If the oil is unknown and no healthy recording is
     of the judged recording's session, they also differ in the oil of this session, which is either like that of the
-    healthy sessions or unlike it.
+    healthy sessions or unlike it. z is the transformed coefficient (`_LevelScale`).
 
     - `sessions` (n + 1,): session number of each recording, the judged one last;
     - `oil`: hypothesis on the oil's effect on the leakage of each recording;
@@ -263,8 +264,7 @@ def _candidate_covariances(
     covariances += np.diag(relative_slopes**2 * oil.variances)
     covariances[:, -1, -1] += condition_deviation**2
     if oil_deviation > 0.0 and sessions[-1] not in sessions[:-1]:
-        # two cases: the oil in the judged recording's session is like the oil in the healthy sessions, or unlike it;
-        # unlike oil adds the variance of a difference between two sessions
+        # like oil, or unlike oil, which adds the variance of a difference between two sessions
         unlike = INFERENCE.scatter.unlike
         log_priors = (np.log([[1.0 - unlike], [unlike]]) + log_priors).ravel()
         covariances = np.tile(covariances, (2, 1, 1))
@@ -289,16 +289,16 @@ class _LevelScale(NamedTuple):
         """Compute dz/da = 1 / sqrt(a^2 + (2 c)^2) at leak coefficients a = `level`, a number or an array."""
         return 1.0 / np.hypot(level, 2.0 * self.crossover)
 
-    def to_levels(self, predicted: Mixture, transformed: Array) -> Mixture:
+    def to_rises(self, predicted: Mixture) -> Mixture:
         """Convert a distribution of z to a distribution of the leak coefficient, relative to the healthy mean `level`.
 
-        `predicted`: mixture of normal distributions of z, shape (s, g, nodes) as from `Population.predict`, with log
-        weights and centres relative to `transformed` (s,), the z of the judged recording. Each normal distribution is
-        split into `PARTS` narrower ones, along a new last axis, with the same mean and variance together.
+        `predicted`: mixture of normal distributions, as from `Population.predict`. Each is split into `PARTS` narrower
+        ones, along a new last axis, with the same mean and variance together.
         """
         x, part_weights = np.polynomial.hermite_e.hermegauss(PARTS)  # centres of the parts [standard deviations]
-        centres, deviations = predicted.centres + transformed[:, None, None], predicted.deviations[..., None]
-        z = np.clip(centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x, -MAX_Z, MAX_Z)
+        deviations = predicted.deviations[..., None]
+        z = predicted.centres[..., None] + np.sqrt(1.0 - PART_WIDTH**2) * deviations * x
+        z = np.clip(z, -MAX_Z, MAX_Z)
         return Mixture(
             predicted.weights[..., None] + np.log(part_weights / part_weights.sum()),
             2.0 * self.crossover * np.cosh(z) * PART_WIDTH * deviations,  # da/dz times the deviation of a part
@@ -309,10 +309,9 @@ class _LevelScale(NamedTuple):
 def leak_deviations_from_mean(recordings: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Array:
     """Compute the deviation of each recording's leak coefficient from the mean of all n recordings, shape (n,).
 
-    It is (n - 1)/n times the difference from the common leak coefficient of the other n - 1 recordings. The other
-    coefficients of the balance may differ between recordings within their priors (`between` in `priors.toml`), and the
-    flow offset by any amount, as it does in any case behind valves that shut at rest. Both assumptions on the valves,
-    which are compared by these deviations, are thus treated alike.
+    It is (n - 1)/n times the difference from the common leak coefficient of the others. The flow offset may differ by
+    any amount between recordings, as it does behind valves that shut at rest: both assumptions on the valves, which
+    are compared by these deviations, are thus treated alike.
     """
     columns = [roles.with_free_zero() for roles in columns]  # so that `eliminate_unshared` eliminates the flow offset
     all_sums = [eliminate_unshared(recording.sums, columns) for recording in recordings]

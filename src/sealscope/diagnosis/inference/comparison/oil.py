@@ -34,15 +34,6 @@ class OilHypothesis(NamedTuple):
     session_deviation: float = 0.0
 
 
-def predict_thinning(recordings: Sequence[RecordingSums]) -> Array:
-    """Predict the rise of each recording's log leakage by thinner oil, shape (n + 1,), the judged recording last.
-
-    The rise is relative to the healthy mean, and follows from the most probable of the `oil_hypotheses`. It is 0 if
-    nothing shows the oil's viscosity.
-    """
-    return oil_hypotheses(recordings)[0].thinning
-
-
 def oil_hypotheses(recordings: Sequence[RecordingSums]) -> list[OilHypothesis]:
     """List the hypotheses on how the oil changed the leakage of `recordings`, the judged one last, most probable first.
 
@@ -83,8 +74,7 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
 
     Each hypothesis is listed twice: once with the judged drop as a sign of the oil, and once, with the small prior
     probability `oil.drop_misleads`, without this sign, as if something else, such as a swollen seal, had changed the
-    judged drop. What swells or wears a seal changes its friction, too, so that in the second case the friction has the
-    density of the first hypothesis: a judged friction like the healthy one makes this case less probable.
+    judged drop. That changes the friction, too, which therefore has the density of the first hypothesis.
 
     A drop predicts the thinning -`oil.per_drop` r (log drop - mean of the healthy ones), with the reliability r, the
     variance of true drops over that of measured ones. A drop below its standard error is replaced by this error. A
@@ -104,44 +94,40 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     sign = np.sign((friction / friction_error)[healthy].sum()) or 1.0
     friction, drop = sign * friction, sign * drop
     healthy_friction, top_speed = (float(np.median(values[healthy])) for values in (friction, speed))
-    drops, log_densities, log_changed = [drop], np.zeros(1), 0.0
+    drops, log_densities = [drop], np.zeros(1)  # one for each hypothesis
     if min(healthy_friction, friction[-1]) > 0.0:  # else their ratio has no logarithm
         drops.append(drop + (friction - healthy_friction) / top_speed)
         change = float(np.log(friction[-1] / healthy_friction))
         # prior deviations of this change under the two hypotheses: friction changed, or did not
         deviations = np.array([prior.friction_changes, prior.friction_session])
         log_densities = -0.5 * (change / deviations) ** 2 - np.log(deviations)
-        log_changed = float(log_densities[0])
     drops_by_hypothesis = np.maximum(drops, drop_error)  # (hypotheses, n + 1)
     healthy_logs = np.log(drops_by_hypothesis[:, healthy])
     squares = (healthy_logs - healthy_logs.mean(axis=1, keepdims=True)) ** 2
     squares += (drop_error[healthy] / drops_by_hypothesis[:, healthy]) ** 2
     log_scatters = -0.5 * (len(healthy) - 1) * np.log(squares.sum(axis=1))
-    log_misleads = np.log(prior.drop_misleads) + log_changed + log_scatters
+    log_misleads = np.log(prior.drop_misleads) + log_densities[0] + log_scatters
     log_tells = np.log1p(-prior.drop_misleads) + log_densities + log_scatters
     log_sum = np.logaddexp.reduce(np.concatenate([log_tells, log_misleads]))
     log_probabilities = np.log(prior.drop_tells) + np.column_stack([log_tells, log_misleads]) - log_sum
-    variance, oils = unknown_deviation**2, list[OilHypothesis]()
-    for positive_drops, mean, (log_tells_oil, log_tells_nothing) in zip(
-        drops_by_hypothesis, healthy_logs.mean(axis=1).tolist(), log_probabilities.tolist(), strict=True
+    variance = unknown_deviation**2
+    judged_unknown = is_known.copy()
+    judged_unknown[-1] = False
+    oils = list[OilHypothesis]()
+    for positive_drops, mean, probabilities in zip(
+        drops_by_hypothesis, healthy_logs.mean(axis=1), log_probabilities.tolist(), strict=True
     ):
         error_variance = (prior.per_drop * drop_error / positive_drops) ** 2
-        slope_deviation = prior.per_drop_deviation / prior.per_drop
-        is_judged = np.arange(len(recordings)) == len(recordings) - 1
-        for is_informative, log_probability in (
-            (is_known, log_tells_oil),
-            (is_known & ~is_judged, log_tells_nothing),
-        ):
+        for is_informative, log_probability in zip((is_known, judged_unknown), probabilities, strict=True):
             # variance of the true drop over that of the measured one
             reliability = np.where(is_informative, variance / (variance + error_variance), 0.0)
+            log_ratio = np.where(is_informative, np.log(positive_drops) - mean, 0.0)
             oils.append(
                 OilHypothesis(
-                    thinning=-prior.per_drop
-                    * reliability
-                    * np.where(is_informative, np.log(positive_drops) - mean, 0.0),
+                    thinning=-prior.per_drop * reliability * log_ratio,
                     variances=(1.0 - reliability) * variance,
                     log_probability=log_probability,
-                    slope_deviation=slope_deviation,
+                    slope_deviation=prior.per_drop_deviation / prior.per_drop,
                 )
             )
     return oils

@@ -23,13 +23,8 @@ MAX_RECORDINGS = 60
 class Population:
     """Joint normal distribution of n healthy values and a judged one about an unknown common mean.
 
-    Parameters
-    ----------
-    candidates : array of float, shape (g, n + 1, n + 1)
-        Candidate covariances between the values, the judged one last. They are in addition to the variance sigma^2 of
-        each value; n is at least 1.
-    log_priors : array of float, shape (g,)
-        Log prior probability of each candidate.
+    `candidates` (g, n + 1, n + 1): candidate covariances between the values, the judged one last, in addition to the
+    variance sigma^2 of each value; n is at least 1. `log_priors` (g,): log prior probability of each candidate.
     """
 
     def __init__(self, candidates: Array, log_priors: Array) -> None:
@@ -38,8 +33,8 @@ class Population:
         self._sample = np.unique(np.linspace(0, n - 1, min(n, MAX_RECORDINGS)).astype(int))
         healthy = candidates[:, self._sample[:, None], self._sample]
         eigen, basis = np.linalg.eigh(healthy)
-        # The other quantities are components along these eigenvectors, of shape (g, 1, n); the second axis is for the
-        # grid of sigma. `_cross`: covariance of each healthy value with the judged one; `_ones`: vector of ones.
+        # components along these eigenvectors (g, 1, n), of the covariance of each healthy value with the judged one,
+        # and of a vector of ones; the second axis is for the grid of sigma
         self._eigen, self._basis = np.maximum(eigen, 0.0)[:, None], basis
         self._cross = np.einsum("gij,gi->gj", basis, candidates[:, self._sample, n])[:, None]
         self._ones = basis.sum(axis=1)[:, None]
@@ -48,64 +43,31 @@ class Population:
     def rise(self, values: Array, healthy_values: Array, prior_sigma: float, freedom: float) -> Rise:
         """Estimate by how much the judged value exceeds its prediction from healthy values of unknown scatter.
 
-        Parameters
-        ----------
-        values : array of float, shape (s,)
-            The judged value by s alternative estimates, weighted by the likelihood of the healthy values.
-        healthy_values : array of float, shape (s, n)
-            The healthy values by the same estimates.
-        prior_sigma, freedom : float
-            Scale and degrees of freedom of the scaled inverse chi-squared prior on the variance of the values.
-
-        Returns
-        -------
-        Rise
-            In the unit of the values; with an infinite deviation if the squares would overflow.
+        `values` (s,): the judged value by s alternative estimates, weighted by the likelihood of the healthy values;
+        `healthy_values` (s, n): the healthy values by the same estimates; `prior_sigma`, `freedom`: scale and degrees
+        of freedom of the scaled inverse chi-squared prior on the variance of the values. The deviation of the result is
+        infinite if the squares would overflow.
         """
         count = len(self._sample)
         healthy = healthy_values[:, self._sample]
-        sums_of_squares = freedom * prior_sigma**2 + np.sum(
-            (healthy - healthy.mean(axis=1, keepdims=True)) ** 2, axis=1
-        )
-        if not 1e4 * sums_of_squares.max() < MAX_READING:  # would overflow: return a rise without a bound
+        sums_of_squares = freedom * prior_sigma**2 + count * healthy.var(axis=1)
+        if not 1e4 * sums_of_squares.max() < MAX_READING:
             return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=freedom)
-        # limits of a log-spaced grid of sigma, far below and far above the probable values
+        # limits of the grid of sigma, far below and far above the probable values
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
         sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)
-        log_prior = -0.5 * freedom * (np.log(sigma**2) + prior_sigma**2 / sigma**2)
-        predicted = self.predict(values, healthy_values, sigma, np.zeros(len(values)), log_prior)
-        return rise_of_mixture(predicted._replace(centres=predicted.centres + values[:, None, None]), values)
+        log_priors = -0.5 * freedom * (np.log(sigma**2) + prior_sigma**2 / sigma**2)
+        return rise_of_mixture(self.predict(healthy_values, sigma, log_priors), values)
 
-    def predict(
-        self,
-        values: Array,
-        healthy_values: Array,
-        sigma: Array,
-        log_priors: Array,
-        sigma_log_prior: Array | float = 0.0,
-    ) -> Mixture:
+    def predict(self, healthy_values: Array, sigma: Array, log_priors: Array) -> Mixture:
         """Predict the judged value from the healthy ones by kriging, as a mixture of normal distributions.
 
         The prediction is m + c' V^-1 (x - m) for the healthy values x: V is their covariance, c their covariance with
-        the judged value, and m the generalised least-squares mean.
-
-        Parameters
-        ----------
-        values, healthy_values : array of float, shape (s,) and (s, n)
-            The judged value and the healthy values x, by s alternative estimates.
-        sigma : array of float, shape (s, nodes)
-            Standard deviations of the values: a log-spaced grid of `NODES` for each estimate.
-        log_priors : array of float, shape (s,)
-            Log prior of each estimate.
-        sigma_log_prior : array of float, shape (s, nodes), or float
-            Log prior density of log sigma at the grid points.
-
-        Returns
-        -------
-        Mixture
-            Log weights, standard deviations, and centres relative to `values`, of shape (s, g, nodes), for g candidate
-            covariances.
+        the judged value, and m the generalised least-squares mean. `healthy_values` (s, n): the healthy values, by s
+        alternative estimates; `sigma` (s, nodes): standard deviations of the values, a log-spaced grid for each
+        estimate; `log_priors` (s, nodes or 1): log prior of the estimate and of log sigma. Returns log weights,
+        standard deviations and centres of shape (s, g, nodes).
         """
         healthy = healthy_values[:, self._sample]
         variance = sigma[:, None] ** 2  # (s, 1, nodes)
@@ -118,11 +80,10 @@ class Population:
         log_likelihood = 0.5 * (
             np.log(weight).sum(axis=-1) - np.log(precision) - (weighted_residual * rotated).sum(axis=-1)
         )
-        log_likelihood += self._log_priors + np.reshape(log_priors, (-1, 1, 1))
         # add the log of the prior density of log sigma, times the spacing of its grid
         log_spacing = np.log(np.log(sigma[:, 1:2] / sigma[:, :1]))
-        log_likelihood += np.broadcast_to(sigma_log_prior, sigma.shape)[:, None] + log_spacing[:, None]
-        centres = mean + (weighted_residual * cross).sum(axis=-1) - values[:, None, None]
+        log_likelihood += self._log_priors + (log_priors + log_spacing)[:, None]
+        centres = mean + (weighted_residual * cross).sum(axis=-1)
         mean_deficit = 1.0 - (weighted_ones * cross).sum(axis=-1)  # weight of the estimated mean in the prediction
         variances = variance + self._judged_variance - (weight * cross**2).sum(axis=-1) + mean_deficit**2 / precision
         return Mixture(log_likelihood, np.sqrt(variances), centres)

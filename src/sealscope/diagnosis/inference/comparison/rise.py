@@ -12,6 +12,7 @@ from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
+from sealscope.signals.smoothing import TINY
 
 #: `Observable.data` of the leakage against healthy recordings.
 RISE = "rise"
@@ -19,8 +20,6 @@ RISE = "rise"
 NODES = 32
 #: Reach of a grid of rises [standard deviations].
 MAX_LOG = 4.0
-#: Lower limit of divisors and of arguments of logarithms.
-TINY = 1e-300
 #: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
 NEGLIGIBLE = 16.0
 #: Number of parts of a large mixture that give the first estimate of a quantile, and step for the slope there.
@@ -71,7 +70,6 @@ class Rise(NamedTuple):
     - `value`, `deviation`: estimate and standard deviation, in the unit of the coefficient;
     - `mixture`: distribution of `value` in a healthy recording. If None, `value` / `deviation` is Student's t with
       `degrees_of_freedom`;
-    - `may_be_partial`: the leak may have begun within the recording, whose mean then contains only a part of the rise;
     - `share`: fraction of the allowed false alarms that is left to this rise, by which its p-value is divided.
     """
 
@@ -79,14 +77,10 @@ class Rise(NamedTuple):
     deviation: float
     degrees_of_freedom: float
     mixture: Mixture | None = None
-    may_be_partial: bool = False
     share: float = 1.0
 
     def share_alarms(self, share: float) -> Rise:
-        """Return a copy that may cause only the fraction `share` of the allowed false alarms, as one of several tests.
-
-        The p-value is divided by `share` (weighted Bonferroni correction).
-        """
+        """Return a copy that gets only the fraction `share` of the allowed false alarms, as one of several tests."""
         return self._replace(share=share)
 
     def widen(self, variance: float) -> Rise:
@@ -125,26 +119,18 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
 
-        `rise` is in the unit of `value`, with which both hypotheses are compared. `log_deviation`: standard deviation
-        of the logarithm of the true rise about log(`rise`); 0 if the true rise is exactly `rise`. If `log_deviation` is
-        0 and `may_be_partial` is true, `value` may contain any fraction of the rise, and the likelihood is averaged
-        over the fraction.
+        `log_deviation`: standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is
+        exactly `rise`, in the unit of `value`.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
-        densities = [self._log_density(self.value - rise)]
-        if self.may_be_partial and rise > 0.0:
-            densities = [self._log_density(self.value - part) for part in np.linspace(0.0, rise, NODES)]
-            if 0.0 < self.value < rise:  # the likeliest fraction, which the grid may miss
-                densities.append(self._log_density(0.0))
-        return float(np.logaddexp.reduce(densities) - np.log(len(densities))) - self._log_density(self.value)
+        return self._log_density(self.value - rise) - self._log_density(self.value)
 
     def log_ratio_within(self, rise: float, tail: float) -> float:
         """Compute the log likelihood ratio of a rise by `rise` to no rise, robust to an outlying estimate `value`.
 
-        Both densities of `value` have a floor: the smaller of the densities of a healthy recording at its quantiles
-        `tail` and 1 - `tail` (for a `share` of 1). An estimate that is improbable with the rise and without it is
-        therefore evidence for neither.
+        Both densities of `value` are at least the smaller of those of a healthy recording at its quantiles `tail` and
+        1 - `tail`: an estimate that is improbable with the rise and without it is evidence for neither.
         """
         tail_values = [self.threshold(chance) * self.deviation for chance in (tail, 1.0 - tail)]
         min_log_density = min(self._log_density(value) for value in tail_values)
@@ -152,10 +138,9 @@ class Rise(NamedTuple):
         return with_rise - max(self._log_density(self.value), min_log_density)
 
     def _log_ratio_lognormal(self, rise: float, log_deviation: float) -> float:
-        """Compute the log likelihood ratio of two hypotheses: a true rise of about `rise`, and no rise.
+        """Compute the log likelihood ratio of a true rise with a log-normal prior (`log_ratio`) to no rise.
 
-        The true rise has a log-normal prior: its logarithm is normal about log(`rise`), with the standard deviation
-        `log_deviation`. The integral over it uses a grid that resolves both the prior and the likelihood.
+        The integral over the prior uses a grid that resolves both the prior and the likelihood.
         """
         grid_deviations = np.linspace(-MAX_LOG, MAX_LOG, NODES)
         grid = np.concatenate(
@@ -181,12 +166,8 @@ class Rise(NamedTuple):
         return float(np.logaddexp.reduce(log_weights - 0.5 * ((value - centres) / deviations) ** 2))
 
     def bound(self) -> float:
-        """Compute the 95 % upper bound of the true rise, in the unit of `value`; a negative `value` counts as zero.
-
-        The score threshold(0.95), which a healthy recording exceeds with this probability, is usually negative:
-
-            bound = max(value, 0) - threshold(0.95) deviation.
-        """
+        """Compute the 95 % upper bound of the true rise, in the unit of `value`; a negative `value` counts as zero."""
+        # a healthy recording exceeds this score with a probability of 95 %; it is usually negative
         return max(self.value, 0.0) - self.threshold(BOUND_PROBABILITY) * self.deviation
 
     def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
@@ -205,9 +186,8 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     """Estimate the rise of a judged value over the value that healthy recordings predict for it.
 
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
-    ...), with log weights. The difference of judged and predicted value follows the mixture over all estimates, without
-    parts of negligible weight. The rise is the median of this difference, and the standard deviation is half the width
-    of the central 68 % interval, infinite if no weight is a number.
+    ...), with log weights. The rise is the median of judged minus predicted value over all estimates, and its standard
+    deviation is half the width of the central 68 % interval, infinite if no weight is a number.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()
@@ -233,9 +213,8 @@ def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatte
         deviation^2 = (m s^2 + ((n - 1)/n)^2 sum d_j^2) / (m + n - 1) (1 + 1/n).
     """
     prior, count = INFERENCE.scatter, len(deviations)
-    sum_of_squares = prior.freedom * prior_scatter * prior_scatter
     freedom = prior.freedom + count - 1
-    if count > 1:
-        sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
+    sum_of_squares = prior.freedom * prior_scatter**2
+    sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
     deviation = max(float(np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))), np.finfo(float).tiny)
     return Rise(value, deviation, degrees_of_freedom=freedom)

@@ -28,9 +28,8 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
     """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
     The spread due to white noise is removed first (see the module). `pressure` (n,): samples [Pa] at the sampling
-    `rate` [Hz], NaN where missing. They are used in pieces of `SMOOTHED` seconds, and only whole pieces within whole
-    strides of the weak form count, without a missing sample; a shorter `pressure` is one stride. The means (PARTS,) are
-    zeros if no piece counts.
+    `rate` [Hz], NaN where missing. Only whole pieces within whole strides of the weak form count, without a missing
+    sample; a shorter `pressure` is one stride. The means (PARTS,) are zeros if no piece counts.
     """
     piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
     stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]

@@ -29,7 +29,7 @@ RIDGE = 1e-10
 #: Maximum number of iterations to a fixed point, and the mean relative change of the weights that ends them.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-2
 #: Standard deviation of normal values over the median of their magnitudes.
-_SIGMA = 1.4826
+SD_PER_MEDIAN = 1.4826
 _Indices = NDArray[np.intp]
 
 
@@ -54,10 +54,7 @@ class Workspace(NamedTuple):
 
 
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
-    """Return the shapes of the scratch arrays of a `Workspace`, in the order of its fields.
-
-    `columns` includes the left side, `slow` (the number of columns with one coefficient for all blocks) does not.
-    """
+    """Return the shapes of a `Workspace`; `columns` includes the left side, `slow` does not."""
     return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
 
 
@@ -124,10 +121,9 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 @large_law
 def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
-    """Eliminate the fast coefficients, which each block fits separately, from the Gram matrix `gram` (m, m) of a block.
+    """Copy a block's Gram matrix `gram` (m, m) to `reduced` (c, c), and eliminate its fast coefficients there.
 
-    `reduced` (c, c) receives the result. `column_order` (c,): the columns of `gram` that are copied to `reduced`, in
-    this order, the `n_fast` fast ones first.
+    `column_order` (c,): the copied columns in their order, the `n_fast` fast ones first.
     """
     for i in range(len(column_order)):
         for j in range(len(column_order)):
@@ -139,9 +135,8 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
-    The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0.
-    `values`, `ends`, `column_order`, `workspace`: as in `weigh_rows`. Weights and residuals in the workspace are
-    replaced.
+    The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0. The
+    arguments are those of `weigh_rows`.
     """
     count, left, block = len(values), len(column_order) - 1, 0  # left: position of the left side in `column_order`
     for r in range(count):
@@ -151,7 +146,7 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
         for i in range(left):
             residual -= workspace.fit[block, i] * values[r, column_order[i]]
         workspace.residual[r] = workspace.ordered[r] = abs(residual)
-    limit, change = HUBER * _SIGMA * median(workspace.ordered, count), 0.0
+    limit, change = HUBER * SD_PER_MEDIAN * median(workspace.ordered, count), 0.0
     for r in range(count):
         weight = limit / workspace.residual[r] if limit > 0.0 and workspace.residual[r] > limit else 1.0
         change += abs(weight / workspace.weights[r] - 1.0)
@@ -172,26 +167,13 @@ def weigh_rows(
 ) -> None:
     """Weight the rows of K blocks by Huber's weights, and compute the Gram matrix of each block.
 
-    Parameters
-    ----------
-    values : array of float, shape (r, m)
-        Rows of all blocks.
-    ends : array of int, shape (K,)
-        Index past the last row of each block.
-    column_order : array of int
-        Indices of the columns that are fitted: first the `n_fast` fast ones, then the slow ones, the left side last.
-    n_fast : int
-        Number of fast columns, whose coefficients are free in each block.
-    earlier_sums : array of float, shape (s + 1, s + 1)
-        Sums over earlier blocks for the s slow columns and the left side, scaled to `SUPPORT` blocks: the prior of the
-        fit. In the end they are moved in place towards the sums of these K blocks, by `update_fraction` of the
-        difference.
-    update_fraction : float
-        Weight of these blocks in the updated `earlier_sums`, from 0 to 1.
-    workspace : Workspace
-        Scratch arrays for intermediate results.
-    gram : array of float, shape (K, m, m)
-        Receives the Gram matrices of the weighted rows.
+    - `values` (r, m): rows of all blocks; `ends` (K,): index past the last row of each block.
+    - `column_order`: indices of the columns that are fitted: first the `n_fast` fast ones, then the slow ones, the left
+      side last.
+    - `earlier_sums` (s + 1, s + 1): sums over earlier blocks for the s slow columns and the left side, scaled to
+      `SUPPORT` blocks: the prior of the fit. In the end they are moved in place towards the sums of these K blocks, by
+      the fraction `update_fraction` of the difference.
+    - `workspace`: scratch arrays (`Workspace`); `gram` (K, m, m): receives the Gram matrices of the weighted rows.
     """
     n_rows, left, n_blocks = len(values), len(column_order) - 1, len(ends)
     n_slow, normal, reduced = left - n_fast, workspace.normal, workspace.reduced
@@ -229,8 +211,7 @@ def block_gram_matrices(
 ) -> Array:
     """Compute the Gram matrices (K, m, m) of K blocks from rows with Huber's weights, and update `earlier_sums`.
 
-    `fast`: indices of the columns whose coefficients are free in each block; `slow`: those with one coefficient for all
-    blocks, the left side last. For the other arguments see `weigh_rows`.
+    `fast`, `slow`: indices of the columns, the left side last. For the other arguments see `weigh_rows`.
     """
     column_order = np.concatenate([fast, slow])
     shapes = workspace_shapes(rows=len(values), blocks=len(ends), columns=len(column_order), slow=len(slow) - 1)

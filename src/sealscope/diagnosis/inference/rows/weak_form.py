@@ -32,8 +32,6 @@ SPAN = 4
 MIN_WEIGHT = 0.1
 #: Limit of integrals that count as readings of a sensor: squares of larger ones might overflow.
 MAX_READING = 1e100
-#: Sampling rate at which the overlap of test functions is computed [Hz]; fine enough that the factor has converged.
-_FINE_RATE = 1e4
 
 
 class Rows(NamedTuple):
@@ -60,62 +58,49 @@ def half_width(rate: float) -> float:
 
 
 def strides_in(seconds: float, rate: float) -> int:
-    """Convert a time [s] to a number of strides, the distances of neighbouring test functions.
+    """Convert a time [s] to a number of strides (distances of test functions), at least `SPAN`.
 
-    It is at least `SPAN`, the length of a test function. A stride is taken as `STRIDE`, or as its length in samples if
-    that is longer, as for slow loggers.
+    A stride is `STRIDE`, or its length in samples if that is longer, as for slow loggers.
     """
     return max(SPAN, round(seconds / max(STRIDE, stride_samples(rate) / rate)))
 
 
 @lru_cache(maxsize=8)
 def test_function(rate: float) -> Array:
-    """Compute the test function phi [1/s] in the middle of each sampling interval of its support.
+    """Compute the test function phi [1/s], bell-shaped with the integral 1, in the middle of each sampling interval.
 
-    It is bell-shaped with the integral 1. `rate`: sampling rate [Hz]. The result has the shape (SPAN, stride): each row
-    is the part of the test function over one stride of samples.
+    `rate`: sampling rate [Hz]. The result has the shape (SPAN, stride): each row is the part of the test function over
+    one stride of samples.
     """
     stride = stride_samples(rate)
     s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0  # -1 to 1 over the support
     phi = (1.0 - s * s) ** 4
-    return np.asarray(phi * (rate / phi.sum())).reshape(SPAN, stride)
+    # stored by columns: BLAS reads the transpose fastest
+    return np.asfortranarray((phi * (rate / phi.sum())).reshape(SPAN, stride))
 
 
-@lru_cache(maxsize=8)
-def _transposed_test_function(rate: float) -> Array:
-    """Return the transpose (stride, SPAN) of `test_function`, in the memory order that BLAS reads fastest."""
-    return np.ascontiguousarray(test_function(rate).T)
-
-
-def _variance_inflation() -> float:
-    """Compute the factor by which the overlap of test functions inflates the variance of a sum over their rows.
-
-    The noise of the samples is assumed to be white.
-    """
-    phi = test_function(_FINE_RATE).ravel()
-    stride, energy = len(phi) // SPAN, float(phi @ phi)
-    return 1.0 + 2.0 * sum(float(phi[k * stride :] @ phi[: -k * stride]) / energy for k in range(1, SPAN))
-
-
-#: Factor by which sums over overlapping rows of white noise vary more than over independent rows.
-OVERLAP = _variance_inflation()
+_phi = test_function(1e4).ravel()  # at a rate [Hz] at which `OVERLAP` has converged
+_stride = len(_phi) // SPAN
+#: Variance of a sum over overlapping rows of white noise, relative to independent rows.
+OVERLAP = 1.0 + 2.0 * sum(
+    float(_phi[k * _stride :] @ _phi[: -k * _stride]) / float(_phi @ _phi) for k in range(1, SPAN)
+)
 
 
 def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     """Compute the rows of a regression in weak form: the integrals of c columns, weighted by each test function.
 
     `increments`: for each column its increments (n,) between samples, NaN where missing; `rate`: sampling rate [Hz].
-
-    The samples are divided into pieces as long as the distance of neighbouring test functions (`stride_samples`). Each
-    test function spans `SPAN` pieces, and gives one row if it lies within the samples. A piece with a missing sample,
-    or with integrals beyond `MAX_READING`, counts as zeros, and its rows are not `whole`.
+    Each test function spans `SPAN` pieces of samples as long as the distance of neighbouring ones (`stride_samples`),
+    and gives one row if it lies within the samples. A piece with a missing sample, or with integrals beyond
+    `MAX_READING`, counts as zeros, and its rows are not `whole`.
     """
     stride = stride_samples(rate)
     n_pieces = len(increments[0]) // stride
     n_rows = max(0, n_pieces - SPAN + 1)
     pieces = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
     # integrals of each column over each piece, times each of the SPAN parts of the test function
-    integrals: Array = (pieces @ _transposed_test_function(rate)).reshape(len(increments), n_pieces, SPAN)
+    integrals: Array = (pieces @ test_function(rate).T).reshape(len(increments), n_pieces, SPAN)
     is_usable = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
     integrals[:, ~is_usable] = 0.0
     values: Array = np.zeros((n_rows, len(increments)))
@@ -128,10 +113,10 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
 
 
 def weights_near_holes(holes: Array, rate: float) -> Array:
-    """Compute the weight (r,) of each row of the regression: the fraction of its test function outside of holes.
+    """Compute the weight (r,) of each row: the fraction of its test function outside of holes, 0 below `MIN_WEIGHT`.
 
     `holes` (n,): 1 for a sample in a hole, a long gap of missing samples that was filled in, else 0; `rate`: sampling
-    rate [Hz]. A weight below `MIN_WEIGHT` is replaced by 0.
+    rate [Hz].
     """
     # length [s] of each sampling interval that touches a hole, else 0; the sum of these lengths, weighted by a test
     # function of integral 1, is the fraction of the function in holes

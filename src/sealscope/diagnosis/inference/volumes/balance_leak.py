@@ -421,8 +421,8 @@ class BalanceLeak(LeakMeasure):
             step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
             return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
         log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
-        whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
-        step_log_ratio = whole_rise.log_ratio(step.fitted.value, log_deviation)
+        # after the onset the holds show the whole step
+        step_log_ratio = rise_after.log_ratio(step.fitted.value, log_deviation)
         return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
 
     def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Estimate | None]:

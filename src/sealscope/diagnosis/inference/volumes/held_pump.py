@@ -18,7 +18,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.inference.changes.motion_fit import fit_robustly, influence_factor, jackknife_errors
+from sealscope.diagnosis.inference.changes.motion_fit import fit_robustly
 from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.onset import Estimate
@@ -63,13 +63,12 @@ def estimate_pump_leakage(
     conductance = mean_flow / mean_pressure
     values = flow[rows] / conductance
     design = np.column_stack([pressure[rows], speed[rows], pressure_rate[rows]])  # column 0: leakage
-    coefficients, weight = fit_robustly(design, values)
     groups = np.repeat(np.arange(len(windows)), [len(samples) for samples in windows])
-    errors = influence_factor(weight) * jackknife_errors(design * weight[:, None], values * weight, [0], groups)
+    (leakage,) = fit_robustly(design, values, [0], groups)
     is_A_loaded = float(np.median(pressure[rows])) > 0.0
     outside, outside_deviation = (
         (leaks.outside_A, leaks.deviation_A) if is_A_loaded else (leaks.outside_B, leaks.deviation_B)
     )
-    value = conductance * float(coefficients[0]) - leaks.piston - outside
-    deviation = float(np.linalg.norm([conductance * float(errors[0]), leaks.deviation, outside_deviation]))
+    value = conductance * leakage.value - leaks.piston - outside
+    deviation = float(np.linalg.norm([conductance * leakage.deviation, leaks.deviation, outside_deviation]))
     return Estimate(value, deviation) if np.isfinite([value, deviation]).all() else None

@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, eliminate, subtract_fit
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
 from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
-from sealscope.diagnosis.inference.comparison.oil import predict_thinning
+from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.differences import MIN_HEALTHY, compare_with_healthy, excess_error, size_penalty
@@ -89,7 +89,8 @@ def rival_rises(
             turning_columns = [roles.replace_leak(TURNING) for roles in columns]
             level, _ = coefficient_level(healthy_gram, turning_columns)
             # levels instead of changes, since the oil's viscosity scales the whole leakage
-            values = _without_oil(level + values, predict_thinning([*compress(healthy, is_known), judged]))
+            likeliest_oil, *_ = oil_hypotheses([*compress(healthy, is_known), judged])
+            values = _without_oil(level + values, likeliest_oil.thinning)
         *healthy_values, value = values.tolist()
         observable = compare_with_healthy(
             names[k],
