@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors import observation
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LeakCourse
-from sealscope.diagnosis.verdict.machine import assumed_rig, unstated_rig
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit, severity
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
@@ -238,7 +239,7 @@ def test_a_rig_is_loaded_once(foreign: Recording, monkeypatch: pytest.MonkeyPatc
         loaded.append(rig)
         return load_rig(rig)  # type: ignore[arg-type]
 
-    monkeypatch.setattr("sealscope.diagnosis.verdict.machine.load_rig", load)
+    monkeypatch.setattr("sealscope.diagnosis.assumed_rig.load_rig", load)
     assert diagnose(foreign, rig="thesis").machine is not None
     assert loaded == ["thesis"]
     assert not hasattr(observation, "load_rig")

@@ -15,6 +15,7 @@ from typing import Any, cast
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
@@ -27,7 +28,6 @@ from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, VOLUME_BALANCE, Evidence
-from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig

@@ -13,10 +13,10 @@ class HydraulicCircuit(NamedTuple):
 
     Other modules read the properties below instead of comparing circuits. `valve_controlled` (`valved` in `physics`)
     chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of `physics/solvers/limits.py`,
-    and the drawing of `reporting/schematic.py`; `pump_feeds_chambers` the volume balance (`equations` of
-    `diagnosis/inference/equations/balances.py`) and the controller's model of the drive (`control/drive.py`:
-    `drive_of`). A circuit that is only diagnosed needs no more than an entry in `CIRCUITS`, and its `value` among those
-    of the parameter.
+    and the drawing of `reporting/schematic.py`; `pump_feeds_chambers` and `feeds_one_chamber` the volume balance
+    (`equations` of `diagnosis/inference/equations/balances.py`), the former also the controller's model of the drive
+    (`control/drive.py`: `drive_of`). A circuit that is only diagnosed needs no more than an entry in `CIRCUITS`, and
+    its `value` among those of the parameter.
 
     Attributes
     ----------
@@ -34,6 +34,8 @@ class HydraulicCircuit(NamedTuple):
         The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
         chambers, but it cannot tell leakage of the pump from leakage past the piston. If the piston areas are equal,
         the balance does not need the piston's position.
+    feeds_one_chamber : bool
+        The pump delivers into one chamber at a time, through directional valves, and the other drains to the tank.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
@@ -54,6 +56,7 @@ class HydraulicCircuit(NamedTuple):
     simulated: bool
     valve_controlled: bool
     pump_feeds_chambers: bool
+    feeds_one_chamber: bool
     pump_is_measured: bool
     holds_load: bool
     flow_size: Literal["area", "displacement"]
@@ -62,6 +65,11 @@ class HydraulicCircuit(NamedTuple):
 
     def __str__(self) -> str:
         return f"{self.name} ({self.parameter} = {self.value})"
+
+    @property
+    def pump_moves_piston(self) -> bool:
+        """True if the piston moves by the flow of the pump, which no valve meters: into both chambers, or into one."""
+        return self.pump_feeds_chambers or self.feeds_one_chamber
 
     @property
     def size_parameters(self) -> tuple[str, ...]:
@@ -78,11 +86,23 @@ PUMP_CIRCUIT = HydraulicCircuit(
     simulated=True,
     valve_controlled=False,
     pump_feeds_chambers=True,
+    feeds_one_chamber=False,
     pump_is_measured=True,
     holds_load=False,
     flow_size="displacement",
     watched_by=(("p_A", "p_B", "x", "theta"), ("p_A", "p_B", "x", "omega")),
     needed_channels="p_A, p_B and the pump's theta or omega, a flow meter q_pump or the command u",
+)
+#: A pump that draws from a tank. Directional valves lead its flow to one chamber at a time; the other drains.
+OPEN_CIRCUIT = PUMP_CIRCUIT._replace(
+    name="pump-controlled in an open circuit",
+    parameter="pump.circuit",
+    value="open",
+    required={"valve.spool": "absent", "supply.drive": "absent"},
+    simulated=False,
+    pump_feeds_chambers=False,
+    feeds_one_chamber=True,
+    needed_channels="x, p_A, p_B and the pump's theta or omega, or a flow meter q_pump",
 )
 #: A servo valve between a supply and the cylinder.
 VALVE_CIRCUIT = HydraulicCircuit(
@@ -93,15 +113,16 @@ VALVE_CIRCUIT = HydraulicCircuit(
     simulated=True,
     valve_controlled=True,
     pump_feeds_chambers=False,
+    feeds_one_chamber=False,
     pump_is_measured=False,
     holds_load=True,
     flow_size="area",
     watched_by=(("p_A", "p_B", "p_1", "p_2", "u", "x"),),
     needed_channels="x, u, p_A, p_B (for leaks in holds), and p_1 of the supply for motion",
 )
-#: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As these two circuits cover
-#: all values of their parameter, a circuit that another parameter chooses must stand before them.
-CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
+#: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As the last two circuits
+#: cover all values of their parameter, a circuit that another parameter chooses must stand before them.
+CIRCUITS = (OPEN_CIRCUIT, PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:

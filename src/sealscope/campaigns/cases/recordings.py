@@ -15,8 +15,8 @@ import numpy as np
 from sealscope.campaigns.cases.row import STROKE, CaseRow, error_text
 from sealscope.campaigns.cases.scoring import INSPECTED, judge_record
 from sealscope.campaigns.plans.model import RecordedPlan, RecordingSet
+from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.inspection import inspect_recording
-from sealscope.diagnosis.verdict.machine import assumed_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings import read
 from sealscope.recordings.chambers import CHAMBERS

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.commissioned.cross_check import cross_check
 from sealscope.diagnosis.detectors.detector import log_failure, unusable_reason
 from sealscope.diagnosis.detectors.observation import healthy_surprisals, limit_threads
@@ -25,7 +26,6 @@ from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK
-from sealscope.diagnosis.verdict.machine import assumed_rig, infer_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
 from sealscope.paragraphs import format_count

@@ -134,6 +134,8 @@ def _describe_rig(rig: Rig | None) -> str:
         parts.append(f"piston {' and '.join(areas)} mm^2")
     if rig.states("pump.q_b"):
         parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
+    if rig.circuit.feeds_one_chamber:
+        parts.append("pump in an open circuit, as a recording shows")
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest, shut_at_rest, with_rests
+from sealscope.diagnosis.inference.equations.feed import feed_one_chamber
 from sealscope.diagnosis.inference.equations.signals import (
     AVERAGING_TIME,
     HALF_DIFFERENCE,
@@ -248,7 +249,7 @@ class BlockStream(SavedAttributes):
                 name: _absolute_offset(first_samples[name]) for name in ("p_A", "p_B") if name in samples
             }
             if self._finds_rests:
-                self._rest_limits = _find_rest_limits(first_samples, self._rate, self._balances[0])
+                self._rest_limits = find_rest_limits(first_samples, self._rate, self._balances[0])
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -569,7 +570,6 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     source = flow_source(names)
     # only a recorded flow of a pump shows whether valves cut the pump off
     may_shut = balances[0].name == CYLINDER and not balances[0].by_command and source != "q_supply"
-    stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     channels = {"x", "p_A", "p_B", str(source)}
     channels |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = bridged_samples(recording, channels)
@@ -577,6 +577,10 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         samples = derive_drive_signals(samples, rig, recording.rate)
     if may_shut:
         samples = _without_lowering(samples, recording.rate, balances[0])
+        if rig.circuit.feeds_one_chamber:
+            limits = find_rest_limits(samples, recording.rate, balances[0])
+            balances = (feed_one_chamber(balances[0], Signals(samples, recording.rate, rest_limits=limits)),)
+    stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
     make_stream = partial(BlockStream, stream_balances, recording.rate, block_s, n_first=None, start=start)
@@ -632,12 +636,12 @@ def _longest_hold(samples: Mapping[str, Array], rate: float, balance: Equation) 
 
     `samples`, `rate`, `balance`: as in `_without_lowering`.
     """
-    signals = Signals(samples, rate, rest_limits=_find_rest_limits(samples, rate, balance))
+    signals = Signals(samples, rate, rest_limits=find_rest_limits(samples, rate, balance))
     _, lengths = find_runs(signals.holding(balance.left) > 0.0).T  # [samples]
     return float(lengths.max(initial=0)) / rate
 
 
-def _find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
+def find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
     """Compute the flow of the pump and the speed of the piston below which they count as resting.
 
     Both are those of `max_rest_rate`, with two exceptions:

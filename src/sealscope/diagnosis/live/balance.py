@@ -161,7 +161,7 @@ class LiveBalance(SavedAttributes):
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)
-        self.cause: Cause = "piston or pump leak" if rig.circuit.pump_feeds_chambers else "piston leak"
+        self.cause: Cause = "piston or pump leak" if rig.circuit.pump_moves_piston else "piston leak"
         self.litres = self.states_flow(rig) if litres is None else litres
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column

@@ -220,6 +220,13 @@ class HeldPriors(PriorTable):
     creep: float  # [m/s] largest speed of a load that shut valves hold
 
 
+class FeedPriors(PriorTable):
+    """Chambers that a pump feeds."""
+
+    one: float  # log odds, before any recording, that the pump feeds one chamber at a time
+    scatter: float  # relative scatter of the ratio of flow to speed in either direction, a standard deviation
+
+
 class RestPriors(PriorTable):
     """A pump at rest, from which valves may cut off the cylinder; flows are divided by the mean flow in motion."""
 
@@ -264,6 +271,7 @@ class InferencePriors(PriorTable):
     zero: ZeroPriors
     healthy: HealthyPriors
     held: HeldPriors
+    feed: FeedPriors
     rest: RestPriors
 
 

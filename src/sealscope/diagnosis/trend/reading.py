@@ -12,6 +12,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.inference.blocks import ColumnRoles
@@ -27,7 +28,7 @@ from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.rms_change.blocks import JUDGED, measure_levels
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.diagnosis.trend.wear import ScatterPrior
-from sealscope.diagnosis.verdict.machine import AssumedMachine, assumed_rig
+from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig

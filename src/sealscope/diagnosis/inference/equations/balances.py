@@ -23,6 +23,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     LINES_TERM,
     LOADED_NULL_FLOW,
     LOCKED,
+    MOTIONS,
     MOVING_BIAS,
     NULL_FLOW,
     PRESSURES,
@@ -52,7 +53,7 @@ if TYPE_CHECKING:
 
 #: Terms of the balance of a cylinder whose flow is that of a pump, or of a meter in one of its lines.
 _CYLINDER = (
-    *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+    *map(motion_term, MOTIONS),
     *chamber_terms("A"),
     *chamber_terms("B"),
     LAG_TERM,
@@ -130,7 +131,7 @@ def _supply_equation(rig: Rig) -> Equation:
 
     air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
     terms = (
-        *(motion_term(outward, by_A) for outward in (True, False) for by_A in (True, False)),
+        *map(motion_term, MOTIONS),
         *while_fed("A", chamber_terms("A")),
         *while_fed("B", chamber_terms("B")),
         LAG_TERM,
@@ -193,7 +194,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     """
     # without p_2, a metered flow is preferred to an assumed pressure of the return
     has_return = "p_2" in channels or not channels & {*METERS}
-    if not rig.circuit.pump_feeds_chambers and {"x", "u", "p_1"} <= channels and has_return:
+    if not rig.circuit.pump_moves_piston and {"x", "u", "p_1"} <= channels and has_return:
         if not channels.issuperset(PRESSURES):
             return ()
         return tuple(_select_recorded_terms(_chamber_equation(side, rig, channels), channels) for side in "AB")

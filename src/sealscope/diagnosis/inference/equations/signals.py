@@ -107,15 +107,15 @@ class Signals:
         """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
-    def directed_step(self, outward: bool, by_A: bool) -> Array:
-        """Compute the increments (n - 1,) of x [m] in a given direction while a given side carries the load, else 0.
+    def direction_weights(self, outward: bool, by_A: bool) -> Array:
+        """Return 1 for each interval (n - 1,) of motion in a given direction while a given side carries the load.
 
         `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true if A carries the
-        load (`carried_by_A`), false if B does. If direction or loaded side change within an interval, half of its
-        increment counts.
+        load (`carried_by_A`), false if B does. The weight of other intervals is 0, and 1/2 if direction or loaded side
+        change within the interval.
         """
         is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
-        return interval_means(is_counted.astype(float)) * self.step("x")
+        return interval_means(is_counted.astype(float))
 
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.

@@ -88,6 +88,8 @@ class Equation(NamedTuple):
         1 if a flow into A is positive on the left side, -1 if it is negative.
     area_ratio : float
         Area of the piston on side B over that on side A; 1 in a balance of one chamber.
+    fed_outward : {"", "A", "B"}
+        Chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed circuit.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Equation(NamedTuple):
     by_command: bool = False
     flow_sign: float = 1.0
     area_ratio: float = 1.0
+    fed_outward: Literal["", "A", "B"] = ""
 
 
 #: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
@@ -150,10 +153,20 @@ LEAKS = (
 )
 
 
-def motion_term(outward: bool, by_A: bool) -> Term:
-    """Make the term of the piston's motion `outward` (to B) or inward, while side A (`by_A`) or B carries the load."""
-    name = f"motion {'out' if outward else 'in'}, {'A' if by_A else 'B'} carries"
-    return fitted_term(name, "m^2", lambda s: s.directed_step(outward, by_A), drift="motion", needs=("x",))
+#: Direction of the piston's motion (true: to B) and loaded side (true: A) of the terms of motion, by their names.
+MOTIONS = {
+    "motion out, A carries": (True, True),
+    "motion out, B carries": (True, False),
+    "motion in, A carries": (False, True),
+    "motion in, B carries": (False, False),
+}
+
+
+def motion_term(name: str) -> Term:
+    """Make the term of the piston's motion in one direction while one side carries the load (`MOTIONS`)."""
+    return fitted_term(
+        name, "m^2", lambda s: s.direction_weights(*MOTIONS[name]) * s.step("x"), drift="motion", needs=("x",)
+    )
 
 
 def chamber_terms(side: str) -> tuple[Term, ...]:

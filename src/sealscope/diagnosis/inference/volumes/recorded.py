@@ -33,6 +33,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.equations.feed import motions_of_side
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, Equation
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
@@ -396,7 +397,7 @@ class RecordedBalance:
         coefficients = dict(zip(nuisance, fitted, strict=True))
         areas, energies = [], []  # for A and B
         for side in "AB":  # columns of the motion under a load that this side carries
-            motion = [k for k in roles.motion if roles.names[k].endswith(f"{side} carries")]
+            motion = [k for k in roles.motion if roles.names[k] in motions_of_side(self.equations[0], side)]
             squares = np.diag(total)[motion]
             energy = float(squares.sum())
             areas.append(float(squares @ [coefficients[k] for k in motion]) / max(energy, np.finfo(float).tiny))
@@ -537,7 +538,8 @@ class RecordedBalance:
         value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
         sign = -1 if value < 0.0 else 1
         value, half_width = abs(value), WITHIN_95 * deviation
-        assumed = [cylinder.A_A if roles.names[k].endswith("A carries") else cylinder.A_B for k in motion]
+        moves_A = [roles.names[k] in motions_of_side(self.equations[0], "A") for k in motion]
+        assumed = np.where(moves_A, cylinder.A_A, cylinder.A_B)
         return _Area(value, value - half_width, value + half_width, float(weights @ assumed), sign)
 
     @cached_property

@@ -1,0 +1,58 @@
+"""Volume balance of a pump in an open circuit, which feeds one chamber at a time while the other drains to the tank.
+
+The coefficient of a term of motion is the area of the side that the pump feeds in this direction, whichever side
+carries the load. While valves shut the chambers, however, a load creeps by the oil of the side that carries it.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.terms import MOTIONS, Equation, Term
+from sealscope.recordings.recording import Array
+
+
+def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
+    """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
+
+    `fed_outward` of the result names the chamber that the pump feeds while x grows: A if its flow is positive then,
+    which the recording tells (`signals`, with limits of rest). The terms of motion count the creep of a piston at rest
+    with the area of the side that carries the load.
+    """
+    volume, step = equation.left(signals), signals.step("x")
+    is_known = np.isfinite(volume * step)
+    adapted = equation._replace(fed_outward="A" if float(volume[is_known] @ step[is_known]) >= 0.0 else "B")
+    terms = [
+        term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
+        if term.name in MOTIONS
+        else term
+        for term in equation.terms
+    ]
+    return adapted._replace(terms=tuple(terms))
+
+
+def motions_of_side(equation: Equation, side: str) -> list[str]:
+    """Return the names of the terms of motion (`MOTIONS`) whose coefficient is the piston's area on `side` "A" or "B".
+
+    In a closed circuit that is the side that carries the load, otherwise the one that the pump feeds.
+    """
+    if not equation.fed_outward:
+        return [name for name in MOTIONS if name.endswith(f"{side} carries")]
+    return [name for name, (outward, _) in MOTIONS.items() if outward == (equation.fed_outward == side)]
+
+
+def _carried_increments(signals: Signals, *, term: Term, equation: Equation) -> Array:
+    """Compute the increments (n - 1,) of a term of motion whose creep at rest moves the area that carries the load.
+
+    While pump or piston rests, the increments are multiplied by the area of the side that carries the load, over that
+    of the side that the pump feeds in this direction.
+    """
+    _, by_A = MOTIONS[term.name]
+    feeds_A = term.name in motions_of_side(equation, "A")
+    area_B = equation.area_ratio  # over the area of A
+    factor = (1.0 if by_A else area_B) / (1.0 if feeds_A else area_B)
+    is_moving = signals.moving(equation.left)
+    return np.asarray(term.increments(signals) * np.where(is_moving > 0.0, 1.0, factor))
