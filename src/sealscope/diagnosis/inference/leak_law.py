@@ -16,20 +16,13 @@ equation the roles of their columns (`blocks.ColumnRoles`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
-from sealscope.diagnosis.inference.onset import (
-    Estimate,
-    Information,
-    StepTest,
-    constant_log_ratio,
-    step_test,
-)
+from sealscope.diagnosis.inference.onset import Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -113,75 +106,6 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         if test is not None:
             tests.append(test.share_alarms(float(prior)))
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
-
-
-def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
-    """Compute the log likelihood ratio of a leak older than the recording to no leak, for each exponent of `EXPONENTS`.
-
-    Only changes of the leakage within the recording count (`constant_log_ratio`): unless the flow of an older leak is
-    laminar, its apparent conductance changes with the pressure. `leak`: likelihood of the leak's coefficient in the
-    blocks.
-    """
-    shapes = apparent_conductances(blocks, columns)
-    # the mean only sets the unit of the fitted constant
-    return np.array(
-        [
-            constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
-            for exponent in EXPONENTS
-        ]
-    )
-
-
-def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Estimate | None]:
-    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its curvature over pressure.
-
-    With dp = p_A - p_B, the flow of the leak is c |dp|^e. The healthy leakage is laminar (e = 1) and not curved. The
-    flow a |dp|^(1/2) of an orifice is fitted in addition to a laminar flow. To the second order, it is as curved as the
-    leak's flow if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
-
-        flow = a |dp|^(1/2) / (4 e (1 - e)).
-
-    The result has a flow for each exponent of `EXPONENTS`, None for laminar flow or if a is unknown. `noise`: factor by
-    which the variance of the coefficients exceeds the one that follows from the residuals of the balance.
-    """
-    bend = information(blocks, columns, columns[0].names.index(ORIFICE))
-    precision = float(bend.precision.sum()) / noise
-    if not precision > 0.0:
-        return [None] * len(EXPONENTS)
-    coefficient = float(bend.vector.sum()) / noise / precision
-    root = float(np.average(blocks.mean_root(), weights=blocks.pressure_weights))
-    factors = [None if exponent == 1.0 else root / (4.0 * exponent * (1.0 - exponent)) for exponent in EXPONENTS]
-    return [
-        None if factor is None else Estimate(coefficient * factor, factor / math.sqrt(precision)) for factor in factors
-    ]
-
-
-def estimate_older_flow(
-    log_ratios: Array, rise_flows: Sequence[Estimate], bend_flows: Sequence[Estimate | None]
-) -> Estimate:
-    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
-
-    The flow is proportional to |p_A - p_B|^e, with an exponent e of `EXPONENTS`. For each e it is estimated from the
-    rise over healthy recordings (`rise_flows`) and, for e < 1, also from its curvature over pressure (`bend_flows` of
-    `estimate_bend_flows`); the two are averaged with their precisions as weights.
-
-    The weight of an exponent in the result is its prior probability times its likelihood ratio, that of e = 1 or the
-    largest of all e < 1 in `log_ratios` (those of `older_log_ratios`): the data hardly tell these from each other. For
-    e < 1 it is multiplied by exp(-d^2 / (2 v)), where d is the difference between the two flows and v its variance.
-    """
-    laminar_ratio, bent_ratio = float(log_ratios[0]), float(log_ratios[1:].max())
-    weights, flows = list[float](), list[Estimate]()
-    for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
-        flow, weight = by_rise, float(log_prior) + laminar_ratio
-        if by_bend is not None:
-            variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)
-            weight += bent_ratio - laminar_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
-            value = float(np.average([by_rise.value, by_bend.value], weights=1.0 / variances))
-            flow = Estimate(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
-        weights.append(weight)
-        flows.append(flow)
-    values, deviations = np.array(flows).T
-    return mixture_flow(np.exp(np.array(weights) - max(weights)), values, deviations)
 
 
 def growth_priors() -> list[tuple[float, float]]:

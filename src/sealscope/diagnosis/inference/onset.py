@@ -344,32 +344,6 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     return [replace(test, sign=sign) for test, sign in zip(tests, signs, strict=True)]
 
 
-def constant_log_ratio(information: Information, shape: Array) -> float:
-    """Compute the log likelihood ratio of an older leak to no leak, from a coefficient's changes within the recording.
-
-    A leak that is older than the recording adds to the coefficient a constant times `shape` (K,), its apparent
-    coefficient in each block. `shape` varies with the pressure unless the flow is laminar. The result is the log
-    likelihood ratio of the best positive constant to no constant, each with the random walk that fits best. It is at
-    least 0, and 0 if too few blocks have information, or if `shape` hardly varies and the level has no prior.
-    """
-    whitened = _whiten_blocks(information)
-    if whitened is None:
-        return 0.0
-    whitening, z, _ = whitened
-    n_prior_blocks = whitening.transform.shape[1] - len(shape)  # 1 with a prior on the level before the recording
-    steps = whitening.transform_steps(np.array([float(n_prior_blocks)]), shape)  # a step at the first block
-    # without a prior on the level, a constant `shape` is projected out with the level
-    if not (steps**2).sum() > RANK_TOLERANCE * float((whitening.transform**2).sum() * (shape**2).max()):
-        return 0.0
-    fits, n = _fit_steps(z, steps, whitening.eigen), len(z)
-    log_factor = 0.5 * np.log(fits.weight).sum(axis=1) + whitening.walk_log_priors
-    without, with_leak = (
-        float((log_factor - 0.5 * n * np.log(squares / n)).max())
-        for squares in (fits.total, fits.residual_squares[:, 0])
-    )
-    return max(with_leak - without, 0.0)
-
-
 def step_sizes(
     information: Information, onsets: NDArray[np.intp], shape: Array, growth: float
 ) -> tuple[Array, Array, Array]:

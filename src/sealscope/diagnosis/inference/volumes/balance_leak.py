@@ -16,11 +16,8 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
-    estimate_bend_flows,
-    estimate_older_flow,
     law_priors,
     mixture_flow,
-    older_log_ratios,
 )
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import (
@@ -392,63 +389,28 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and the evidence for its causes (`LeakRise`).
+        """Leakage above that of healthy recordings, and whether a step within the recording explains it (`LeakRise`).
 
-        The causes are a leak that began within the recording, with the size of the tested step, and an older leak.
-        `step_log_ratio` compares the rise in holds after the step's onset with the whole step, if shut valves then hold
-        the load. Otherwise it compares the mean rise over the recording with the part of the step that this mean
-        contains. None without healthy recordings. Without a step test, all fields but `rise` keep their defaults.
+        If shut valves hold the load after the step's onset, the rise in these holds is compared with the whole step.
+        Otherwise the mean rise over the recording is compared with the part of the step that this mean contains. None
+        without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
-        if total_rise is None:
+        if total_rise is None or motion_rise is None:  # both are None, or neither
             return None
-        if step is None or motion_rise is None:  # with a `total_rise`, `motion_rise` is never None
+        if step is None:
             return LeakRise(total_rise)
         balance, chambers = self.balance, self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
-        older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
-        # the likelihood of an older leak is averaged over the laws; that of the step has `law.share`, its law's prior
-        mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
-        onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
-        # noise[False]: as fitted without a step
-        older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
-        if rise_after is None:
-            is_after = balance.running_blocks.time >= step.onset().value
-            fraction = float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
-            mean_rise = step.fitted.value * fraction  # mean over the recording
-            step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
-            return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
-        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
-        whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
-        step_log_ratio = whole_rise.log_ratio(step.fitted.value, log_deviation)
-        return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
-
-    def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Estimate | None]:
-        """Compare the rise of the leakage above healthy recordings with the size of a leak older than the recording.
-
-        This size is estimated from the curvature of the leak's flow over the pressure. Returns the fields
-        `older_log_ratio` and `older_flow` of `LeakRise`: the log likelihood ratio of a rise of this size to no rise,
-        and the mean flow of the older leak [m^3/s]. The flow is None if holds measure it better. The result is (0,
-        None) if the curvature is unknown. `log_ratios`: those of `older_log_ratios`; `noise`: as in
-        `estimate_bend_flows`; `motion_rise`: the rise in the whole recording.
-        """
-        balance, total_rise = self.balance, self.rise
-        assert total_rise is not None
-        deviation = motion_rise.normal_deviation
-        units = [unit for unit, _ in self._rise_laws()]  # mean flow for a rise of 1
-        bend_flows = estimate_bend_flows(balance.running_blocks, balance.columns, noise)
-        rises = [flow.value / unit for flow, unit in zip(bend_flows, units, strict=True) if flow is not None]
-        if not rises:
-            return 0.0, None
-        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(total rise / expected rise)
-        rise_log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
-        log_ratio = float(np.logaddexp.reduce(rise_log_ratios) - np.log(len(rises)))
-        if self._hold_rise is not None:
-            return log_ratio, None
-        rise_flows = [Estimate(motion_rise.value * unit, deviation * unit) for unit in units]
-        return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_ratios, rise_flows, bend_flows))
+        if rise_after is not None:
+            whole_rise = rise_after._replace(may_be_partial=False)  # after the onset the holds show the whole step
+            # `agrees`: standard deviation of log(rise / step)
+            return LeakRise(total_rise, whole_rise.log_ratio(step.fitted.value, INFERENCE.held_oil.agrees))
+        is_after = balance.running_blocks.time >= step.onset().value
+        mean_rise = step.fitted.value * float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
+        return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
 
     @property
     def lpm_per_flow(self) -> float | None:
