@@ -87,7 +87,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     tests = dict[str, StepTest]()
     for side in "AB":
         pressures = _block_means(signals[f"p_{side}"], edges)
-        if np.isfinite(volumes).all() and np.isfinite(pressures).all():
+        if np.isfinite(volumes + pressures).all():
             test = step_test(_estimate_conductance(volumes, pressures, block_s, begin))
             if test is not None:
                 tests[f"external leak {side}"] = test

@@ -139,7 +139,7 @@ def conductance_term(
     needs: tuple[str, ...] = PRESSURES,
     drift: Coefficient | Literal[""] = "",
 ) -> Term:
-    """Make the term of an unknown conductance; `increments` computes the driving pressure times dt [Pa s]."""
+    """Make the term of a conductance; `increments` computes the driving pressure times dt [Pa s]."""
     return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
 
@@ -176,9 +176,9 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
 def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
-    the current position, counted from mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A`
-    computes w, the weight (0 to 1) of chamber A in the balance.
+    p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at the current position, counted from
+    mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0 to 1) of
+    chamber A in the balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -202,10 +202,9 @@ def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Ter
 
 
 def external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term of an external leak from `side` "A" or "B", with the increments `weight` max(p, 0) dt [Pa s].
+    """Make the term of an external leak from `side` "A" or "B" at its gauge pressure p: `weight` max(p, 0) dt [Pa s].
 
-    p is the gauge pressure of the side. `weight`: factor of this flow in the volume balance, 1 for a leak from A, -1
-    for a leak from B, and 0 in a balance of the other chamber alone.
+    `weight`: 1 for a leak from A, -1 for a leak from B, and 0 in a balance of the other chamber alone.
     """
     p = f"p_{side}"
     return conductance_term(
@@ -251,9 +250,9 @@ def metering_edge_terms(
 ) -> tuple[Term, ...]:
     """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
-    `edge`: name of the edge, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of
-    the command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure
-    [Pa] in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
+    `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
+    command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure [Pa]
+    in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
 
         flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain times dead band of u,
 

@@ -6,9 +6,9 @@ some theta_k^0,
     y_k(theta_k) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
 with the Jacobian J_k. Of each block only products of residual and Jacobian are kept (`Block`). The likelihood is
-Gaussian in all theta_k together (`Joint`). The covariance of one parameter over all blocks, with all other parameters
-eliminated, is therefore a part of the inverse of the joint precision. Parameters are counted in units that are
-fractions of the widths of their priors.
+Gaussian in all theta_k together (`Joint`), so that the covariance of one parameter over all blocks, with all others
+eliminated, is a part of the inverse of the joint precision. Parameters are counted in units that are fractions of the
+widths of their priors.
 """
 
 from __future__ import annotations
@@ -146,11 +146,11 @@ class Joint:
         return Joint(priors, theta, mean, covariance, prior_precision, variance)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
-        """Compute the likelihood of one parameter in K blocks, with all other parameters eliminated, as `Information`.
+        """Compute the likelihood of the parameter with the index `parameter` in K blocks, all others eliminated.
 
-        It follows from the fitted posterior by subtracting the prior of the fit. The result then has another prior: on
-        a linear change and on a random walk, both with the scale `wander` over all blocks, in the unit of the
-        parameter. `parameter`: index of the parameter; `time` (K,): middles of the blocks [s].
+        It is the fitted posterior without the prior of the fit. The result has another prior: on a linear change and on
+        a random walk, both with the scale `wander` over all blocks, in the unit of the parameter. `time` (K,): middles
+        of the blocks [s].
         """
         indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         unit = self.priors.unit[parameter]

@@ -1,10 +1,10 @@
 """Model of the rig reduced to the difference p_A - p_B of its chamber pressures, for many parameter sets at once.
 
 Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed and current,
-and the integral of the speed loop. The states follow the laws of `sealscope.physics`. Friction has two alternative
-laws, Stribeck's and LuGre's. A leak of conductance G damps the ringing of a compliance C after each reversal by G/C. It
-also reduces the ramp, the breakaway and the fall of the pressure while sliding. `response` fits the parameters to
-recorded pressures. Parameter sets are simulated in parallel lanes of the processor (`physics.lanes`).
+and the integral of the speed loop. The states follow the laws of `sealscope.physics`. A leak of conductance G damps the
+ringing of a compliance C after each reversal by G/C. It also reduces the ramp, the breakaway and the fall of the
+pressure while sliding. `response` fits the parameters to recorded pressures. Parameter sets are simulated in parallel
+lanes of the processor (`physics.lanes`).
 """
 
 from __future__ import annotations
@@ -116,9 +116,9 @@ def _advance_friction(
 def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
     """Compute the time derivative of the state y = (p, v, omega, i, I, x) of the reduced rig.
 
-    The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the integral
-    of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s]; `theta`:
-    fitted parameters; `m`: sizes of the rig.
+    These are p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the integral of the
+    speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s]; `theta`: fitted
+    parameters; `m`: sizes of the rig.
     """
     # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
@@ -209,10 +209,9 @@ def simulate_response(
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
-    A prior has a centre, a width and a wander (`Priors`), by the table `[response]` of `priors.toml`; that of the
-    contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. These three numbers are multiplied by
-    the rig's value of the parameter, or are absolute if the rig has none. The Coulomb friction is that at the charge
-    pressure. The prior of the bias, a speed, is in volts of the command and is multiplied by the gain.
+    They are the table `[response]` of `priors.toml`, multiplied by the rig's value of the parameter, or absolute if the
+    rig has none; the prior of the contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. The
+    Coulomb friction is that at the charge pressure. The bias, a speed, is in volts of the command.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,16 +55,14 @@ def _step_growths() -> list[tuple[float, float]]:
     `growth.from_nothing` (`priors.toml`) of the probability of all leaks that grow.
     """
     from_nothing: float = INFERENCE.growth.from_nothing
-    steady, *growing = growth_priors()
-    growths = [steady, *((growth, (1.0 - from_nothing) * probability) for growth, probability in growing)]
-    return [*growths, (math.inf, from_nothing * (1.0 - steady[1]))]
+    (no_growth, steady), *growing = growth_priors()
+    growths = [(growth, (1.0 - from_nothing) * probability) for growth, probability in growing]
+    return [(no_growth, steady), *growths, (math.inf, from_nothing * (1.0 - steady))]
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording.
-
-    `test` counts a prior on the level as one more block before the first (`StepTest.positions`).
-    """
+    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording."""
+    # a prior on the level counts as one more block before the first (`StepTest.positions`)
     return test.positions - float(np.isfinite(leak.level))
 
 
@@ -111,10 +109,9 @@ def _fit_steps(
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
-    It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
-    leak increases from the onset to the end) and an onset, weighted by their likelihood and the prior probability of
-    the growth; its standard error is the standard deviation of their mixture. `leak`: likelihood of the leak's
-    coefficient in the blocks; `test`: step test of this coefficient, whose onsets are used except improbable ones.
+    It is the mean over all combinations of law, growth and onset, weighted by their likelihood and the prior
+    probability of the growth. `leak`: likelihood of the leak's coefficient in the blocks; `test`: step test of this
+    coefficient, whose onsets are used except improbable ones.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     fits, _ = _fit_steps(blocks, columns, leak, _onset_positions(leak, test)[onsets], onsets)
@@ -140,11 +137,6 @@ class RiseFits(NamedTuple):
     deviations: Array
     by_rise: NDArray[np.bool_]
     log_none: float
-
-    def join(self, fits: Sequence[RiseFits]) -> RiseFits:
-        """Return the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
-        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits]) for name in self._fields[:-1]}
-        return self._replace(**joined)
 
     @property
     def flow(self) -> Estimate:
@@ -197,7 +189,7 @@ def fit_rise(
     - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
       in the blocks; `weights` (K,): weight of each block in the rise (`coefficients.block_weights`); `test`: step test
       of the coefficient, None if the leak can only be older than the recording;
-    - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
+    - `rise`: mean rise of the coefficient over the recording [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
     - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, except an older one under the first law.
@@ -229,7 +221,6 @@ def fit_rise(
     from scipy.special import log_ndtr
 
     unit_flows, law_log_weights = np.array(laws).T
-    ones = np.ones(len(laws))
     usual_flow = INFERENCE.size.usual * max_flow
     usual_rises = usual_flow / unit_flows
     log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
@@ -240,10 +231,9 @@ def fit_rise(
     log_none += float(normal_log_density(rise.value, rise.deviation**2))
     if test is not None:
         log_weights = log_weights + math.log(1.0 - within)
-    flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
-    # onsets: before the recording; parts: all of it; by_rise: true
-    older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
-    fits = [older]
+    ones = np.ones(len(laws))
+    # hypotheses in the order of the fields of `RiseFits`; first a leak that is older than the recording, under each law
+    fits = [(log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows, ones > 0.0)]
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
@@ -252,13 +242,14 @@ def fit_rise(
             combined = _combine_with_rise(step_fit, rise, usual_flow, usual_rise, weights)
             log_prior = law_log_weights[step_fit.law] + math.log(within / len(positions))
             for by_rise, (likelihoods, flows, deviations) in zip((True, False), combined, strict=True):
-                flags, log_weights = np.full(len(positions), by_rise), log_prior + likelihoods
-                fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
-    fit = older.join(fits)
-    log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
-    is_excluded = np.abs(fit.flows) > max_flow
+                flags = np.full(len(positions), by_rise)
+                fits.append((log_prior + likelihoods, test.onsets, part_after, flows, deviations, flags))
+    log_weights, onsets, parts, flows, deviations, flags = map(np.concatenate, zip(*fits, strict=True))
+    log_weights += log_ndtr(flows / np.maximum(deviations, _TINY))  # probability of a flow > 0
+    is_excluded = np.abs(flows) > max_flow
     is_excluded[0] = False  # the older leak under the first law always counts, so that a hypothesis remains
-    return fit._replace(log_weights=np.where(is_excluded, -np.inf, log_weights))
+    log_weights[is_excluded] = -np.inf
+    return RiseFits(log_weights, onsets, parts, flows, deviations, flags, log_none)
 
 
 def _combine_with_rise(

@@ -3,8 +3,8 @@
 Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance. The change of
 its coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the changes of
 all other coefficients, including the leak's (`priors.toml`). The scatter of the coefficient among the healthy
-recordings shows which change is normal (`differences`). A leak to the outside and a leak past the piston look nearly
-alike. The likelihood ratio of the two is therefore stated with the observable.
+recordings shows which change is normal (`differences`). An external leak and a leak past the piston look nearly alike:
+the likelihood ratio of the two is stated with the observable.
 """
 
 from __future__ import annotations
@@ -44,9 +44,8 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that may explain a change since the healthy recordings.
 
-    These rivals of the leak are external leaks, leakage of the turning pump, and free air. The result has one test for
-    each rival that can be compared. Leakages that are measured while shut valves hold the load (`held_rivals`), or just
-    before (`held_pump_rise`), are compared only by these measurements.
+    The result has one test for each rival that can be compared. Leakages that are measured while shut valves hold the
+    load (`held_rivals`), or just before (`held_pump_rise`), are compared only by these measurements.
 
     `columns`: roles of the columns of each balance, the same for all recordings. `volume_ratio`: measured over assumed
     ratio of the piston's area to the pump's displacement, by which prior volumes of air are multiplied. `unit_flows`:
@@ -123,13 +122,15 @@ def _without_oil(coefficients: Array, thinning: Array) -> Array:
     """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if healthy ones then scatter less.
 
     `thinning` (n + 1,): logarithm of the factor by which thinner oil raises each coefficient. The last coefficient is
-    that of the judged recording, the others are those of healthy ones, whose scatter is taken relative to their mean.
+    that of the judged recording.
     """
+
+    def relative_scatter(values: Array) -> float:
+        """Compute the standard deviation of the healthy values over their mean."""
+        return float(np.std(values[:-1])) / max(abs(float(values[:-1].mean())), TINY)
+
     corrected = coefficients * np.exp(-thinning)
-    scatters = [
-        float(np.std(values[:-1])) / max(abs(float(values[:-1].mean())), TINY) for values in (coefficients, corrected)
-    ]
-    return corrected if scatters[1] < scatters[0] else coefficients
+    return min(coefficients, corrected, key=relative_scatter)
 
 
 def held_rivals(
@@ -137,9 +138,8 @@ def held_rivals(
 ) -> tuple[Observable, ...] | None:
     """Test chambers A and B for larger external leaks than in healthy recordings, while shut valves hold the load.
 
-    Return one test for each chamber that can be compared (`compare_with_healthy`). Return None if the judged recording
-    has no such holds, or if fewer than `MIN_HEALTHY` healthy recordings have them. `unit_flows`: as in
-    `rival_rises`.
+    Return one test for each chamber that can be compared, None without such holds in the judged recording and in at
+    least `MIN_HEALTHY` healthy ones. `unit_flows`: as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_HEALTHY:
@@ -162,7 +162,7 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 
     A large external leak is improbable, since someone would have noticed the oil outside. The penalty is 2 log(prior
     density / largest prior density) of the leak's flow, and 0 for flows below the centre of the prior (`outside` in
-    `priors.toml`). `observable`: the test; `unit_flows`: as in `rival_rises`.
+    `priors.toml`). `unit_flows`: as in `rival_rises`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
@@ -172,10 +172,9 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     """Estimate the change of a coefficient of a recording from healthy recordings, with its standard error.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
-    equations; `columns`: roles of their columns; `tested`: column of the coefficient, which counts as 0 in the healthy
-    recordings. The differences of the other coefficients have normal priors and are eliminated. Except for the leak,
-    columns without a finite prior deviation are left out: `RecordingSums.sums` no longer contain them. Without
-    information the change is 0 and the error infinite.
+    equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The differences of the
+    other coefficients have normal priors and are eliminated. Except for the leak, columns without a finite prior
+    deviation are left out: `RecordingSums.sums` no longer contain them. Without information the result is (0, inf).
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):

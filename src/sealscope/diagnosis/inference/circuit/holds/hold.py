@@ -51,12 +51,8 @@ class LockedHold:
         """Recorded p_A - p_B [Pa] at each sample, shape (n,)."""
         return self.p_A - self.p_B
 
-    def carries(self, is_A: bool) -> bool:
-        """Return True if the side A (or B, if `is_A` is False) has the higher pressure when the hold begins."""
-        return self._is_A_higher == is_A
-
     @cached_property
-    def _is_A_higher(self) -> bool:
+    def is_A_loaded(self) -> bool:
         """True if A has the higher pressure in the first interval."""
         settling = slice(self.edges[0], self.edges[1])
         return float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
@@ -66,7 +62,7 @@ class LockedHold:
 
         The first reading of the side with the higher pressure becomes 0, since the valves may still be shutting.
         """
-        first = int(self.carries(is_A))  # first reading that counts: 1 on the side with the higher pressure, else 0
+        first = int(self.is_A_loaded == is_A)  # first reading that counts: 1 on the side with the higher pressure
         centred = np.asarray(readings - readings[first:].mean(axis=0))
         centred[:first] = 0.0
         return centred
@@ -106,9 +102,9 @@ class LockedHold:
         return difference
 
     def steepest_time(self) -> float:
-        """Find the start [s] of the time window of the length `held_oil.equalises` in which p_A - p_B changes most.
+        """Find the start [s] of the window in which p_A - p_B changes most.
 
-        Within such a time (`priors.toml`) a large leak equalises the pressures.
+        Its length is `held_oil.equalises` (`priors.toml`), the time in which a large leak equalises the pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
