@@ -54,20 +54,11 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
 
 class JudgedAlarm(NamedTuple):
-    """A person's judgement of an alarm of the monitor, or a repair.
+    """A person's judgement (`mark`) of an alarm of the monitor, or a repair.
 
-    Attributes
-    ----------
-    alarm : str
-        Name of the alarm, "" for a repair without an alarm.
-    mark : str
-        "valid", "invalid" or "repaired".
-    date_s, onset_s : float
-        Times of the judgement and of the onset of the leak [s since 1970].
-    leak_lpm : float or None
-        Flow of the leak [L/min], None if unknown.
-    reason : str
-        Reason given by the person, may be empty.
+    `alarm`: name of the alarm, "" for a repair without an alarm; `mark`: "valid", "invalid" or "repaired"; `date_s`,
+    `onset_s`: times of the judgement and of the onset of the leak [s since 1970]; `leak_lpm`: flow of the leak [L/min],
+    None if unknown; `reason`: reason given by the person, may be empty.
     """
 
     alarm: str

@@ -33,20 +33,12 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 class WatchedMachine:
     """An actuator to be monitored, as stated by the file of a rig or of a commissioned machine.
 
-    Attributes
-    ----------
-    rig : Rig
-        Sizes of the machine. If only the areas are stated, the pump's displacement is measured from the healthy
-        recordings.
-    channel_map, rate : mapping of str to str, float or None
-        Column of the actuator's logs for each channel, and sampling rate [Hz] of logs without a time column.
-    limit_lpm : float or None
-        Leak at which the machine must be repaired [L/min], None for the file of a rig, or if it follows from a creep
-        speed and a piston area that is not stated.
-    machine : CommissionedMachine or None
-        Machine with the healthy recordings that recordings of the actuator are compared with, None if there are none.
-    healthy : HealthyLevel or None
-        Leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
+    - `rig`: sizes; if only the areas are stated, the pump's displacement is measured from the healthy recordings.
+    - `channel_map`, `rate`: column of the logs for each channel, and sampling rate [Hz] of logs without a time column.
+    - `limit_lpm`: leak at which the machine must be repaired [L/min], None for the file of a rig, or if it follows from
+      a creep speed and a piston area that is not stated.
+    - `machine`: machine with the healthy recordings that recordings are compared with, None if there are none.
+    - `healthy`: leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
     """
 
     rig: Rig

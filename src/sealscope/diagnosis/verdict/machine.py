@@ -29,22 +29,13 @@ _BEHIND_VALVE = "servo-valve"
 class AssumedMachine:
     """Sizes of the machine that a diagnosis assumes.
 
-    Attributes
-    ----------
-    rig : str
-        Name of the rig.
-    stated_by : {"call", "recording", "nobody"}
-        Source of the rig: the caller (`--rig` or a Rig), the recording's provenance, or a mere assumption.
-    area, displacement : float
-        Mean piston area of both sides [m^2], and displacement of the pump [m^3/rev].
-    area_stated, displacement_stated : bool
-        Whether the size is known from the rig, or was stated separately.
-    flow_meter : bool
-        Whether a flow meter, channel `q_pump` or `q_supply`, measures the flow, so that neither size is needed.
-    areas : tuple of float, optional
-        Piston areas of sides A and B [m^2].
-    bypass : bool
-        Whether a flow meter in a bypass of the cylinder was recorded.
+    - `rig`: name of the rig; `stated_by`: who stated it, the caller (`--rig` or a Rig), the recording's provenance, or
+      nobody.
+    - `area`: mean of the piston areas [m^2] of sides A and B, `areas`; `displacement`: that of the pump [m^3/rev].
+    - `area_stated`, `displacement_stated`: true if the size is known from the rig, or was stated separately.
+    - `flow_meter`: true if a flow meter, channel `q_pump` or `q_supply`, measures the flow, so that neither size is
+      needed.
+    - `bypass`: true if a flow meter in a bypass of the cylinder was recorded.
     """
 
     rig: str
@@ -80,9 +71,9 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
     A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
-    thesis's rig is used, or the one of `infer_rig`. The thesis's rig counts as stated by the recording if the recording
-    was simulated with a packaged rig of the same areas and displacement. Otherwise nobody stated it, and all values of
-    the returned rig are marked as assumptions. Raises InputError if `rig` cannot be read.
+    thesis's rig is used, or the one of `infer_rig`. It counts as stated by the recording if that was simulated with a
+    packaged rig of the same areas and displacement; otherwise all its values are marked as assumptions. Raises
+    InputError if `rig` cannot be read.
     """
     rig = infer_rig(None if rig is None else load_rig(rig), recording)
     used_rig = load_rig(_DEFAULT) if rig is None else rig
@@ -113,7 +104,7 @@ def infer_rig(rig: Rig | None, recording: Recording) -> Rig | None:
     That is so if no flow and no pump is recorded, only the command, and if p_1 exceeds both chamber pressures by
     `supply.margin` (`priors.toml`) in the fraction `supply.above` of the samples: at the port of a pump, p_1 is about
     the pressure of one chamber. Pressures in raw counts cannot be compared, and a stated displacement is that of a pump
-    that feeds the chambers: `rig` is then returned as it is. Stated areas are kept.
+    that feeds the chambers. Stated areas are kept.
     """
     is_stated = rig is not None and (states_rig(rig) or rig.states("pump.q_b"))
     if is_stated or flow_source(recording.channels) != "u":

@@ -71,23 +71,13 @@ class Term(NamedTuple):
 class Equation(NamedTuple):
     """A volume balance of a machine: its left side equals the sum of its terms.
 
-    Parameters
-    ----------
-    name : str
-        Name of the balance, for example "cylinder".
-    left : callable
-        Computes the increments of the left side [m^3] from `Signals`, shape (n - 1,).
-    terms : tuple of Term
-        The terms, those of the leak last.
-    healthy : float
-        Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
-    by_command : bool
-        True if no channel gives the pump's flow. A speed is then computed from the command u
-        (`balance.derive_drive_signals`).
-    flow_sign : float
-        1 if a flow into A is positive on the left side, -1 if it is negative.
-    area_ratio : float
-        Area of the piston on side B over that on side A; 1 in a balance of one chamber.
+    - `left`: computes the increments of the left side [m^3] from `Signals`, shape (n - 1,);
+    - `terms`: those of the leak are the last two;
+    - `healthy`: standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown;
+    - `by_command`: true if no channel gives the pump's flow, and a speed is computed from the command u
+      (`balance.derive_drive_signals`);
+    - `flow_sign`: 1 if a flow into A is positive on the left side, -1 if it is negative;
+    - `area_ratio`: area of the piston on side B over that on side A; 1 in a balance of one chamber.
     """
 
     name: str

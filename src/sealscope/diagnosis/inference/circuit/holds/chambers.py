@@ -29,6 +29,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -97,11 +98,11 @@ class HeldChambers:
     charge: float
 
     def area_variants(self) -> list[tuple[float, HeldChambers]]:
-        """Return variants of this estimator with other areas of the less certain side, each with its probability.
+        """Return this estimator with three areas of the less certain side, each with its probability.
 
-        The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. How
-        well a variant fits the holds does not change its probability: errors by delays of the sensors repeat from hold
-        to hold. If both areas are known (`size.area` in `priors.toml`), there is only this estimator.
+        The areas are the Gauss-Hermite quadrature of the normal distribution of the area's logarithm. How well one fits
+        the holds does not count: errors by delays of the sensors repeat from hold to hold. If both areas are known
+        (`size.area` in `priors.toml`), there is only this estimator.
         """
         sides = self.sides
         deviation = max(sides.deviation_A, sides.deviation_B)
@@ -133,8 +134,7 @@ class HeldChambers:
         """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
         The leak moves equal volumes from one side to the other, and the piston follows the side that loses oil. If the
-        side that gains oil has the larger area, its volume grows by more than the leak supplies, and the check valve
-        opens. With equal areas neither side is refilled.
+        other side has the larger area, its volume grows by more than the leak supplies, and the check valve opens.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         if area_A == area_B:
@@ -153,8 +153,8 @@ class HeldChambers:
         An open side has the probability `held_oil.open` (`priors.toml`). It is above the charge pressure, by more than
         the back pressure `held_oil.tank` of its line, only while it empties: for the fraction a = `held_oil.above` of a
         hold. Each hold with a larger fraction f multiplies the probability by exp(-(f - a) / a). If check valves keep
-        both sides at their pressure, a side that gains oil must drain to the tank. The charge pressure is then that of
-        a tank line, whose gauge pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
+        both sides at their pressure, a side that gains oil drains to the tank: the charge pressure is then that of a
+        tank line, which is normal about 0 gauge with the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
@@ -186,8 +186,7 @@ class HeldChambers:
     def _possible_supplies(self) -> list[SideSupplies]:
         """Supplies of A and B that are tried for a leak.
 
-        Check valves are tried if one of their sides is at the charge pressure in some samples, and an open side if it
-        is at this pressure nearly all the time.
+        Check valves are tried if a side is at the charge pressure in some samples, an open side if it nearly always is.
         """
         possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
         if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
@@ -216,9 +215,8 @@ class HeldChambers:
     def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
         """Compute the flow past the piston in each hold for a `leak` with a coefficient of 1.
 
-        With the leak's exponent e and dp = p_A - p_B - z, the flow out of A is sign(dp) |dp|^e times the
-        `growth_factor`, and the flow out of B its negative. The sensor offset z in a hold may differ from the
-        recording's (`LockedHold.driving_pressure`).
+        With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`. The sensor offset z
+        in a hold may differ from the recording's (`LockedHold.driving_pressure`).
         """
         flows = []
         for hold in self.holds:
@@ -255,7 +253,7 @@ class HeldChambers:
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow [Pa] from A (or B, if not `is_A`) through open valves and the pump, for a conductance of 1.
 
-        No flow counts for the other chamber, since check valves or a shuttle valve keep it at the charge pressure.
+        The other chamber has no flow, since check valves or a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
         flows = []
@@ -281,8 +279,8 @@ class HeldChambers:
     def _conditions_log_prior(self, leak: PistonLeak) -> float:
         """Compute the log prior of a leak's supplies and sensor offset, up to a constant.
 
-        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from that of the
-        recording; a hold that is taken as loaded has the recording's offset (`LockedHold.offset_in_hold`).
+        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the recording's
+        (`LockedHold.offset_in_hold`).
         """
         offset_costs = [float(offset_cost(leak.offset)), *(hold.offset_in_hold(leak.offset)[1] for hold in self.holds)]
         return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * sum(offset_costs)
@@ -290,14 +288,12 @@ class HeldChambers:
     def start_error(self, leak: PistonLeak) -> float:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
 
-        The coefficient is the volume that has left a chamber, divided by the time integral of the flow u of a leak with
-        a coefficient of 1. A hold starts when its valves are shut. This time is known to within s = `held_oil.settles`
-        (`priors.toml`), and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each
-        hold, the error is
+        The coefficient is the volume that has left a chamber, over the time integral of the flow u of a leak with a
+        coefficient of 1. The time at which the valves shut is known to within s = `held_oil.settles` (`priors.toml`),
+        and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each hold, the error
+        is
 
-            s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
-
-        Only the time after the leak's onset counts: a leak that begins within a hold has no such error there.
+                    s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
         """
         start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
@@ -322,10 +318,7 @@ class HeldChambers:
         return np.array(self.leaks._replace(piston=probable, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
-        """Fit a leak past the piston since `onset` [s] for several sensor offsets, on which it may depend strongly.
-
-        Fits without any flow are omitted.
-        """
+        """Fit a leak past the piston since `onset` [s] for several sensor offsets, omitting fits without any flow."""
         best = self.piston_fit._replace(onset=onset)
         offsets = (*self._offset_grid.tolist(), best.offset)
         fits = [self.fit_piston_leak(best._replace(offset=offset)) for offset in offsets]
@@ -356,10 +349,9 @@ class HeldChambers:
 
     @cached_property
     def _onset_ranges(self) -> tuple[Array, Array]:
-        """First and last time [s] that each of g possible onsets stands for, (g,) each.
+        """First and last time [s] that each of g possible onsets, without the steepest times, stands for, (g,) each.
 
-        These are `onsets` without those of the largest pressure change. The beginning of the recording and the evenly
-        spaced onsets within a hold stand for themselves, one between two holds for all times between them.
+        An onset between two holds stands for all times between them, the others for themselves.
         """
         lows, highs = [self.begin], [self.begin]
         for k, hold in enumerate(self.holds):
@@ -401,10 +393,9 @@ class HeldChambers:
     def _onset_posteriors(self, leak: UnitLeak, growth: float = 0.0) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
-        The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
+        It is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
         coefficient >= 0, with the properties of the oil eliminated. The variance of the readings weights the priors of
-        the properties: at first the variance without a leak, then the variance with the most probable onset. `growth`:
-        as in `PistonLeak`.
+        these: first without a leak, then with the most probable onset. `growth`: as in `PistonLeak`.
         """
         regression = self._regressions[leak.supplies]
         variance, n_rows = self._fits_without_leak[leak.supplies].variance, len(regression.displaced)
@@ -415,13 +406,11 @@ class HeldChambers:
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
 
     def _growing_leak_columns(self, leak: UnitLeak, growth: float) -> Array:
-        """Compute the volume lost up to each of r readings (`_leak_columns`) for each of `onsets` of a leak that grows.
+        """Compute the volume lost up to each of r readings through a leak that grows from each of `onsets`, (r, o).
 
         With the relative growth g from the onset s to the end e of the recording, the flow u of the leak becomes
 
-            (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
-
-        The result has the shape (r, o).
+                    (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
         """
         columns = self._leak_columns(leak, self.onsets)
         if not growth:
@@ -435,7 +424,7 @@ class HeldChambers:
     def _offset_grid(self) -> Array:
         """Candidates for the sensor offset of p_A - p_B [Pa], sorted: a fixed grid and the last reading of each hold.
 
-        If a leak has equalised the pressures by the end of a hold, the offset is the recorded p_A - p_B.
+        The latter is the offset if a leak has equalised the pressures by then.
         """
         ends = [hold.mean(hold.difference)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
@@ -498,27 +487,16 @@ class HeldChambers:
         fits = [(leak, self.fit_piston_leak(leak), log_prior) for leak, log_prior, _ in self._laws]
         return [LawFit(leak, fit, fit.log_likelihood + log_prior) for leak, fit, log_prior in fits]
 
-    def _fit_over_supplies(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
-        """Fit a leak that is not past the piston and may grow, under each possible choice of the sides' supplies.
+    def _fit_growing_leak(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
+        """Fit a leak that is not past the piston and may grow, and return the fit with the index of its onset.
 
-        `leaks`: flows of this one leak, for each choice. Returns the most probable fit and the index of its onset in
-        `onsets`. The likelihood of the fit is replaced by the sum over all choices, each times its prior probability.
-        """
-        fits = [self._fit_growing_leak(leak) for leak in leaks]
-        log_priors = [self._supply_log_prior(leak.supplies, drains=False) for leak in leaks]
-        log_weights = [fit.log_likelihood + prior for (fit, _), prior in zip(fits, log_priors, strict=True)]
-        fit, index = fits[int(np.argmax(log_weights))]
-        return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
-
-    def _fit_growing_leak(self, leak: UnitLeak) -> tuple[LeakFit, int]:
-        """Fit a leak that may grow from its onset on; its coefficient is the mean from the onset to the end.
-
-        Each growth of `growth_priors` has its own most probable onset. Returns the fit with the most probable growth,
-        and the index of its onset in `onsets`. The likelihood of the fit is replaced by the mean over all growths,
-        weighted by their prior probabilities.
+        `leaks`: flows of this one leak, for each possible choice of the sides' supplies. Of all choices and growths,
+        each with its own most probable onset, the most probable is returned. Its coefficient is the mean from the onset
+        to the end; its likelihood is replaced by the sum over all choices and growths, each times its prior
+        probability.
         """
         fits, log_weights = list[tuple[LeakFit, int]](), list[float]()
-        for growth, probability in growth_priors():
+        for leak, (growth, probability) in itertools.product(leaks, growth_priors()):
             index = int(self._onset_posteriors(leak, growth).argmax())
             onset = float(self.onsets[index])
             flows = [
@@ -528,7 +506,8 @@ class HeldChambers:
             fit = self._fit_leak(leak._replace(flows=flows), onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
-            log_weights.append(fit.log_likelihood + float(np.log(probability)))
+            log_prior = math.log(probability) + self._supply_log_prior(leak.supplies, drains=False)
+            log_weights.append(fit.log_likelihood + log_prior)
         fit, index = fits[int(np.argmax(log_weights))]
         return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
 
@@ -569,7 +548,7 @@ class HeldChambers:
         # each fit with the index of its onset in `onsets`
         index = int(np.abs(self.onsets - best.leak.onset).argmin())
         fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
-        fits += [self._fit_over_supplies(leak) for leak in leaks]
+        fits += [self._fit_growing_leak(leak) for leak in leaks]
         log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
@@ -582,8 +561,8 @@ class HeldChambers:
     def total_leak(self) -> Estimate:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
-        A leak may be past the piston, to the outside, or through open valves and the pump; each of these is weighted by
-        its probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
+        A leak may be past the piston, to the outside, or through open valves and the pump, each with its probability. A
+        check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed; if they do so anyway, the cached fits serve
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
@@ -602,8 +581,8 @@ class HeldChambers:
     def leaks(self) -> HeldLeaks:
         """Mean leaks over the recording, from the times in which shut valves hold the load.
 
-        Each leak is its estimate times its probability. Its standard deviation is not multiplied by the probability,
-        and excludes the uncertainty of the oil's properties.
+        Each is its estimate times its probability. Its standard deviation is not multiplied by the probability, and
+        excludes the uncertainty of the oil's properties.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
@@ -620,10 +599,7 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it.
-
-        It is the probability that it begins within the recording, times the fraction of the time after the last hold.
-        """
+        """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it."""
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
@@ -631,8 +607,8 @@ class HeldChambers:
     def piston_onset(self) -> Interval | None:
         """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
 
-        It is averaged over the laws of the leak. The interval is widened on either side to the next of the evenly
-        spaced onsets within holds, or to the whole time between two holds.
+        The interval is widened on either side to the next of the evenly spaced onsets within holds, or to the whole
+        time between two holds.
         """
         posteriors = np.logaddexp.reduce([posteriors for _, _, posteriors in self._laws])
         weights = np.exp(posteriors - posteriors.max())
