@@ -75,9 +75,9 @@ class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
-    p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends` (8,
-    12): simulated states at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2]
-    of `theta` and of the further parameter sets that were simulated with it.
+    p): sums over the samples of their products with each other, without the mains hum; `ends` (8, 12): simulated states
+    at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2] of `theta` and of the
+    further parameter sets that were simulated with it.
     """
 
     theta: Array
@@ -180,11 +180,11 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and how much its correlation inflates the variance of parameters.
+    """Compute the variance of the residual [Pa^2], and the factor by which its correlation inflates that of parameters.
 
-    The second result is a factor: the variance of the scores (`Block`) over their variance under white noise, at least
-    1. `deviations` (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index
-    of the tested parameter.
+    The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1. `deviations`
+    (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index of the tested
+    parameter.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

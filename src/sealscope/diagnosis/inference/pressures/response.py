@@ -77,7 +77,7 @@ class Segment:
       each parameter up to `SPRING` increased in turn;
     - `waves` (m, n): waves of the mains hum, which are projected out;
     - `sample_weights` (n,): 0 for samples that are missing or recorded while the drive settles, otherwise 1;
-    - `smooth`: width [samples] of a Gaussian that smooths the residual, 0 for no smoothing.
+    - `smooth`: width [samples] of a Gaussian that smooths the residual.
     """
 
     machine: Machine
@@ -227,9 +227,9 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     """Fit the parameters to a first segment of samples, without parameters from an earlier fit.
 
     The ringing causes many local minima. Therefore the slow part of p_A - p_B is fitted first, from the best of several
-    gains and stiffnesses of the load. Then the unsmoothed p_A - p_B is fitted from several breakaway forces and several
-    stiffnesses of the oil, two of which follow from the strongest ringing (`Machine.ringing_stiffnesses`).
-    `total` (n,): p_A + p_B [Pa]; `noise`: variance of the noise [Pa^2].
+    gains and stiffnesses of the load. Then all of it is fitted from several breakaway forces and several stiffnesses of
+    the oil, two of which follow from the strongest ringing. `total` (n,): p_A + p_B [Pa]; `noise`: variance of the
+    noise [Pa^2].
     """
     priors = segment.priors
 

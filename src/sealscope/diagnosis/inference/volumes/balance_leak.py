@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
@@ -466,21 +466,16 @@ class BalanceLeak(LeakMeasure):
         # a delay of one sample is usual
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
             remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
-        return [*remarks, *self._iter_condition_remarks()]
-
-    def _iter_condition_remarks(self) -> Iterator[Remark]:
-        """Yield a remark on each condition (load, speed, oil) outside of the range of the healthy recordings.
-
-        It states load [bar] and oil temperature [deg C] with the range, but the speed over the nearer end of its range.
-        """
-        for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
-            value, low, high = condition.value, condition.low, condition.high
-            if condition.name == "load":
-                yield Remark("load beyond", {"value": value / BAR, "low": low / BAR, "high": high / BAR})
-            elif condition.name == "speed":
-                yield Remark("speed beyond", {"ratio": value / (high if value > high else low)})
+        for condition in find_unusual_conditions(balance.recording_sums, self.healthy):
+            name, value, low, high = condition.name, condition.value, condition.low, condition.high
+            if name == "speed":  # over the nearer end of the range of the healthy recordings
+                remarks.append(Remark("speed beyond", {"ratio": value / (high if value > high else low)}))
             else:
-                yield Remark("oil beyond", {"value": value, "low": low, "high": high})
+                unit = BAR if name == "load" else 1.0  # oil temperatures are in deg C
+                remarks.append(
+                    Remark(f"{name} beyond", {"value": value / unit, "low": low / unit, "high": high / unit})
+                )
+        return remarks
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:

@@ -4,9 +4,9 @@ A step of the leak's conductance is fitted at each possible onset, with each law
 each growth after the onset: a seal that continues to wear leaks more towards the end, and a leak may grow from nothing.
 The flow is a mixture over them, weighted by likelihood and prior (`estimate_step_flow`).
 
-If a leak began or grew within the recording, the rise over healthy recordings contains only a part of it, since the
-blocks after the onset have only a part of the information. `fit_rise` therefore estimates the flow from the rise and
-from the changes within the recording together, and bounds it if no leak is found.
+If a leak began or grew within the recording, the rise over healthy recordings contains only a part of it. `fit_rise`
+therefore estimates the flow from the rise and from the changes within the recording together, and bounds it if no leak
+is found.
 """
 
 from __future__ import annotations
@@ -124,10 +124,10 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 class RiseFits(NamedTuple):
     """Leak above healthy recordings under h hypotheses on its onset, growth and law (`fit_rise`).
 
-    `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
-    is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
-    mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if the rise shows the leak, false if
-    it is no evidence. `log_none`: log probability that there is no leak, up to the same constant.
+    `log_weights` (h,), `log_none`: log probabilities of these and of no leak, up to a constant; `onsets` (h,): onsets
+    [s], minus infinity for a leak that is older than the recording; `parts` (h,): fraction of the recording after the
+    onset; `flows`, `deviations` (h,): mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if
+    the rise shows the leak, false if it is no evidence.
     """
 
     log_weights: Array
@@ -194,29 +194,25 @@ def fit_rise(
       a constant;
     - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, except an older one under the first law.
 
-    With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. Three
-    sources determine s:
-
-    - The changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of
-      the leak to no leak (`step_sizes`).
-    - The flow has a half-normal prior, whose scale is the fraction `size.usual` (`priors.toml`) of the pump's flow; S
-      is the coefficient of a leak with this flow. s'' and e'' are mean and standard deviation of s by this prior and
-      s'.
-    - The rise r, with the standard deviation d, measures f s, where f is the sum of the weights times c_k.
+    With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. The
+    changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of the
+    leak to no leak (`step_sizes`). The flow has a half-normal prior, whose scale is the fraction `size.usual`
+    (`priors.toml`) of the pump's flow; S is the coefficient of such a leak, and s'' and e'' are mean and standard
+    deviation of s by this prior and s'. The rise r, with the standard deviation d, measures f s, where f is the sum of
+    the weights times c_k.
 
     N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
-    p = `size.present` the prior probability of a leak, and q = `size.within` that of its onset within the recording,
-    each onset being as probable. The weights of the hypotheses, up to a common factor and those of law and growth, are
-    as follows, without the factor 2 of the half-normal density; those of leaks are also multiplied by the probability
-    that the flow is positive.
+    p = `size.present` the prior probability of a leak, and q = `size.within` that of its onset within the recording, 0
+    without a step test, each onset being as probable. Up to the factors of law and growth, and for leaks of the
+    probability of a positive flow, the weights of the hypotheses are
 
-        leak within the recording: q exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
-        older leak:                (1 - q) N(r; d^2 + R^2),
-        no leak:                   N(r; d^2) (1 - p) / (2 p).
+            leak within the recording: q exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+            older leak:                (1 - q) N(r; d^2 + R^2),
+            no leak:                   N(r; d^2) (1 - p) / (2 p).
 
-    The flow of an older leak follows from the rise alone. Without a step test q is 0. With the small probability 2
-    `scatter.tail` the rise is no evidence, as the recording is like none that the healthy ones predict. Its density is
-    then 1 / R, and only s'' and e'' give the flow.
+    The flow of an older leak follows from the rise alone. With the small probability 2 `scatter.tail` the rise is no
+    evidence, as the recording is like none that the healthy ones predict. Its density is then 1 / R, and only s'' and
+    e'' give the flow.
     """
     from scipy.special import log_ndtr
 
@@ -258,9 +254,9 @@ def _combine_with_rise(
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
     `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
-    it is older than the recording; `weights` (K,): weights of the blocks in the rise. Yields two triples of arrays
-    (o,): log weight of each onset, without the priors of law and onset, mean flow after it, and the flow's
-    standard error [m^3/s]. In the first the rise is evidence of the step, in the second it is not.
+    it is older than the recording; `weights` (K,): those of `fit_rise`. Yields two triples of arrays (o,): log weight
+    of each onset, without the priors of law and onset, mean flow after it, and the flow's standard error [m^3/s]. In
+    the first the rise is evidence of the step, in the second it is not.
     """
     unit_flow = np.maximum(fit.unit_flow, MIN_UNIT * float(fit.unit_flow.max()))  # 0 where no pressure is known
     prior_deviation = usual_flow / unit_flow  # of the coefficient

@@ -95,8 +95,8 @@ class Size(NamedTuple):
 class RecordedBalance:
     """Volume balance of a recording, and the estimates that follow from it.
 
-    - `blocks`: blocks of the recording with the Gram matrices of the balance.
-    - `equations`, `columns`: the balances, behind a servo valve one for each chamber, and the roles of their columns.
+    - `blocks`, `equations`, `columns`: blocks with the Gram matrices of the balances, of which there is one or, behind
+      a servo valve, one for each chamber; and the roles of their columns.
     - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
     - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
@@ -293,8 +293,8 @@ class RecordedBalance:
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        At equal pressures a leak has no flow, so that the hold would not show the leak. The largest abs(p_A - p_B) in
-        the hold or just before it counts, since a large leak equalises the pressures while the valves are shutting.
+        At equal pressures a leak has no flow to show. The largest abs(p_A - p_B) in the hold or just before it counts,
+        since a large leak equalises the pressures while the valves are shutting.
         """
         oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -462,8 +462,7 @@ class RecordedBalance:
         - A flow meter or a stated displacement gives the factor 1. If a stated area disagrees with the displacement,
           the difference is the uncertainty.
         - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
-          stated, it is 1, with the uncertainty of both.
-        - Without a measured area the factor is 1, with the uncertainty of meter or displacement.
+          stated, or no area is measured, it is 1.
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)
@@ -552,14 +551,13 @@ class RecordedBalance:
 def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
     """Estimate the logarithm r of the ratio of two piston areas, first side over second, with its standard deviation.
 
-    `measured`: fitted ratio of the areas, without information if it is not positive; the area of the second side is
-    well known. Only a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the
-    second side. Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with
-    the probability `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the
-    fraction of that motion in which the first side surely carries the load.
-
-    r has a normal prior with the standard deviation `held_oil.sides_deviation`. The prior mean is `held_oil.sides` if
-    the first side is probably the larger one (`is_larger`), else minus this value.
+    `measured`: fitted ratio, without information if it is not positive; the area of the second side is well known. Only
+    a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the second side.
+    Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the
+    probability `held_oil.sides_told`; otherwise log w is uniform between 0 and log `loaded_share`, the fraction of that
+    motion in which the first side surely carries the load. r is normal about `held_oil.sides` if the first side is
+    probably the larger one (`is_larger`), else about minus this value, with the standard deviation
+    `held_oil.sides_deviation`.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
@@ -52,70 +51,84 @@ def rival_rises(
     flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A leak without an
     entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
     """
-    names = columns[0].names
-    hold_rivals = held_rivals(judged, healthy, unit_flows)
-    # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
-    turning = (TURNING,) if SPEED_LOSS in names else ()
-    columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
-    if hold_rivals is not None:
-        columns_to_test = [k for k in columns_to_test if not names[k].startswith("external leak")]
-    laws = compare_laws(judged, healthy, columns)
-    healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
-    observables = list[Observable]()
+    names, hold_rivals = columns[0].names, held_rivals(judged, healthy, unit_flows)
+    observables = list[Observable | None]()
+    for k, name in enumerate(names):
+        # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
+        if name == TURNING and SPEED_LOSS in names:
+            observables.append(_turning_rise(judged, healthy, columns, k))
+        elif name == AIR:
+            prior_change = INFERENCE.free_air.size * volume_ratio
+            values, error, _ = _compare_changes(judged, healthy, columns, k)
+            *healthy_values, value = values
+            air = compare_with_healthy(AIR, RISE, value, healthy_values, error, prior_change=prior_change)
+            observables.append(_with_log_ratio(air, judged, healthy, columns))
+        elif name.startswith("external leak") and hold_rivals is None:
+            values, error, _ = _compare_changes(judged, healthy, columns, k)
+            *healthy_values, value = values
+            leak = compare_with_healthy(name, RISE, value, healthy_values, error, above=True)
+            leak = None if leak is None else _penalise_size(leak, judged, unit_flows)
+            observables.append(_with_log_ratio(leak, judged, healthy, columns))
+    return (*filter(None, observables), *(hold_rivals or ()))
+
+
+def _compare_changes(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles], tested: int
+) -> tuple[list[float], float, list[RecordingSums]]:
+    """Estimate the change of a coefficient from the healthy recordings, in each of these and in the judged recording.
+
+    A healthy recording is compared with the other healthy ones, and left out if no pressure drives the flow of the
+    tested term. Returns the changes, that of the judged recording last; the part of its standard error that the scatter
+    of the others does not contain (`excess_error`); and the healthy recordings that were compared. `tested`: column of
+    the coefficient.
+    """
+    total = np.sum([recording.sums for recording in healthy], axis=0)
+    change, error = _estimate_change(judged.sums, total, columns, tested)
+    known, values, errors = list[RecordingSums](), list[float](), list[float]()
+    for recording in healthy:
+        healthy_change, healthy_error = _estimate_change(recording.sums, total - recording.sums, columns, tested)
+        if np.isfinite(healthy_error):
+            known.append(recording)
+            values.append(healthy_change)
+            errors.append(healthy_error)
+    return [*values, change], excess_error(error, errors), known
+
+
+def _turning_rise(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles], tested: int
+) -> Observable | None:
+    """Test the leakage of the turning pump, the coefficient of the column `tested`, for a rise over healthy recordings.
+
+    It describes data of its own, and so does not compete with the leak for the rise of the leakage.
+    """
     pump_rise = held_pump_rise(judged, healthy)
-    for k in columns_to_test:
-        if names[k] == TURNING and pump_rise is not None:
-            observables.append(
-                Observable(
-                    name=TURNING,
-                    data=TURNING_DATA,
-                    score=max(pump_rise.score, 0.0) ** 2,  # a fall does not count
-                    chance=pump_rise.chance,
-                    size=pump_rise.value,
-                )
-            )
-            continue
-        change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
-        # change of each healthy recording from the other healthy ones
-        changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
-        is_known = [np.isfinite(healthy_error) for _, healthy_error in changes]
-        changes = list(compress(changes, is_known))  # in the others no pressure drives the flow of this term
-        is_air = names[k] == AIR
-        values = np.array([*(healthy_change for healthy_change, _ in changes), change])
-        # the scatter of the healthy changes contains their own errors already
-        error = excess_error(error, [healthy_error for _, healthy_error in changes])
-        if names[k] == TURNING:
-            turning_columns = [roles.replace_leak(TURNING) for roles in columns]
-            level, _ = coefficient_level(healthy_gram, turning_columns)
-            # levels instead of changes, since the oil's viscosity scales the whole leakage
-            values = _without_oil(level + values, predict_thinning([*compress(healthy, is_known), judged]))
-        *healthy_values, value = values.tolist()
-        observable = compare_with_healthy(
-            names[k],
-            TURNING_DATA if names[k] == TURNING else RISE,
-            value,
-            healthy_values,
-            error,
-            above=not is_air,  # free air may also decrease
-            prior_change=INFERENCE.free_air.size * volume_ratio if is_air else np.inf,
-        )
-        if observable is None:
-            continue
-        if names[k] == TURNING:  # it describes data of its own, and so does not compete with the leak for the rise
-            turning_rise = rise(judged, healthy, turning_columns)
-            # a rise that warmer oil explains does not count
-            observable = replace(observable, chance=max(observable.chance, turning_rise.chance))
-        else:
-            # rival against a laminar leak, for one independent residual
-            log_ratio = compare_with_leak(judged, healthy, columns, names[k])
-            if log_ratio is not None and laws is not None:
-                log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
-            log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
-            if not is_air:
-                observable = _penalise_size(observable, judged, unit_flows)
-            observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
-        observables.append(observable)
-    return (*observables, *(hold_rivals or ()))
+    if pump_rise is not None:  # measured just before valves shut to hold a load
+        score = max(pump_rise.score, 0.0) ** 2  # a fall does not count
+        return Observable(name=TURNING, data=TURNING_DATA, score=score, chance=pump_rise.chance, size=pump_rise.value)
+    changes, error, known = _compare_changes(judged, healthy, columns, tested)
+    turning_columns = [roles.replace_leak(TURNING) for roles in columns]
+    level, _ = coefficient_level(np.sum([recording.sums for recording in healthy], axis=0), turning_columns)
+    # levels instead of changes, since the oil's viscosity scales the whole leakage
+    levels = _without_oil(level + np.array(changes), predict_thinning([*known, judged]))
+    *healthy_values, value = levels.tolist()
+    observable = compare_with_healthy(TURNING, TURNING_DATA, value, healthy_values, error, above=True)
+    if observable is None:
+        return None
+    # a rise that warmer oil explains does not count
+    return replace(observable, chance=max(observable.chance, rise(judged, healthy, turning_columns).chance))
+
+
+def _with_log_ratio(
+    rival: Observable | None, judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
+) -> Observable | None:
+    """Add the log likelihood ratio of a rival to a leak past the piston, laminar or through an orifice, if known."""
+    log_ratio = None if rival is None else compare_with_leak(judged, healthy, columns, rival.name)
+    if rival is None or log_ratio is None:
+        return rival
+    laws = compare_laws(judged, healthy, columns)
+    if laws is not None:
+        log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
+    return replace(rival, log_ratio_to_leak=INFERENCE.size.readings * log_ratio)  # ratios for one independent residual
 
 
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
