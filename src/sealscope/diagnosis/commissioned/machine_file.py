@@ -149,12 +149,6 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     """
     target = _resolve_target(path)
     with _lock(target):
-        # a machine that was not loaded from this file replaces it unchecked
-        if machine.origin is not None and machine.origin.path == target and target.exists():
-            # the tables as they will be read back
-            new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
-            if change := _find_change(machine.origin, _hash_parts(_read_checked(target)), _hash_parts(new_tree)):
-                raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
         _write_files(machine, target)
     return Path(path)
 
@@ -205,10 +199,14 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
 
     With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. Summaries
     that neither the machine nor the present TOML file or its backup names are kept as long as the total size stays
-    below `_SPARE`. Raises InputError if the TOML file could not be read back.
+    below `_SPARE`. Raises InputError if the TOML file could not be read back, or if it would undo a change by another
+    process.
     """
-    data = _format_text(machine, target)
-    _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
+    data = (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
+    new_tree = parse_toml(data, "a machine's file", str(target))  # the tables as they will be read back
+    _convert_tree(new_tree, str(target))  # raises InputError
+    if change := _find_change(machine.origin, target, new_tree):
+        raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
     backup = target.with_suffix(".toml.bak")
     present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
@@ -229,11 +227,6 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
             temporary.write_bytes(target.read_bytes())
     with atomic_write(target) as temporary:
         temporary.write_bytes(data)
-
-
-def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
-    """Format a machine as the text of its file at `target`, encoded in UTF-8."""
-    return (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
 
 
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
@@ -266,12 +259,15 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     return parts | {hash_value(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Find the first change of a machine's file by another process, which writing would undo; None if there is none.
+def _find_change(origin: Origin | None, target: Path, new_tree: Mapping[str, Any]) -> str | None:
+    """Find the first change of the file `target` by another process, which writing `new_tree` would undo, or None.
 
-    `origin`: the file when it was loaded; `present`, `written`: parts (`_hash_parts`) of the file as it is now, and as
-    it will be written. A part was added if only `present` has it, and removed if only `present` lacks it.
+    A part (`_hash_parts`) was added if only the present file has it, and removed if only the present file lacks it. A
+    machine that was not loaded from this file (`origin`) replaces it unchecked.
     """
+    if origin is None or origin.path != target or not target.exists():
+        return None
+    present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
     return changes[0] if changes else None

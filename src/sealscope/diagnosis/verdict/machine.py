@@ -77,13 +77,10 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """
     rig = infer_rig(None if rig is None else load_rig(rig), recording)
     used_rig = load_rig(_DEFAULT) if rig is None else rig
-    stated_by: StatedBy
-    if rig is not None:
-        stated_by = "call" if states_rig(used_rig) else "nobody"
-    elif _names_rig_of_same_geometry(recording.provenance, used_rig):
+    stated_by: StatedBy = "call" if rig is not None and states_rig(rig) else "nobody"
+    if rig is None and _names_rig_of_same_geometry(recording.provenance, used_rig):
         stated_by = "recording"
-    else:
-        stated_by = "nobody"
+    elif rig is None:
         used_rig = used_rig.as_assumed(_REASON)
     return used_rig, AssumedMachine(
         used_rig.name,

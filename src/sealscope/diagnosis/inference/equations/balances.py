@@ -36,6 +36,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     Term,
     chamber_terms,
     compensated_leak_term,
+    compliance_term,
     conductance_term,
     external_leak_term,
     fitted_term,
@@ -135,11 +136,10 @@ def _supply_equation(rig: Rig) -> Equation:
         *while_fed("A", external_leak_term("A")),
         *while_fed("B", external_leak_term("B", weight=-1.0)),
         _mask_term(air, lambda s: s.moving(_supply_volume)),
-        Term(
+        fitted_term(
             "compliance of the supply",
             "m^3/Pa",
             lambda s: direction(s) * s.step("p_1"),
-            "sensor fault",
             drift="compliance",
             needs=("p_1",),
         ),
@@ -254,13 +254,8 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         """Return the side, "A" or "B", that on average carries the load."""
         return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
 
-    compliance = Term(
-        "compliance of the loaded side",
-        "m^3/Pa",
-        lambda s: s.step(f"p_{loaded_side(s)}"),
-        "air in the oil",
-        drift="compliance",
-        needs=PRESSURES,
+    compliance = compliance_term(
+        "compliance of the loaded side", "m^3/Pa", lambda s: s.step(f"p_{loaded_side(s)}"), needs=PRESSURES
     )
     return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
 

@@ -120,6 +120,8 @@ START = "start"
 PRESSURES = ("p_A", "p_B")
 #: Makes a term whose coefficient changes suddenly only by a sensor fault.
 fitted_term = partial(Term, cause="sensor fault")
+#: Makes a term of oil that the pressure compresses; air in the oil changes its coefficient suddenly.
+compliance_term = partial(Term, cause="air in the oil", drift="compliance")
 
 
 def conductance_term(
@@ -153,7 +155,6 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
     dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, d ln p for dissolving air.
     """
     p, name = f"p_{side}", f"compliance {side}"
-    compliance_term = partial(Term, cause="air in the oil", drift="compliance")
     air_term = partial(Term, cause="air in the oil", drift="air")
     return (
         compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),

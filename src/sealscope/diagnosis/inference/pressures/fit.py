@@ -92,6 +92,12 @@ class Linearisation(NamedTuple):
         # gram[0, 0] is the residual sum of squares
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
 
+    def newton_terms(self, variance: float, prior: Normal) -> tuple[Array, Array]:
+        """Compute Hessian (p, p) and negative gradient (p,) of `cost` / 2 by the parameters, per `prior.unit`."""
+        # row and column 0 of the Gram matrix belong to the residual
+        gradient = self.gram[0, 1:] / variance - prior.precision @ prior.deviations(self.theta)
+        return self.gram[1:, 1:] / variance + prior.precision, gradient
+
 
 class Block(NamedTuple):
     """Sums over a block of samples, from the linearisation about the block's parameters `theta` (p,).

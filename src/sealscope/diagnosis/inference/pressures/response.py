@@ -40,6 +40,7 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
     POSITION,
     SCALE,
     SPRING,
+    STRIBECK,
     G,
     Machine,
     response_priors,
@@ -169,10 +170,8 @@ class Segment:
         """
         damping = 0.0
         for _ in range(n_steps):
-            residual_squares = float(fit.gram[0, 0])  # row and column 0 of the Gram matrix belong to the residual
-            variance = noise or self.residual_variance(residual_squares)
-            hessian = fit.gram[1:, 1:] / variance + prior.precision
-            gradient = fit.gram[0, 1:] / variance - prior.precision @ prior.deviations(fit.theta)
+            variance = noise or self.residual_variance(float(fit.squares[0]))
+            hessian, gradient = fit.newton_terms(variance, prior)
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             if not float(gradient @ step) >= _MIN_GAIN:
                 break
@@ -279,13 +278,14 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
-    `machine`: simulator; `priors`: priors of its parameters; `sense`: 1 if p_A - p_B rises with the command, else -1.
+    `rig`: assumed machine; `rate`: sampling rate [Hz]; `sense`: 1 if p_A - p_B rises with the command, else -1; `law`:
+    law of friction, one of `reduced_rig.LAWS`.
     """
 
-    def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
-        self.machine, self.priors, self.sense = machine, priors, sense
-        self.theta = priors.centre  # parameters (p,)
-        self.covariance = np.diag(priors.variance)  # covariance of the parameters, in units of `priors.unit`
+    def __init__(self, rig: Rig, rate: float, sense: float, law: str = STRIBECK) -> None:
+        self.machine, self.priors, self.sense = Machine.from_rig(rig, rate, law), response_priors(rig, law), sense
+        self.theta = self.priors.centre  # parameters (p,)
+        self.covariance = np.diag(self.priors.variance)  # covariance of the parameters, in units of `priors.unit`
         self.variance = math.nan  # variance of the noise [Pa^2]
         self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
@@ -306,20 +306,19 @@ class Follower:
         # p_A + p_B has the noise of p_A - p_B but does not ring; the squares of the coefficients (1, -3, 3, -1) of a
         # third difference have the sum 20
         noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
-        follower = Follower(Machine.from_rig(rig, recording.rate), response_priors(rig), sense)
+        follower = Follower(rig, recording.rate, sense)
         segment = follower.next_segment(beginning)
         fit = fit_from_priors(segment, total, noise_variance)
         cost = fit.cost(noise_variance, follower.priors.normal)
         if not segment.is_explained(cost):  # try LuGre's friction in place of Stribeck's
-            bristles = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), response_priors(rig, BRISTLES), sense)
+            bristles = Follower(rig, recording.rate, sense, BRISTLES)
             starts = np.array([fit.theta, bristles.priors.centre])
             # the fit with Stribeck's friction says nothing about the compliance
             starts[:, COMPLIANCE] = bristles.priors.centre[COMPLIANCE]
             bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise_variance, n_best=1)
             if bristles_fit.cost(noise_variance, bristles.priors.normal) < cost:
                 follower, fit = bristles, bristles_fit
-        residual_squares = float(fit.gram[0, 0])
-        follower.theta, follower.variance = fit.theta, segment.residual_variance(residual_squares)
+        follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
         follower._converge_on_beginning(recording)
         return follower
 
@@ -338,7 +337,7 @@ class Follower:
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
         """Make a filter for samples of the same machine at another `rate` [Hz] that continues as after a gap."""
-        follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
+        follower = Follower(rig, rate, self.sense, self.machine.law)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
         return follower
@@ -418,9 +417,8 @@ class Follower:
         fit, prior = self._fit_block(segment, block.duration)
         chi_squared = fit.cost(self.variance, prior)
         self.excess = (chi_squared - segment.n_samples) / math.sqrt(2.0 * max(segment.n_samples, 1.0))
-        parameter_gram = fit.gram[1:, 1:]  # row and column 0 belong to the residual
-        self.covariance = np.asarray(np.linalg.inv(parameter_gram / self.variance + prior.precision))
-        gradient = fit.gram[0, 1:] / self.variance - prior.precision @ prior.deviations(fit.theta)
+        hessian, gradient = fit.newton_terms(self.variance, prior)
+        self.covariance = np.asarray(np.linalg.inv(hessian))
         # one more Gauss-Newton step, which needs no simulation
         self.theta = np.clip(fit.theta + self.covariance @ gradient * prior.unit, *segment.bounds(fit.theta))
         self.states, self.last = fit.ends, float(block["u"][-1])

@@ -14,11 +14,7 @@ from sealscope.diagnosis.inference.comparison.laws import compare_laws
 from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
-from sealscope.diagnosis.inference.leak_law import (
-    EXPONENTS,
-    law_priors,
-    mixture_flow,
-)
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import (
     BOUND_PROBABILITY,
@@ -467,14 +463,13 @@ class BalanceLeak(LeakMeasure):
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
             remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
         for condition in find_unusual_conditions(balance.recording_sums, self.healthy):
-            name, value, low, high = condition.name, condition.value, condition.low, condition.high
-            if name == "speed":  # over the nearer end of the range of the healthy recordings
+            value, low, high = condition.value, condition.low, condition.high
+            if condition.name == "load":
+                remarks.append(Remark("load beyond", {"value": value / BAR, "low": low / BAR, "high": high / BAR}))
+            elif condition.name == "speed":  # over the nearer end of the range of the healthy recordings
                 remarks.append(Remark("speed beyond", {"ratio": value / (high if value > high else low)}))
             else:
-                unit = BAR if name == "load" else 1.0  # oil temperatures are in deg C
-                remarks.append(
-                    Remark(f"{name} beyond", {"value": value / unit, "low": low / unit, "high": high / unit})
-                )
+                remarks.append(Remark("oil beyond", {"value": value, "low": low, "high": high}))
         return remarks
 
 

@@ -184,23 +184,21 @@ class VolumeBalance:
         balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:
             return None
-        scale = balance.size.scale if balance.size.stated else 0.0
-        summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
+        summary = {
+            "terms": list(balance.columns[0].names),
+            "scale": balance.size.scale if balance.size.stated else 0.0,
+            "stroke": balance.recorded_stroke,
+            "creep_odds": balance.creep_log_odds() if balance.is_creep else None,
+            **balance.recording_sums._asdict(),
+        }
         if recorded is not None:
             summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
-        if balance.recorded_stroke is not None:
-            summary["stroke"] = np.array(balance.recorded_stroke)
         if recorded is not None and recorded.shut is not None:
             shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            if shut_sums.held is not None and hold_odds is not None:
-                summary |= {"held": shut_sums.held, "held_odds": hold_odds}
-                if shut_sums.held_pump is not None:
-                    summary["held_pump"] = shut_sums.held_pump
-        if balance.is_creep:
-            summary["creep_odds"] = balance.creep_log_odds()
-        return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
+            summary |= {"held": shut_sums.held, "held_odds": hold_odds, "held_pump": shut_sums.held_pump}
+        return {name: value for name, value in summary.items() if value is not None}
 
     def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], n_repeats: int = 1) -> Rise:
         """Predict the distribution of the rise [m^3/(s Pa)] that a healthy recording of a later day will seem to show.
