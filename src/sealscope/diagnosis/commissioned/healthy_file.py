@@ -147,7 +147,7 @@ def _check_levels(summary: Any) -> Any:
     """Return the `summary` of wavelet details (`_RMS`) if its arrays are valid; raise ValueError otherwise.
 
     `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) the features `DUTY`: three
-    logarithms and a ratio. All are finite and below `_MAX_LOGARITHM` in magnitude.
+    logarithms and a ratio.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -161,8 +161,8 @@ def _check_levels(summary: Any) -> Any:
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
-    `values` (4, k) has a column for each of k octaves, with the fields of `Octaves`: logarithms of the RMS of both
-    channels, their phase [rad], and the variance of the phase's error [rad^2]. All must be below 750 in magnitude.
+    `values` (4, k) has the fields of `Octaves` for each of k octaves: logarithms of the RMS of both channels, their
+    phase [rad], and the variance of the phase's error [rad^2].
     """
     if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"

@@ -309,10 +309,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file at `path`, which also gives the name of the file of summaries.
-
-    Values that are None are unknown; `_format_table` does not write them, as TOML has no such value.
-    """
+    """Build the nested tables of a machine's file at `path`; values that are None are not written (`_format_table`)."""
     from importlib.metadata import version
 
     machine_table = {
@@ -354,7 +351,7 @@ def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") ->
     """Format a table as lines of TOML: first plain values, then inner tables; None and empty tables are not written.
 
     `path` is the table's dotted name, "" for the whole file. In the file a list becomes an array of tables; in a table,
-    an inner table that has only plain values is written on one line. `heading` is the line before the table's values.
+    an inner table of plain values only takes one line. `heading` is the line before the table's values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():

@@ -297,9 +297,9 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
-    Second differences of white noise have sqrt(6) times its standard deviation, and the median absolute value of a
-    standard normal number is 0.6745. The estimate is at least the standard deviation of a rounding error, the
-    channel's resolution / sqrt(12), and 0 for fewer than three finite values.
+    These have sqrt(6) times the standard deviation of the noise; the median absolute value of a standard normal number
+    is 0.6745. The estimate is at least the standard deviation of a rounding error, and 0 for fewer than three finite
+    values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:

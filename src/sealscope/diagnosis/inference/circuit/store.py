@@ -7,8 +7,7 @@ areas A_A and A_B, the volume delivered by the middle of block k is
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
 where g_j is the conductance to the outside in block j, P_j the pressure that drives the leak, and tau the length of a
-block (1/2 applies to block k itself). w and v describe the gas temperature and have priors (`priors.toml`). The mean
-volume of a block is far more precise than a mean flow.
+block (1/2 applies to block k itself). w and v describe the gas temperature and have priors (`priors.toml`).
 """
 
 from __future__ import annotations

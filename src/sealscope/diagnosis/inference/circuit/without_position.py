@@ -9,11 +9,9 @@ returns displaces nothing,
 so the pump delivers just the leakage. D is the pump's displacement per angle theta, G the leakage conductance, and c_j
 are the coefficients of the other terms f_j dg_j. If the pump delivers less than any pump leaks, no loop replaces the
 leakage, and the balance contains no information. While a loop holds the piston at standstill, any test function will
-do. Rows with a missing sample have no weight. Rows of a single rod in which the loaded side changes have no weight
-either, since the circuit then exchanges oil. Sensor offsets up to z may cause a part of the mean pressure difference d
-of a row; only d - z^2/d counts, or 0 below z (Breiman's garrote). If no channel gives a flow, shut valves hold the
-piston, and the leakage of the loaded side moves it slowly. While the command moves, the valve may replace the lost oil,
-and the samples do not count.
+do. Rows of a single rod in which the loaded side changes have no weight, since the circuit then exchanges oil. If no
+channel gives a flow, shut valves hold the piston, and the leakage of the loaded side moves it slowly. While the command
+moves, the valve may replace the lost oil, and the samples do not count.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """

@@ -1,7 +1,7 @@
 """The terms of a machine's volume balance, computed from recorded channels.
 
-A balance states where the volume of oil goes that the pump delivers: into motion of the piston, compression, air and
-leakage. It is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
+A balance states where the volume of oil goes that the pump delivers. It is linear in the unknown coefficients of the
+machine. For a pump-controlled cylinder
 
     D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
 
@@ -10,8 +10,6 @@ for each term; f_j and g_j are functions of the recorded channels. A term comput
 sampling interval dt, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance. Its
 left side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges.
 G is the same in both chambers.
-
-The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of edges).
 """

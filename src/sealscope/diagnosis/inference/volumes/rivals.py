@@ -2,9 +2,9 @@
 
 Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance. The change of
 its coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the changes of
-all other coefficients, including the leak's (`priors.toml`). The scatter of the coefficient among the healthy
-recordings shows which change is normal (`differences`). An external leak and a leak past the piston look nearly alike:
-the likelihood ratio of the two is stated with the observable.
+all other coefficients (`priors.toml`). The scatter of the coefficient among the healthy recordings shows which change
+is normal (`differences`). An external leak and a leak past the piston look nearly alike: the likelihood ratio of the
+two is stated with the observable.
 """
 
 from __future__ import annotations

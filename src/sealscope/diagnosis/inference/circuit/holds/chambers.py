@@ -13,16 +13,14 @@ with
 - I: time integral of a power of p_A - p_B - z, where z is the sensor offset; I_A, I_B: those of the gauge pressures;
 - p_0: atmospheric pressure.
 
-A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way. A check valve may
-fill a side that is at the charge pressure, or the side without the load may be open to the charge line; no balance
+A leaking piston moves oil from A to B; a leaking rod seal drains one side only, and the piston gives way. A check valve
+may fill a side that is at the charge pressure, or the side without the load may be open to the charge line; no balance
 holds for that side then. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The first is of
 the time in which the valves may still shut; it counts only on the side of the lower pressure, whose oil comes through a
-leak alone: a large leak equalises the pressures within that time. The readings of all holds form one regression, each
-side of a hold about its mean. The dead volumes and the logarithms of K and alpha have normal priors (`held_oil` in
-`priors.toml`); the regression is linearised about the estimate, iteratively. Uncertain areas are varied
-(`HeldChambers.area_variants`). The onset of the leak and the offset z are those with the highest posterior; a leak that
-has equalised the pressures determines z. The three leaks are hypotheses, each with its probability. A leak past the
-piston may grow from its onset on.
+leak alone: a large leak equalises the pressures within that time. The readings of all holds form one regression
+(`oil`), each side of a hold about its mean. The onset of the leak and the offset z are those with the highest
+posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with its
+probability. A leak may grow from its onset on.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """

@@ -1,8 +1,8 @@
 """Regression of the volumes in closed chambers on the properties of their oil, and on leaks.
 
 The compressed oil and the free air of the stroke and of the dead volumes take up what the piston displaces; the rest
-has leaked. The compressibility, the free air and the dead volumes have priors (`held_oil` in `priors.toml`); the
-regression is linearised about the estimate, iteratively.
+has leaked. The logarithms of compressibility and free air, and the dead volumes, have normal priors (`held_oil` in
+`priors.toml`); the regression is linearised about the estimate, iteratively.
 """
 
 from __future__ import annotations
