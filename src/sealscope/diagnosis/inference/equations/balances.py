@@ -323,8 +323,8 @@ def _pump_leakage_terms(
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
     """Return a volume balance with additional terms before the leak's terms, which stay last."""
-    *others, laminar_leak, orifice_leak = equation.terms
-    return equation._replace(terms=(*others, *terms, laminar_leak, orifice_leak))
+    *other_terms, laminar_leak, orifice_leak = equation.terms
+    return equation._replace(terms=(*other_terms, *terms, laminar_leak, orifice_leak))
 
 
 def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:

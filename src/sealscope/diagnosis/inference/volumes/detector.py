@@ -330,13 +330,15 @@ def compare_motion(
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
     # logarithm of the ratio over that of all healthy recordings together
-    judged, *others = (Estimate(*motion_change(sums.sums[0], healthy_sums, roles)) for sums in (judged_sums, *healthy))
+    judged, *healthy_estimates = (
+        Estimate(*motion_change(sums.sums[0], healthy_sums, roles)) for sums in (judged_sums, *healthy)
+    )
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
     observable = compare_estimates(
         name="motion",
         data="motion",
         judged=judged,
-        healthy=others,
+        healthy=healthy_estimates,
         prior=PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
