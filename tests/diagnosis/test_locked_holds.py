@@ -11,7 +11,7 @@ from scipy.optimize import lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import extend_rests, find_charge_pressure, find_locked_holds
-from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, NEITHER, LeakLaw, PistonFit, SideSupply
+from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, SideSupply, growth_factor
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, residual_squares
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -165,8 +165,8 @@ def test_the_faster_a_leak_equalises_the_pressures_the_less_its_size_is_known(ex
     errors = []
     for size in (0.01, 1.0, 100.0):
         chambers = held_press(piston=size * SEAL, exponent=exponent)
-        law = LeakLaw(exponent)
-        errors.append(chambers.start_error(chambers.piston_fits[exponent], law))
+        leak = next(leak for leak in chambers.piston_fits if leak.exponent == exponent)
+        errors.append(chambers.start_error(leak))
     held_s = HELD[1] - HELD[0]
     assert errors[0] == pytest.approx(INFERENCE.held_oil.settles / held_s / len(chambers.holds) ** 0.5, rel=0.2)
     assert errors[0] < errors[1] < errors[2]
@@ -186,8 +186,7 @@ def test_equalised_pressures_tell_a_leak_though_the_gains_of_the_sensors_differ(
 def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
     for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
         chambers = held_press(piston=SEAL, exponent=exponent)
-        found = PistonFit(0.0, 0.0, NEITHER)
-        likelihoods = {e: chambers.fit_piston_leak(found, LeakLaw(e)).log_likelihood for e in (1.0, 0.5)}
+        likelihoods = {e: chambers.fit_piston_leak(PistonLeak(e)).log_likelihood for e in (1.0, 0.5)}
         assert likelihoods[exponent] > likelihoods[other] + 5.0
 
 
@@ -196,9 +195,10 @@ def test_holds_tell_how_a_leak_grows() -> None:
     growth = 2.0 * INFERENCE.growth.most / 3.0
     chambers = held_press(piston=5.0 * SEAL, growth=growth)
     best = max(chambers.law_fits, key=lambda fit: fit.log_weight)
-    assert (best.law.exponent, best.law.growth) == (1.0, pytest.approx(growth, rel=0.3))
+    assert (best.leak.exponent, best.leak.growth) == (1.0, pytest.approx(growth, rel=0.3))
     assert best.fit.value == pytest.approx(5.0 * SEAL, rel=0.2)
-    steady = next(fit for fit in chambers.law_fits if fit.law == LeakLaw(1.0, 0.0, best.law.onset))
+    steady = chambers.law_fits[0]
+    assert (steady.leak.exponent, steady.leak.growth) == (1.0, 0.0)
     assert best.log_weight > steady.log_weight + 5.0
 
 
@@ -207,7 +207,7 @@ def test_a_leak_that_equalises_the_pressures_while_the_valves_shut_shows_on_the_
     chambers = held_press(piston=100.0 * SEAL)
     hold = chambers.holds[0]
     equal = float((hold.p_A - hold.p_B)[hold.edges[1] :].max())
-    assert hold.carries(True) and not hold.carries(False)
+    assert hold.is_A_loaded
     assert equal < 0.1 * LOADED
     assert chambers.piston_leak.probability > 0.99
     without_settling = [replace(hold, edges=hold.edges[1:]) for hold in chambers.holds]
@@ -324,21 +324,21 @@ def test_the_growth_of_a_leak_moves_no_onset(since: float) -> None:
     assert onset is not None
     assert onset.low <= since <= onset.high
     best = max(chambers.law_fits, key=lambda fit: fit.log_weight)
-    assert best.law.growth > 0.5 * INFERENCE.growth.most
-    assert best.law.onset == pytest.approx(since, abs=2.0)
+    assert best.leak.growth > 0.5 * INFERENCE.growth.most
+    assert best.leak.onset == pytest.approx(since, abs=2.0)
 
 
 def test_volumes_lost_to_a_growing_leak_are_those_of_each_onset_by_itself() -> None:
     chambers = held_press(piston=0.3 * SEAL)
-    leak = chambers._unit_piston_leak(0.0)
+    leak = chambers._unit_piston_leak(PistonLeak())
     columns = chambers._growing_leak_columns(leak, 1.5)
     for index in (0, 3, len(chambers.onsets) // 2, len(chambers.onsets) - 1):
-        law = LeakLaw(1.0, 1.5, float(chambers.onsets[index]))
+        onset = float(chambers.onsets[index])
         flows = [
-            flow * law.growth_factor(hold.t, chambers.end)
+            flow * growth_factor(hold.t, 1.5, onset, chambers.end)
             for flow, hold in zip(leak.flows, chambers.holds, strict=True)
         ]
-        expected = chambers._leak_columns(leak._replace(flows=flows), np.array([law.onset]))[:, 0]
+        expected = chambers._leak_columns(leak._replace(flows=flows), np.array([onset]))[:, 0]
         # the kink at the onset lies between two samples
         assert columns[:, index] == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max())
 

@@ -29,19 +29,16 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     """Choose the rig that detectors assume for a recording, and tell who stated its areas and displacement.
 
     A given `rig` counts as stated by the caller if it defines a whole machine, else by nobody. Without a rig, the
-    thesis's rig is used, or the one of `infer_rig`. The thesis's rig counts as stated by the recording if the recording
-    was simulated with a packaged rig of the same areas and displacement. Otherwise nobody stated it, and all values of
-    the returned rig are marked as assumptions. Raises InputError if `rig` cannot be read.
+    thesis's rig is used, or the one of `infer_rig`. It counts as stated by the recording if that was simulated with a
+    packaged rig of the same areas and displacement; otherwise all its values are marked as assumptions. Raises
+    InputError if `rig` cannot be read.
     """
     rig = infer_rig(None if rig is None else load_rig(rig), recording)
     used_rig = load_rig(DEFAULT) if rig is None else rig
-    stated_by: StatedBy
-    if rig is not None:
-        stated_by = "call" if states_rig(used_rig) else "nobody"
-    elif _names_rig_of_same_geometry(recording.provenance, used_rig):
+    stated_by: StatedBy = "call" if rig is not None and states_rig(rig) else "nobody"
+    if rig is None and _names_rig_of_same_geometry(recording.provenance, used_rig):
         stated_by = "recording"
-    else:
-        stated_by = "nobody"
+    elif rig is None:
         used_rig = used_rig.as_assumed(UNSTATED)
     return used_rig, AssumedMachine(
         used_rig.name,

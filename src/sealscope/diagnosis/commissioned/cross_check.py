@@ -26,8 +26,7 @@ def cross_check(
     """Diagnose each healthy recording against all others, and leave out those that seem to leak.
 
     `judge(recording, reference)` diagnoses a recording against the healthy recordings `reference`. No recording is left
-    out if `keep` is True, or if at least half of the recordings seem to leak, as there is then no healthy majority. A
-    recording in which a leak seems to begin is also kept if there are later ones, none of which leaks (`_has_healed`).
+    out if `keep` is True, or if at least half of the recordings seem to leak, as there is then no healthy majority.
     Fewer than `MIN_RECORDINGS` recordings are not judged. Returns the remaining recordings, and the reason for each one
     left out. If a remaining recording shows a leak or another event, its problems (`about["wrong"]`) state it.
     """
@@ -56,7 +55,7 @@ def cross_check(
 def _has_healed(file: str, healthy: Sequence[SummarisedRecording], leaking: Collection[str]) -> bool:
     """Return True if recordings were made after that of the `file`, and none of them is among the `leaking` files.
 
-    Since a worn seal does not heal, the leak that seemed to begin in the recording is then no leak.
+    As a worn seal does not heal, the leak that seemed to begin in the recording is then no leak.
     """
     start_s = next(recording.start_s for recording in healthy if recording.file == file)
     if start_s is None:

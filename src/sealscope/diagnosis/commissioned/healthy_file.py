@@ -1,9 +1,9 @@
 """Read and write the file of healthy summaries, which lies next to a machine's text file (`machine_file`).
 
-The file consists of lines. The first line names the format. Each other line is the summary of a recording: the
-SHA-256 of a JSON text, a blank and the JSON text. The machine's file refers to summaries by their SHA-256. A summary
-that was altered or lost is therefore found and named, and a summary that is not referred to does no harm. A new file
-also contains the old summaries. It therefore fits both the old and the new machine's file, whenever a writer is killed.
+The first line names the format. Each other line is the summary of a recording: the SHA-256 of a JSON text, a blank and
+the JSON text. The machine's file refers to summaries by their SHA-256. A summary that was altered or lost is therefore
+found and named, and one that is not referred to does no harm. A new file also contains the old summaries. It therefore
+fits both the old and the new machine's file, whenever a writer is killed.
 
 The JSON text holds the fields of a `SummarisedRecording` except `file`. Arrays are stored as bytes
 (`storage.plain_state.plain_array`). Unknown names in `about` and in the summaries are kept.
@@ -64,10 +64,9 @@ class Line(NamedTuple):
 
 
 def table_type(extra: Literal["allow", "ignore"] = "ignore", **value_types: Any) -> Any:
-    """Make a pydantic type for a table with known keys.
+    """Make a pydantic type for a table with known keys; `extra`: keep ("allow") or drop ("ignore") other keys.
 
-    `value_types` has the type of each key's value, or (type, None) for a key that may be absent. Unknown keys are kept
-    if `extra` is "allow", and dropped if it is "ignore".
+    `value_types` has the type of each key's value, or (type, None) for a key that may be absent.
     """
     config = ConfigDict(strict=True, allow_inf_nan=False, extra=extra)
     # pydantic's `...` marks a value that must be present
@@ -97,13 +96,20 @@ def list_type(value_type: Any, min_length: int = 0) -> Any:
     return Annotated[list[value_type], FailFast(), Field(min_length=min_length)]
 
 
-def _check_array(value: Any) -> Any:
-    """Return the value if it is an array of finite numbers below 1e100 in magnitude; raise ValueError otherwise."""
-    if not isinstance(value, np.ndarray):
-        raise ValueError("must be an array of numbers")
-    if not (np.abs(value) < _MAX_NUMBER).all():
-        raise ValueError(f"must hold finite numbers with a magnitude below {_MAX_NUMBER:g}")
-    return value
+def _array_type(*shape: int) -> Any:
+    """Make a pydantic type for an array of finite numbers below 1e100 in magnitude, of any shape if none is given."""
+
+    def check_array(value: Any) -> Any:
+        """Return the value unchanged; raise ValueError if it is no such array."""
+        if not isinstance(value, np.ndarray):
+            raise ValueError("must be an array of numbers")
+        if not (np.abs(value) < _MAX_NUMBER).all():
+            raise ValueError(f"must hold finite numbers with a magnitude below {_MAX_NUMBER:g}")
+        if shape and value.shape != shape:
+            raise ValueError(f"must be of the shape {shape}, got {value.shape}")
+        return value
+
+    return Annotated[Any, AfterValidator(check_array)]
 
 
 def _check_sums(summary: Any) -> Any:
@@ -111,13 +117,8 @@ def _check_sums(summary: Any) -> Any:
 
     The array `sums` (E, m, m) has for each of E balances the sums of products of its m columns: the `terms`, which must
     include the leak, and the left side, a flow. Leak and left side must have positive sums of squares, and obey
-    Cauchy's inequality. The other arrays may be None:
-
-    - `shut_sums` (1, m + 2, m + 2): the sums if valves cut the pump off at rest, which needs two more columns.
-    - `held`: fields of `HeldLeaks`, the leaks while valves hold the load.
-    - `held_pump` (2,): the pump's leakage just before these times, and its standard deviation.
-    - `stroke` (2,): lower and upper end of the recorded motion.
-    - `resistance`: fields of `recording_sums.Resistance`, a fit of what resists the motion.
+    Cauchy's inequality. `shut_sums` (1, m + 2, m + 2) are the sums if valves cut the pump off at rest, which needs two
+    more columns.
     """
     size = len(summary.terms) + 1
     if summary.sums.ndim != 3 or not len(summary.sums) or summary.sums.shape[1:] != (size, size):
@@ -125,17 +126,10 @@ def _check_sums(summary: Any) -> Any:
     shut = summary.shut_sums
     if shut is not None and shut.shape != (1, size + 2, size + 2):
         raise ValueError(f"shut_sums must be of the shape (1, {size + 2}, {size + 2}), got {shut.shape}")
-    if summary.held is not None and summary.held.shape != (len(HeldLeaks._fields),):
-        raise ValueError(f"held must hold {len(HeldLeaks._fields)} numbers, got the shape {summary.held.shape}")
-    if summary.stroke is not None and (summary.stroke.shape != (2,) or summary.stroke[0] > summary.stroke[1]):
+    if summary.stroke is not None and summary.stroke[0] > summary.stroke[1]:
         raise ValueError(f"stroke must hold the lower and the upper end of the motion, got {summary.stroke}")
-    if summary.held_pump is not None and summary.held_pump.shape != (2,):
-        raise ValueError(f"held_pump must hold two numbers, got the shape {summary.held_pump.shape}")
-    resistance = summary.resistance
-    if resistance is not None:
-        if resistance.shape != (len(Resistance._fields),):
-            raise ValueError(f"resistance must hold {len(Resistance._fields)} numbers, got {resistance.shape}")
-        fit = Resistance(*resistance)
+    if summary.resistance is not None:
+        fit = Resistance(*summary.resistance)
         if min(fit.friction_error, fit.drop_error, fit.top_speed) < 1.0 / _MAX_NUMBER:  # these are divisors
             raise ValueError("resistance must hold positive standard errors and a positive speed")
     if LEAK not in summary.terms:
@@ -152,7 +146,7 @@ def _check_levels(summary: Any) -> Any:
     """Return the `summary` of wavelet details (`_RMS`) if its arrays are valid; raise ValueError otherwise.
 
     `levels` (5 per chamber,) are logarithms of the RMS of the details, and `duty` (4,) the features `DUTY`: three
-    logarithms and a ratio. All are finite and below `_MAX_LOGARITHM` in magnitude.
+    logarithms and a ratio.
     """
     expected = (len(QUANTITIES) * len(summary.chambers),)
     if not summary.chambers or summary.levels.shape != expected or summary.duty.shape != (len(DUTY),):
@@ -166,8 +160,8 @@ def _check_levels(summary: Any) -> Any:
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
-    `values` (4, k) has a column for each of k octaves, with the fields of `Octaves`: logarithms of the RMS of both
-    channels, their phase [rad], and the variance of the phase's error [rad^2]. All must be below 750 in magnitude.
+    `values` (4, k) has the fields of `Octaves` for each of k octaves: logarithms of the RMS of both channels, their
+    phase [rad], and the variance of the phase's error [rad^2].
     """
     if values.ndim != 2 or len(values) != len(Octaves._fields) or values.shape[1] < MIN_OCTAVES:
         shape = f"({len(Octaves._fields)}, k), k >= {MIN_OCTAVES}"
@@ -178,7 +172,7 @@ def _check_octaves(values: Any) -> Any:
 
 
 # types of values; `_BALANCE` and `_RMS` are those of the summaries by `VolumeBalance.learn` and `RmsChange.learn`
-_Array = Annotated[Any, AfterValidator(_check_array)]
+_Array = _array_type()
 _Number = Annotated[float, Field(gt=-_MAX_NUMBER, lt=_MAX_NUMBER)]
 _Magnitude = Annotated[float, Field(ge=0.0, lt=_MAX_NUMBER)]
 _Positive = Annotated[float, Field(gt=0.0, lt=_LAST_TIME)]
@@ -189,18 +183,18 @@ _BALANCE = table_type(
     scale=_Magnitude,
     sums=_Array,
     shut_sums=(_Array, None),
-    held=(_Array, None),
-    held_pump=(_Array, None),
+    held=(_array_type(len(HeldLeaks._fields)), None),
+    held_pump=(_array_type(2), None),
     shut_odds=(_Number, None),
     held_odds=(_Number, None),
     creep_odds=(_Number, None),
     sign_log_odds=(_Array, None),
-    stroke=(_Array, None),
+    stroke=(_array_type(2), None),
     flow=_Magnitude,
     pressure=_Magnitude,
     start_s=(_Time, None),
     oil_degC=(_Number, None),
-    resistance=(_Array, None),
+    resistance=(_array_type(len(Resistance._fields)), None),
 )
 _RMS = table_type(
     "allow",
@@ -240,8 +234,7 @@ _ABOUT = {
 def _restore_arrays(value: Any, name: str) -> Any:
     """Convert packed arrays (tables of "shape" and "f8") in a JSON value, at any depth of nested tables, to arrays.
 
-    Lists are returned unchanged. `name` is the key of the value. Raises ValueError with the key of an array that is not
-    valid.
+    Raises ValueError with the key of an array that is not valid; `name` is the key of the value.
     """
     if isinstance(value, dict):
         if value.keys() == {"shape", "f8"}:
@@ -270,8 +263,8 @@ _RECORDING = table_type(
 def _pack_arrays(value: Any) -> Any:
     """Convert a value for JSON: drop entries of mappings that are None, and pack arrays (`plain_array`), at any depth.
 
-    Lists that begin with a float or a list are packed, too, as a line may have few single values (`_MAX_MARKS`), and
-    row by row if their rows have unequal lengths. Arrays of other types than numbers become lists.
+    Lists that begin with a float or a list are packed, too, as a line may have few single values (`_MAX_MARKS`); if
+    their rows have unequal lengths, row by row.
     """
     if isinstance(value, Mapping):
         return {str(name): _pack_arrays(member) for name, member in value.items() if member is not None}
@@ -294,10 +287,10 @@ def _format_json(value: Any) -> bytes:
 
 
 def check_summary(method: str, summary: Summary) -> None:
-    """Check that the summary by the detector `method` can be stored and read back; its numbers must be finite.
+    """Check that the summary by the detector `method` can be stored and read back.
 
-    Raises TypeError for a value that is not plain, else ArithmeticError. For a built-in detector, `log_failure`
-    attributes the latter to the recording, not to the detector.
+    Raises TypeError for a value that is not plain, else ArithmeticError, which `log_failure` attributes to the
+    recording if the detector is built in.
     """
     try:
         convert_type(_BY_METHOD, parse_json(_format_json({method: summary})))
@@ -318,10 +311,9 @@ def format_summary(recording: SummarisedRecording) -> Line:
 
 
 def parse_summary(line: Line, file: str, place: str) -> SummarisedRecording:
-    """Parse a line of a file of summaries to the summary of a healthy recording.
+    """Parse a line of a file of summaries to the summary of a healthy recording; raise InputError if it is not valid.
 
-    `file` is the recording's name, and `place` the path of the file of summaries, for messages. Raises InputError if
-    the checksum does not match, a value is not valid, or the line holds too many single values instead of arrays.
+    `file` is the recording's name, and `place` the path of the file of summaries, for messages.
     """
     if sha256(line.data).hexdigest() != line.checksum:
         rule = f"must have the SHA-256 {line.checksum[:12]}..., got another"
@@ -344,8 +336,7 @@ _REMEDY = "take its [[healthy]] out of the machine's file, or commission it anew
 def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecording]:
     """Read the summaries of the recordings in `files`, which maps the checksum of a line to the recording's name.
 
-    The result has the order of `files`. Raises InputError if the file at `path` is missing, of another kind or too
-    large, or if one of the lines is missing or not valid.
+    The result has the order of `files`. Raises InputError if the file or one of the lines is missing or not valid.
     """
     recordings: dict[str, SummarisedRecording] = {}
     for line in _iter_lines(path):

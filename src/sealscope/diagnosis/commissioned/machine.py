@@ -54,20 +54,11 @@ JUDGEMENTS: tuple[Judgement, ...] = get_args(Judgement)
 
 
 class JudgedAlarm(NamedTuple):
-    """A person's judgement of an alarm of the monitor, or a repair.
+    """A person's judgement (`mark`) of an alarm of the monitor, or a repair.
 
-    Attributes
-    ----------
-    alarm : str
-        Name of the alarm, "" for a repair without an alarm.
-    mark : str
-        "valid", "invalid" or "repaired".
-    date_s, onset_s : float
-        Times of the judgement and of the onset of the leak [s since 1970].
-    leak_lpm : float or None
-        Flow of the leak [L/min], None if unknown.
-    reason : str
-        Reason given by the person, may be empty.
+    `alarm`: name of the alarm, "" for a repair without an alarm; `mark`: "valid", "invalid" or "repaired"; `date_s`,
+    `onset_s`: times of the judgement and of the onset of the leak [s since 1970]; `leak_lpm`: flow of the leak [L/min],
+    None if unknown; `reason`: reason given by the person, may be empty.
     """
 
     alarm: str
@@ -85,10 +76,7 @@ class JudgedAlarm(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """Path of the file that a machine was loaded from, and hashes of its parts (`machine_file._hash_parts`).
-
-    By the hashes, changes that others make to the file are detected.
-    """
+    """Path of the file that a machine was loaded from, and hashes of its parts, which show later changes by others."""
 
     path: Path
     parts: frozenset[bytes]
@@ -173,8 +161,7 @@ class CommissionedMachine:
         """Return a copy of the machine with one more healthy recording.
 
         `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
-        is judged leaking by those that the machine has, overlaps in time with a confirmed leak, is a copy of a known
-        recording, or cannot be trusted.
+        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known one, or cannot be trusted.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy:
@@ -200,8 +187,8 @@ class CommissionedMachine:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
 
         An alarm judged "valid" or "repaired" is a confirmed leak, open from its onset until the next repair. A later
-        judgement "invalid" of an alarm with the same name revokes the confirmation, unless the onset of the invalid
-        alarm is after the confirmation: then it is another alarm.
+        judgement "invalid" of an alarm with the same name revokes it; one whose onset is after the confirmation is
+        another alarm.
         """
         for k, leak in enumerate(self.alarms):
             is_revoked = any(
@@ -239,8 +226,7 @@ class CommissionedMachine:
 def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
     """Read a log with the channel map of its machine or, if the log does not fit the map, without a map.
 
-    `rate` is the sampling rate [Hz] of a log without a time column. If both attempts fail, the UnreadableFile of the
-    first one is raised.
+    `rate` is the sampling rate [Hz] of a log without a time column. If both fail, the first UnreadableFile is raised.
     """
     if not channel_map:
         return read(path, rate=rate)
@@ -256,8 +242,8 @@ def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: flo
 def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[str]) -> list[Path]:
     """List the files of recordings at one or several paths, each a file or a folder.
 
-    In a folder, hidden files, files with a suffix in `NO_RECORDINGS`, and results that Sealscope wrote are left out.
-    Links that lead out of the folder are left out with a warning. Raises InputError if no file remains.
+    In a folder, hidden files, files with a suffix in `NO_RECORDINGS`, results of Sealscope, and links that lead out of
+    the folder are left out, the latter with a warning. Raises InputError if no file remains.
     """
     try:
         named_paths = [paths] if isinstance(paths, str | os.PathLike) else list(paths)
@@ -279,7 +265,7 @@ def recordings_in(paths: Iterable[str | os.PathLike[str]] | str | os.PathLike[st
 
 
 def _is_own_output(file: Path) -> bool:
-    """Return True if a file begins like a verdict or a trend that this program wrote; False if it cannot be read."""
+    """Return True if a file begins like a verdict or a trend of this program; False if it cannot be read."""
     try:
         with file.open("rb") as content:
             return _OWN_OUTPUT.match(content.read(200)) is not None
@@ -290,9 +276,9 @@ def _is_own_output(file: Path) -> bool:
 def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
     """Compute the summaries of a healthy recording by all detectors that can use the recording.
 
-    `rig` states the sizes of the machine that the detectors assume, `file` is the name of the recording and `checksum`
-    the SHA-256 of its file. A detector that fails is left out, and its error is logged. Raises InputError if the
-    recording cannot be trusted, or if no detector can use it.
+    `rig` states the sizes that the detectors assume, `file` is the name of the recording and `checksum` the SHA-256 of
+    its file. A detector that fails is left out, and its error is logged. Raises InputError if the recording cannot be
+    trusted, or if no detector can use it.
     """
     from sealscope.diagnosis.commissioned.healthy_file import check_summary
     from sealscope.diagnosis.commissioned.summary import describe_recording

@@ -149,14 +149,6 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
     """
     target = _resolve_target(path)
     with _lock(target):
-        # a machine that was not loaded from this file replaces it unchecked
-        if machine.origin is not None and machine.origin.path == target and target.exists():
-            # the tables as they will be read back
-            new_tree = parse_toml(_format_text(machine, target), "a machine's file", str(target))
-            present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
-            change = _find_change(machine.origin, present, written)
-            if change is not None:
-                raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
         _write_files(machine, target)
     return Path(path)
 
@@ -164,11 +156,10 @@ def write_machine(machine: CommissionedMachine, path: str | os.PathLike[str]) ->
 def update_machine(
     path: str | os.PathLike[str], change: Callable[[CommissionedMachine], CommissionedMachine]
 ) -> CommissionedMachine:
-    """Apply a change to a machine's file without losing changes that another process makes at the same time.
+    """Apply a `change` to the machine of a file, and return the changed machine.
 
-    `change` converts the machine that was read to the machine to write. If another process has written the file
-    meanwhile, `change` is called a second time, with the machine of the new file. Returns the changed machine. Raises
-    InputError as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
+    If another process writes the file meanwhile, `change` is called a second time, with the machine of the new file.
+    Raises InputError as `read_machine`, `write_machine` and `change` do; the file then stays as it was.
     """
     target = _resolve_target(path)
     machine = read_machine(target)
@@ -206,13 +197,16 @@ def _lock(target: Path) -> AbstractContextManager[object]:
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """Write the files of a machine: the summaries, then a backup of the present TOML file, then the new TOML file.
 
-    With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. The new
-    file of summaries has those of the machine and those that the present TOML file or its backup names. Other summaries
-    of the present files are kept as long as the total size stays below 5 MB (`_SPARE`). Raises InputError if the TOML
-    file could not be read back.
+    With this order, an interruption leaves a complete TOML file at `target` and all summaries that it names. Summaries
+    that neither the machine nor the present TOML file or its backup names are kept as long as the total size stays
+    below `_SPARE`. Raises InputError if the TOML file could not be read back, or if it would undo a change by another
+    process.
     """
-    data = _format_text(machine, target)
-    _convert_tree(parse_toml(data, "a machine's file", str(target)), str(target))  # raises InputError
+    data = (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
+    new_tree = parse_toml(data, "a machine's file", str(target))  # the tables as they will be read back
+    _convert_tree(new_tree, str(target))  # raises InputError
+    if change := _find_change(machine.origin, target, new_tree):
+        raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
     backup = target.with_suffix(".toml.bak")
     present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
@@ -235,11 +229,6 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
         temporary.write_bytes(data)
 
 
-def _format_text(machine: CommissionedMachine, target: Path) -> bytes:
-    """Format a machine as the text of its file at `target`, encoded in UTF-8."""
-    return (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
-
-
 def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
     """Parse the tables `[[alarms]]` one at a time, to save memory; ValueError states the number of a wrong one."""
     if not isinstance(rows, list):
@@ -256,8 +245,7 @@ def _parse_alarms(rows: Any) -> tuple[JudgedAlarm, ...]:
 def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     """Hash each part of a machine's file; return a mapping from hash to the description of a change of that part.
 
-    Parts are the statements about the machine, each healthy recording (its summary, not its name), and each judged
-    alarm.
+    Parts are the statements about the machine, each healthy recording (its summary, not its name), and each alarm.
     """
 
     def hash_value(value: Any) -> bytes:
@@ -271,13 +259,15 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
     return parts | {hash_value(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
 
-def _find_change(origin: Origin, present: Mapping[bytes, str], written: Mapping[bytes, str]) -> str | None:
-    """Find the first change of a machine's file by another process, which writing would undo; None if there is none.
+def _find_change(origin: Origin | None, target: Path, new_tree: Mapping[str, Any]) -> str | None:
+    """Find the first change of the file `target` by another process, which writing `new_tree` would undo, or None.
 
-    `origin` has the hashes of the file's parts when it was loaded. `present` is for the file as it is now, `written`
-    for the file to be written; both map the hashes of its parts to the description of a change (`_hash_parts`). A part
-    was added if it is present but in neither of the others, and removed if it is in both of them but not present.
+    A part (`_hash_parts`) was added if only the present file has it, and removed if only the present file lacks it. A
+    machine that was not loaded from this file (`origin`) replaces it unchecked.
     """
+    if origin is None or origin.path != target or not target.exists():
+        return None
+    present, written = _hash_parts(_read_checked(target)), _hash_parts(new_tree)
     changes = [text for part, text in present.items() if part not in origin.parts and part not in written]
     changes += [text for part, text in written.items() if part in origin.parts and part not in present]
     return changes[0] if changes else None
@@ -299,20 +289,16 @@ def _read_if_readable(path: Path) -> dict[str, Any]:
 
 
 def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of summaries in the tables `tree` of a machine's file; entries that are no text are skipped.
-
-    The list is empty if the tables are not valid.
-    """
+    """List the checksums of summaries in the tables `tree` of a machine's file; what is not valid is skipped."""
     rows = tree.get("healthy")
     checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
     return [checksum for checksum in checksums if isinstance(checksum, str)]
 
 
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
-    """Return the path of the file with the healthy recordings' summaries that belongs to a machine's file.
+    """Return the path of the file of summaries that belongs to a machine's file at `path`, with the tables `tree`.
 
-    `path` is that of the machine's file, and `tree` holds its tables. The other file has the same name with the suffix
-    `.healthy`. If it does not exist, `summaries` of the table `[machine]` may name it.
+    It has the same name with the suffix `.healthy`. If it does not exist, `summaries` of `[machine]` may name it.
     """
     machine_table, same_name = tree.get("machine"), path.with_suffix(SUFFIX)
     name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
@@ -323,10 +309,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 
 
 def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file at `path`, which also gives the name of the file of summaries.
-
-    Values that are None are unknown; `_format_table` does not write them, as TOML has no such value.
-    """
+    """Build the nested tables of a machine's file at `path`; values that are None are not written (`_format_table`)."""
     from importlib.metadata import version
 
     machine_table = {
@@ -365,11 +348,10 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
 
 
 def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
-    """Format a table as lines of TOML: first plain values, then inner tables.
+    """Format a table as lines of TOML: first plain values, then inner tables; None and empty tables are not written.
 
-    `path` is the table's dotted name, "" for the outermost table, which is the file itself. In this table a list
-    becomes an array of tables. In other tables, an inner table that has only plain values is written on one line.
-    `heading` is the line to write before the table's values. None and empty tables are not written.
+    `path` is the table's dotted name, "" for the whole file. In the file a list becomes an array of tables; in a table,
+    an inner table of plain values only takes one line. `heading` is the line before the table's values.
     """
     lines, inner_lines = list[str](), list[str]()
     for name, value in tree.items():
@@ -392,7 +374,7 @@ def _format_key(name: str) -> str:
 
 
 def _format_value(value: Any) -> str:
-    """Format a plain value as TOML; entries of a table that are None are left out, and numbers keep all digits."""
+    """Format a plain value as TOML; entries of a table that are None are left out."""
     if isinstance(value, np.ndarray):
         value = value.tolist()
     if isinstance(value, Mapping):

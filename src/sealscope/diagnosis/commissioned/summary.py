@@ -107,8 +107,7 @@ class MachineSummary:
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool, needed: str) -> list[tuple[str, str]]:
         """Build the rows (heading, text) on the smallest detectable leak and on the recordings needed to halve it.
 
-        `n_healthy` is the number of healthy recordings; `are_dated` is True if their dates are known; `needed` names
-        the channels of a volume balance.
+        `needed` names the channels of a volume balance.
         """
         if self.smallest is None:
             text = f"not known, that needs {needed}, in two recordings; the ringing alone judges"
@@ -140,11 +139,7 @@ def _describe_rig(rig: Rig | None) -> str:
 
 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:
-    """Format the ranges of pump flow, pressure difference and oil temperature over the healthy recordings.
-
-    Pressures are stated in `pressure_unit`. Unknown quantities are left out: the flow is known only with a stated
-    displacement or area, or from a flow meter.
-    """
+    """Format the ranges of pump flow, pressure difference and oil temperature, as far as they are known."""
     summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
     # "scale": factor from the flow of the balance to the true flow, 0 if unknown
     flows = [summary.get("flow", 0.0) * summary.get("scale", 0.0) / LITRE_PER_MINUTE for summary in summaries]
@@ -167,8 +162,6 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:
     """Collect figures of a healthy recording for display, by name; unknown figures are left out.
-
-    `inspection` has the corrected samples of the recording and the findings on it.
 
     - `pressure_bar`: mean of abs(p_A - p_B) [bar].
     - `oil_degC`: oil temperature [deg C].
@@ -205,9 +198,8 @@ def summarise_machine(
 ) -> MachineSummary:
     """Estimate the figures of a machine from the summaries of its `healthy` recordings.
 
-    The noise of a channel is the median over the recordings. The coefficients of the volume balance and the smallest
-    detectable leak are estimated from the recordings whose balance has the same terms as the first one; others are
-    listed as problems, and so is each text in `left_out`. `rig` states the machine's sizes; None if nothing is stated.
+    The volume balance and the smallest detectable leak are those of the recordings whose balance has the same terms as
+    the first one; others are listed as problems, and so is each text in `left_out`.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -234,12 +226,11 @@ def summarise_machine(
 
 
 def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Estimate the coefficients of a volume balance from all recordings together, by the name of the term.
+    """Estimate the unknown coefficients of a volume balance from all recordings together, by the name of the term.
 
-    `sums` holds for each recording the Gram matrix (m, m): the products of the balance's columns (the terms and, as the
-    last one, the left side), summed over equations that are scaled to unit noise. `rig` and the recorded `channels`
-    determine the terms; those with a known coefficient are left out. The `scatter` of a result is the standard
-    deviation between estimates from single recordings.
+    `sums` holds for each recording the Gram matrix (m, m) of the balance's columns, with rows of unit noise. `rig` and
+    the recorded `channels` determine the terms. The `scatter` of a result is the standard deviation between estimates
+    from single recordings.
     """
     equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
     roles = ColumnRoles(equation)
@@ -257,20 +248,15 @@ def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -
 
 
 def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients x of a volume balance X x = y by least squares, as x = (X'X)^-1 X'y.
-
-    `gram` (m, m) is the balance's Gram matrix, i.e. the products of its m columns summed over the rows, and `columns`
-    are the indices of the c columns in X. Returns x (c,).
-    """
+    """Fit the coefficients (c,) of c `columns` of a volume balance by least squares, from its Gram matrix (m, m)."""
     return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:
     """Estimate the smallest leak that a recording of a later day will show if the machine moves and is loaded as usual.
 
-    `balance` is the detector that made the `summaries` of the healthy recordings, and `channels` are the recorded
-    channels. The leakage of a recording is tested for a rise over that of the healthy ones (`predict_rise`). A leak
-    that is detected with the probability `power` (`priors.toml`) raises the leakage by
+    `balance` is the detector that made the `summaries` of the healthy recordings. Over these, a leak that is detected
+    with the probability `power` (`priors.toml`) raises the leakage (`predict_rise`) by
 
         rise = (threshold of the test + normal quantile of `power`) * deviation,
 
@@ -295,10 +281,9 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind of problem.
+    """List the problems of all healthy recordings, one line for each kind, i.e. each text before the first colon.
 
-    Problems of a kind have the same text before the first colon. A line shows the alphabetically last of their texts,
-    and the recording's name or the number of recordings.
+    A line shows the alphabetically last of the texts, and the recording's name or the number of recordings.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
@@ -314,9 +299,9 @@ def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
 def _estimate_noise(values: Array) -> float:
     """Estimate the standard deviation of white noise in a channel from second differences of its samples.
 
-    Second differences of white noise have sqrt(6) times its standard deviation, and the median absolute value of a
-    standard normal number is 0.6745. The estimate is at least the standard deviation of a rounding error, the
-    channel's resolution / sqrt(12), and 0 for fewer than three finite values.
+    These have sqrt(6) times the standard deviation of the noise; the median absolute value of a standard normal number
+    is 0.6745. The estimate is at least the standard deviation of a rounding error, and 0 for fewer than three finite
+    values.
     """
     known = values[np.isfinite(values)]
     if known.size < 3:

@@ -33,20 +33,12 @@ _AREAS, _DISPLACEMENT = ("cylinder.A_A", "cylinder.A_B"), "pump.q_b"
 class WatchedMachine:
     """An actuator to be monitored, as stated by the file of a rig or of a commissioned machine.
 
-    Attributes
-    ----------
-    rig : Rig
-        Sizes of the machine. If only the areas are stated, the pump's displacement is measured from the healthy
-        recordings.
-    channel_map, rate : mapping of str to str, float or None
-        Column of the actuator's logs for each channel, and sampling rate [Hz] of logs without a time column.
-    limit_lpm : float or None
-        Leak at which the machine must be repaired [L/min], None for the file of a rig, or if it follows from a creep
-        speed and a piston area that is not stated.
-    machine : CommissionedMachine or None
-        Machine with the healthy recordings that recordings of the actuator are compared with, None if there are none.
-    healthy : HealthyLevel or None
-        Leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
+    - `rig`: sizes; if only the areas are stated, the pump's displacement is measured from the healthy recordings.
+    - `channel_map`, `rate`: column of the logs for each channel, and sampling rate [Hz] of logs without a time column.
+    - `limit_lpm`: leak at which the machine must be repaired [L/min], None for the file of a rig, or if it follows from
+      a creep speed and a piston area that is not stated.
+    - `machine`: machine with the healthy recordings that recordings are compared with, None if there are none.
+    - `healthy`: leakage of pump and piston together in the healthy recordings, None if it cannot be determined.
     """
 
     rig: Rig
@@ -58,10 +50,9 @@ class WatchedMachine:
 
 
 def load_watched(rig: str) -> WatchedMachine:
-    """Load sizes, log layout, repair limit and healthy leakage of an actuator for the monitor.
+    """Load an actuator for the monitor by the name or file of a `rig`, or by the file of a commissioned machine.
 
-    `rig` is the name or the file of a rig, or the file of a commissioned machine. A rig states no repair limit and no
-    healthy recordings. Raises InputError if the file cannot be read.
+    Raises InputError if the file cannot be read.
     """
     if not rig.endswith(".toml") or "machine" not in read_toml(Path(rig), "a rig file", rig):
         named_rig = load_rig(rig)
@@ -89,10 +80,9 @@ def is_remeasured(rig: Rig, rig_before: Rig) -> bool:
 
 
 def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ...]) -> Rig:
-    """Replace the displacement of a rig that states only piston areas by that measured in the healthy recordings.
+    """Replace the displacement of a rig that states only piston areas by the median of the healthy recordings.
 
-    The measurement is the median over the recordings. Any other rig is returned unchanged, and so is one whose healthy
-    recordings do not measure the displacement.
+    Any other rig is returned unchanged, and so is one whose healthy recordings do not measure the displacement.
     """
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
@@ -106,12 +96,12 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
 
 
 def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> HealthyLevel | None:
-    """Estimate mean, range and deviation of the leakage conductance [m^3/(s Pa)] over healthy recordings.
+    """Estimate mean, range and deviation of the leakage conductance [m^3/(s Pa)] of pump and piston together.
 
-    The conductance is that of pump and piston together. `rig` states the sizes of the machine. The lower end of the
-    range is at least the largest conductance divided by `oil.warmest` of `priors.toml`, the factor by which the warmest
-    oil raises the leakage. The machine is known to be healthy until the start of the last recording (`known_s`), 0 if
-    no recording has a date. The result is None if fewer than two recordings have an estimate.
+    The lower end of the range is at least the largest conductance divided by `oil.warmest` of `priors.toml`, the factor
+    by which the warmest oil raises the leakage. The machine is known to be healthy until the start of the last
+    recording (`known_s`), 0 if no recording has a date. The result is None if fewer than two recordings have an
+    estimate.
     """
     levels = [level for recording in healthy if (level := _leak_conductance(recording, rig)) is not None]
     if len(levels) < _MIN_RECORDINGS:
@@ -125,9 +115,8 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    It is fitted by least squares with the other coefficients of the volume balance. The result is None without a
-    summary by the balance, for a rig with no or several balances (servo valve), if the summary has other terms than the
-    rig's balance, or if the fit fails.
+    The result is None without a summary by the balance, for a rig with no or several balances (servo valve), if the
+    summary has other terms than the rig's balance, or if the fit fails.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1:

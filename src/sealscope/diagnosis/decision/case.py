@@ -18,7 +18,6 @@ from sealscope.diagnosis.decision.explanations import (
     Explanation,
     explain,
     log_bayes_factor,
-    older_leak_gain,
     probability_against_chance,
     probability_of,
 )
@@ -185,37 +184,30 @@ class Case:
         An older leak was there from the first sample on. Compared are the log Bayes factors
 
             began within:    B(step) + step_log_ratio,
-            older:           max(B(rise over healthy recordings), older_leak_gain + older_log_ratio).
+            older:           B(rise over healthy recordings).
 
-        B is the largest one that the p-value of a test allows (`log_bayes_factor`); the log ratios are those of
-        `LeakRise`. The last sum is for a leak whose size follows from how its flow bends over the pressure. The result
-        is True without measured leakage or healthy recordings, or if the times in which valves hold the load show when
-        the rise began (`rise_onset` is not None).
+        B is the largest one that the p-value of a test allows (`log_bayes_factor`); `step_log_ratio` is that of
+        `LeakRise`. The result is True without measured leakage or healthy recordings, or if the times in which valves
+        hold the load show when the rise began (`rise_onset` is not None).
         """
         leak = self.leak
         if leak is None or leak.step_rise is None or leak.rise_onset is not None:
             return True
         rise = leak.step_rise
         step_gain = sum(log_bayes_factor(test.chance) for test in self.tests if test.name == WITHIN)  # 0 or 1 test
-        within_gain = step_gain + rise.step_log_ratio
-        bending_gain = older_leak_gain(step_gain, rise) + rise.older_log_ratio
-        return within_gain > max(log_bayes_factor(rise.rise.chance), bending_gain)
+        return step_gain + rise.step_log_ratio > log_bayes_factor(rise.rise.chance)
 
     def leak_flow(self, alarm: LeakTest) -> Estimate | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
         After an alarm by comparison with healthy recordings, this is the flow of the rise over them; after an alarm by
         the limit in the rig's file, the total leakage. After an alarm by a step within the recording, it is the step's
-        flow or, if an older leak explains the step better (`has_onset_within` is False) and its flow is known, that of
-        the older leak.
+        flow.
         """
         leak = self.leak
         if leak is None:
             return None
-        if alarm.name != WITHIN:
-            return leak.rise_flow
-        older_flow = None if self.has_onset_within or leak.step_rise is None else leak.step_rise.older_flow
-        return leak.step_flow if older_flow is None else older_flow
+        return leak.step_flow if alarm.name == WITHIN else leak.rise_flow
 
     @cached_property
     def other_event(self) -> OtherEvent | None:

@@ -165,32 +165,15 @@ def _possible_gains(
 
     `factors` are observables with the log Bayes factors of a change. The first mapping is for an onset within the
     recording. A leak gets a second one if `rise` is given, for an onset before the recording: such a leak explains the
-    leakage above that of healthy recordings (the rise). If the leak's log factor in the volume balance is above 0, a
-    third mapping is for an older leak that is not laminar. Its size follows from how its flow changes with the
-    pressure, and must agree with the rise.
+    leakage above that of healthy recordings (the rise).
     """
     gains = _gains_at_onset(event, factors)
     if rise is None or event.name not in LEAK_EVENTS:
         return [gains]
     older_gains = {RISE: log_bayes_factor(rise.rise.chance)}
-    volume_gain = gains.get(VOLUMES, 0.0)
-    if not volume_gain > 0.0:
-        return [gains, older_gains]
-    gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
-    # the factor of an older leak may not exceed the step's, as healthy recordings calibrated only the latter
-    bending_gains = {RISE: rise.older_log_ratio, VOLUMES: min(older_leak_gain(volume_gain, rise), volume_gain)}
-    return [gains, older_gains, bending_gains]
-
-
-def older_leak_gain(step_gain: float, rise: LeakRise) -> float:
-    """Compute the log Bayes factor of a leak older than the recording, given changes of the leakage in the recording.
-
-    The result is at least 0. It is `step_gain`, the log Bayes factor of a leak that begins within the recording, minus
-    the log likelihood ratio of this leak to the older one (`LeakRise.onset_log_ratio`). This ratio is divided by
-    1 + 2 m `step_gain`, with the misfit m of the models (`explanation.misfit` in `priors.toml`).
-    """
-    misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * step_gain
-    return max(step_gain - rise.onset_log_ratio / misfit_divisor, 0.0)
+    if gains.get(VOLUMES, 0.0) > 0.0:
+        gains[RISE] = rise.step_log_ratio  # a leak that began within the recording explains the rise by its step
+    return [gains, older_gains]
 
 
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:

@@ -1,13 +1,8 @@
 """Mean flow of a leak whose law is unknown, from the conductance in blocks: laminar, an orifice, or between the two.
 
-The law of a leak is the exponent e of its flow c |p_A - p_B|^e. Such a leak, in addition to the healthy leakage,
-changes the conductance of block k by c r_k. Here r_k is the regression coefficient of |p_A - p_B|^e on the pressure
-difference within the block. A step test with a size proportional to r_k in each block thus covers every law, and the
-healthy laminar leakage does not enter.
-
-A rise g, i.e. the conductance above that of the healthy recordings, is the regression coefficient of the leak's flow on
-p_A - p_B over the whole recording. With dp = p_A - p_B, <> the mean over the recording, and b_e the regression
-coefficient of |dp|^e on dp after elimination of all other terms, the flow under another law is g <|dp|^e> / b_e. The
+The law of a leak is the exponent e of its flow c |p_A - p_B|^e. Such a leak changes the conductance of block k by c
+r_k, where r_k is the regression coefficient of |p_A - p_B|^e on the pressure difference within the block. A step test
+with a size proportional to r_k in each block thus covers every law, and the healthy laminar leakage does not enter. The
 flow of a leak that began within the recording follows in `volumes/leak_flow.py`.
 
 The arguments `blocks` and `columns` are Gram matrices of the volume balance in K blocks of the recording, and for each
@@ -16,20 +11,13 @@ equation the roles of their columns (`blocks.ColumnRoles`).
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
-from sealscope.diagnosis.inference.onset import (
-    Estimate,
-    Information,
-    StepTest,
-    constant_log_ratio,
-    step_test,
-)
+from sealscope.diagnosis.inference.onset import Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -43,9 +31,9 @@ _TINY = np.finfo(float).tiny
 def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
-    It is the regression coefficient of this flow on p_A - p_B within the block. For an orifice, e = 1/2, this
-    coefficient r follows from the Gram matrices. For the other exponents it is approximated by r^(2 (1 - e)), which is
-    1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
+    For an orifice, e = 1/2, this regression coefficient r follows from the Gram matrices. For the other exponents it is
+    approximated by r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to
+    an array (K,) [Pa^(e - 1)].
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)  # sum over the equations
@@ -57,11 +45,8 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
 def law_flows(blocks: Blocks) -> dict[float, Array]:
     """Compute the mean of |p_A - p_B|^e in each of K blocks: the flow of a leak with the coefficient 1.
 
-    With dp = p_A - p_B, and <> for the mean over a block, it is approximated by
-
-        <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2 e),
-
-    exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to (K,) [Pa^e].
+    With dp = p_A - p_B, and <> for the mean over a block, it is approximated by <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2
+    e), exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to (K,) [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
     return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
@@ -80,10 +65,10 @@ def law_priors() -> Array:
 def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
     """Add a prior for a turbulent part of the healthy leakage to `leak`, the likelihood of the conductance in K blocks.
 
-    This part flows as through an orifice, so that it adds an unknown constant times `shape` (K,) to the conductance.
-    `shape` is the apparent conductance of an orifice (`apparent_conductances`), scaled to the mean 1. The prior
-    standard deviation of the constant, `Information.disturbance`, is the fraction `healthy.turbulent` (`priors.toml`)
-    of the mean conductance. `leak` is returned unchanged if the blocks contain no information on the conductance.
+    This part flows as through an orifice: it adds an unknown constant times the apparent conductance of an orifice,
+    scaled to the mean 1 (`Information.shape`). The prior standard deviation of the constant (`Information.disturbance`)
+    is the fraction `healthy.turbulent` (`priors.toml`) of the mean conductance. Without information on the conductance,
+    `leak` is returned unchanged.
     """
     shape = apparent_conductances(blocks, columns)[0.5]
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
@@ -98,11 +83,10 @@ def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnR
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
-    A step is tested for each exponent of `EXPONENTS`. The p-value (`chance`) of each test is divided by the prior
-    probability of the exponent, and the test with the smallest quotient is returned. For an exponent other than 1 the
-    step of the apparent conductance varies with the pressure; the size of the step is then its mean over the blocks,
-    weighted by their information. `leak`: likelihood of the leak's coefficient in the blocks. Return None if too few
-    blocks determine this coefficient.
+    A step is tested for each exponent of `EXPONENTS`; the p-value of each is divided by the prior probability of the
+    exponent, and the smallest one counts. For an exponent other than 1 the step varies with the pressure, and its size
+    is the mean over the blocks, weighted by their information. `leak`: likelihood of the leak's coefficient in the
+    blocks. Return None if too few blocks determine this coefficient.
     """
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
     shapes = apparent_conductances(blocks, columns)
@@ -113,75 +97,6 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         if test is not None:
             tests.append(test.share_alarms(float(prior)))
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
-
-
-def older_log_ratios(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> Array:
-    """Compute the log likelihood ratio of a leak older than the recording to no leak, for each exponent of `EXPONENTS`.
-
-    Only changes of the leakage within the recording count (`constant_log_ratio`): unless the flow of an older leak is
-    laminar, its apparent conductance changes with the pressure. `leak`: likelihood of the leak's coefficient in the
-    blocks.
-    """
-    shapes = apparent_conductances(blocks, columns)
-    # the mean only sets the unit of the fitted constant
-    return np.array(
-        [
-            constant_log_ratio(leak, shapes[exponent] / max(float(shapes[exponent].mean()), _TINY))
-            for exponent in EXPONENTS
-        ]
-    )
-
-
-def estimate_bend_flows(blocks: Blocks, columns: Sequence[ColumnRoles], noise: float) -> list[Estimate | None]:
-    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, from its curvature over pressure.
-
-    With dp = p_A - p_B, the flow of the leak is c |dp|^e. The healthy leakage is laminar (e = 1) and not curved. The
-    flow a |dp|^(1/2) of an orifice is fitted in addition to a laminar flow. To the second order, it is as curved as the
-    leak's flow if their second derivatives agree, e (e - 1) c |dp|^e = -a |dp|^(1/2) / 4, so that
-
-        flow = a |dp|^(1/2) / (4 e (1 - e)).
-
-    The result has a flow for each exponent of `EXPONENTS`, None for laminar flow or if a is unknown. `noise`: factor by
-    which the variance of the coefficients exceeds the one that follows from the residuals of the balance.
-    """
-    bend = information(blocks, columns, columns[0].names.index(ORIFICE))
-    precision = float(bend.precision.sum()) / noise
-    if not precision > 0.0:
-        return [None] * len(EXPONENTS)
-    coefficient = float(bend.vector.sum()) / noise / precision
-    root = float(np.average(blocks.mean_root(), weights=blocks.pressure_weights))
-    factors = [None if exponent == 1.0 else root / (4.0 * exponent * (1.0 - exponent)) for exponent in EXPONENTS]
-    return [
-        None if factor is None else Estimate(coefficient * factor, factor / math.sqrt(precision)) for factor in factors
-    ]
-
-
-def estimate_older_flow(
-    log_ratios: Array, rise_flows: Sequence[Estimate], bend_flows: Sequence[Estimate | None]
-) -> Estimate:
-    """Estimate the mean flow [m^3/s] of a leak that was there before the recording, averaged over its exponents.
-
-    The flow is proportional to |p_A - p_B|^e, with an exponent e of `EXPONENTS`. For each e it is estimated from the
-    rise over healthy recordings (`rise_flows`) and, for e < 1, also from its curvature over pressure (`bend_flows` of
-    `estimate_bend_flows`); the two are averaged with their precisions as weights.
-
-    The weight of an exponent in the result is its prior probability times its likelihood ratio, that of e = 1 or the
-    largest of all e < 1 in `log_ratios` (those of `older_log_ratios`): the data hardly tell these from each other. For
-    e < 1 it is multiplied by exp(-d^2 / (2 v)), where d is the difference between the two flows and v its variance.
-    """
-    laminar_ratio, bent_ratio = float(log_ratios[0]), float(log_ratios[1:].max())
-    weights, flows = list[float](), list[Estimate]()
-    for log_prior, by_rise, by_bend in zip(np.log(law_priors()), rise_flows, bend_flows, strict=True):
-        flow, weight = by_rise, float(log_prior) + laminar_ratio
-        if by_bend is not None:
-            variances = np.maximum(np.square([by_rise.deviation, by_bend.deviation]), _TINY)
-            weight += bent_ratio - laminar_ratio - 0.5 * (by_rise.value - by_bend.value) ** 2 / float(variances.sum())
-            value = float(np.average([by_rise.value, by_bend.value], weights=1.0 / variances))
-            flow = Estimate(value, float(1.0 / np.sqrt((1.0 / variances).sum())))
-        weights.append(weight)
-        flows.append(flow)
-    values, deviations = np.array(flows).T
-    return mixture_flow(np.exp(np.array(weights) - max(weights)), values, deviations)
 
 
 def growth_priors() -> list[tuple[float, float]]:
@@ -195,7 +110,7 @@ def growth_priors() -> list[tuple[float, float]]:
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:
     """Compute mean and standard deviation of a mixture of k estimates of a flow [m^3/s] or another quantity.
 
-    `weights` (k,): weights of the estimates, of any sum; `flows`, `deviations` (k,): their values and standard errors.
+    `weights` (k,): of any sum; `flows`, `deviations` (k,): estimates and their standard errors.
     """
     probabilities = weights / weights.sum()
     value = float(probabilities @ flows)

@@ -93,23 +93,14 @@ class Remark(NamedTuple):
 
 
 class LeakRise(NamedTuple):
-    """Leakage of a recording above that of healthy recordings (`rise`), and two explanations of it.
+    """Leakage of a recording above that of healthy recordings (`rise`), and whether a step within it explains the rise.
 
-    Either a leak began within the recording, with the size of the step found in it, or a leak was there before, with
-    the size that follows from how the leakage varies with the pressure.
-
-    - `step_log_ratio`: log of p(rise | the leak began within the recording) / p(rise | no leak).
-    - `onset_log_ratio`: log of p(changes within the recording | the leak began there) / p(changes | older leak);
-      infinite if an older leak explains none of these changes.
-    - `older_log_ratio`: log of p(rise | older leak) / p(rise | no leak).
-    - `older_flow`: mean flow of the older leak, None if it follows from the rise alone.
+    `step_log_ratio`: log of p(rise | a leak began within the recording, with the size of the tested step) / p(rise | no
+    leak).
     """
 
     rise: Rise
     step_log_ratio: float = 0.0
-    onset_log_ratio: float = math.inf
-    older_log_ratio: float = 0.0
-    older_flow: Estimate | None = None
 
 
 class RiseTest(Protocol):

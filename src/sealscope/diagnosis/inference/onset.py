@@ -303,30 +303,6 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     return [_test_step(whitening, onsets, steps, fits, sign) for sign in signs]
 
 
-def constant_log_ratio(information: Information, shape: Array) -> float:
-    """Compute the log likelihood ratio of an older leak to no leak, from a coefficient's changes within the recording.
-
-    A leak that is older than the recording adds to the coefficient a positive constant times `shape` (K,), its apparent
-    coefficient in each block, which varies with the pressure unless the flow is laminar. Both hypotheses have the
-    random walk that fits best. The result is at least 0, and 0 if too few blocks have information, or if `shape` hardly
-    varies and the level has no prior.
-    """
-    whitened = _whiten_blocks(information)
-    if whitened is None:
-        return 0.0
-    whitening, z, _ = whitened
-    n_prior_blocks = whitening.transform.shape[1] - len(shape)  # 1 with a prior on the level before the recording
-    steps = whitening.transform_steps(np.array([float(n_prior_blocks)]), shape)  # a step at the first block
-    # without a prior on the level, a constant `shape` is projected out with the level
-    if not (steps**2).sum() > RANK_TOLERANCE * float((whitening.transform**2).sum() * (shape**2).max()):
-        return 0.0
-    fits = whitening.fit_steps(z, steps)
-    without, with_leak = (
-        float(fits.log_likelihood(squares).max()) for squares in (fits.total, fits.residual_squares())
-    )
-    return max(with_leak - without, 0.0)
-
-
 def step_sizes(
     information: Information, onsets: NDArray[np.intp], shape: Array, growth: float
 ) -> tuple[Array, Array, Array]:

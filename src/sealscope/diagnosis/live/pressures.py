@@ -18,7 +18,7 @@ from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressures.detector import RESPONSE, score_response_steps
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error, states_flow
-from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS, G, Machine, response_priors
+from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS, G
 from sealscope.diagnosis.inference.pressures.response import Follower, parameter_information
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
 from sealscope.diagnosis.live.balance import BlockConductance, BlockResult, NotJudged
@@ -266,7 +266,7 @@ class PressureEstimator(SavedAttributes):
             raise InputError(f"saved state's rate must be > 0 Hz, got {rate}")
         if (law := require_part(saved, "law", str)) not in LAWS:
             raise InputError(f"saved state's law must be {' or '.join(LAWS)}, got {law!r}")
-        self._follower = Follower(Machine.from_rig(self._rig, rate, law), response_priors(self._rig, law), sense)
+        self._follower = Follower(self._rig, rate, sense, law)
         restore_attributes(self._follower, _FOLLOWER_ATTRIBUTES, saved)
 
 

@@ -186,7 +186,7 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
         "error": (total.high - total.low) * size.scale / (2.0 * WITHIN_95),  # half-width: WITHIN_95 standard errors
         "states_flow": size.stated,
         # the area has a meaning only if it is stated, or if the position is in metres
-        "area": machine.area if size.stated or ("x", "m") in solution.units else None,
+        "area": machine.area if size.stated or solution.recording.units.get("x") == "m" else None,
         # not `size.scale`: the measured over the assumed ratio of displacement to area
         "scale": None if size.ratio is None else size.ratio.value,
         "pump": solution.blocks.moving_flow * size.scale,

@@ -156,7 +156,7 @@ class Diagnosis(Evidence):
     def measured_ratio(self) -> tuple[float, tuple[float, float]] | None:
         """Measured over assumed ratio of pump displacement to piston area, with 95 % interval (low, high).
 
-        The detectors are searched for a measured ratio, the deciding one first; None if no detector measured it.
+        It is that of the first detector with such a ratio, the deciding one first; None if no detector measured it.
         """
         for decision in (self, *self.parts):
             if decision.ratio is not None and decision.ratio_interval is not None:
@@ -177,10 +177,9 @@ class Diagnosis(Evidence):
     def _condition(self) -> str:
         """Name of the condition in `states.toml` that corresponds to the verdict, such as "leak" or "no change".
 
-        The verdict `no leak` has four conditions. If the leakage is known to be healthy (`known_healthy`), the
-        condition is "no leak" for a recording that may serve as a baseline, else "no leak found". Otherwise only a
-        change within the recording was excluded: the condition is "no change of RMS" if the detector of RMS changes
-        decided, else "no change".
+        With the verdict `no leak`, the leakage may be known to be healthy (`known_healthy`), and the recording may then
+        serve as a baseline or not. Otherwise only a change within the recording was excluded, of the leakage or of the
+        RMS.
         """
         if self.verdict != NO_LEAK:
             return self.verdict
@@ -190,10 +189,7 @@ class Diagnosis(Evidence):
 
     @property
     def named_cause(self) -> str | None:
-        """The `cause` if it agrees with the verdict, else None.
-
-        The verdict `leak` requires a cause in `LEAKS`. The other verdicts require a cause outside `LEAKS`.
-        """
+        """The `cause` if it agrees with the verdict, i.e. is one of `LEAKS` for the verdict `leak` only; else None."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
 
     @property
@@ -221,9 +217,8 @@ class Diagnosis(Evidence):
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
         At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings, in the test
-        for a step, and in the rarest of all tests (`rarest_chance`). The result is False without this comparison, if a
-        cause of a change is stated, or if the total leakage is surely above 0 and an undetected leak could be the whole
-        of it.
+        for a step, and in the rarest of all tests (`rarest_chance`). No cause of a change may be stated. If the total
+        leakage is surely above 0, an undetected leak must not be the whole of it.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):

@@ -28,14 +28,8 @@ _EXPONENT = re.compile(r"(?<=[\d.])[eE](?=[+-]?\d)")
 class RepairLimit:
     """Leak at which a machine must be repaired.
 
-    Attributes
-    ----------
-    value : float
-        A flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s].
-    kind : {"flow", "creep"}
-        Whether `value` is a flow or a creep speed.
-    stated : bool
-        True if the caller gave the limit, False for the default creep speed of `priors.toml`.
+    `value`: a flow [m^3/s] or, by `kind`, the speed at which the piston creeps with its lines shut [m/s]; `stated`:
+    true if the caller gave the limit, false for the default creep speed of `priors.toml`.
     """
 
     value: float
@@ -84,20 +78,13 @@ class RepairLimit:
 
 @dataclass(frozen=True)
 class Severity:
-    """Severity of a leak, as far as it is known.
+    """Severity of a leak: figures with their 95 % intervals, (value, low, high), or None if not known.
 
-    Attributes
-    ----------
-    mL_per_min : tuple of float, or None
-        Mean flow while the leak is open [mL/min].
-    pump_share : tuple of float, or None
-        This flow as a fraction of the pump's mean flow.
-    creep_mm_per_min : tuple of float, or None
-        Speed at which the piston would creep with its lines shut under the same pressure difference [mm/min].
-    of_limit : tuple of float, or None
-        The leak divided by the repair limit.
-
-    Each figure is a tuple of value and 95 % interval (value, low, high), or None if it is not known.
+    - `mL_per_min`: mean flow while the leak is open [mL/min].
+    - `pump_share`: this flow as a fraction of the pump's mean flow.
+    - `creep_mm_per_min`: speed at which the piston would creep with its lines shut under the same pressure difference
+      [mm/min].
+    - `of_limit`: the leak divided by the repair limit.
     """
 
     mL_per_min: _Figure
@@ -150,9 +137,9 @@ def severity(evidence: Evidence, limit: RepairLimit) -> Severity | None:
 def relative_leak(evidence: Evidence, recording: Recording, machine: AssumedMachine) -> RelativeLeak | None:
     """Convert a leak in L/min to a fraction of the pump's mean flow and to a creep speed of the piston.
 
-    The flow of the pump follows from its mean speed in the `recording` and the displacement of the `machine`, and the
-    creep speed from the machine's piston area. Returns None if the `evidence` states no leak in L/min. The fraction
-    alone is None if the pump stands still, or if neither its speed nor its angle is recorded in SI units.
+    The flow of the pump follows from its mean speed in the `recording` and the displacement of the `machine`. Returns
+    None if the `evidence` states no leak in L/min. The fraction alone is None if the pump stands still, or if neither
+    its speed nor its angle is recorded in SI units.
     """
     if evidence.leak_lpm is None or evidence.leak_interval_lpm is None:
         return None

@@ -24,21 +24,12 @@ LEAKING = (LEAK, "leak over the limit")
 class MachineState:
     """State of a machine by NAMUR NE 107, from `states.toml`.
 
-    Attributes
-    ----------
-    name, symbol : str
-        The state, "good", "check function", "out of specification", "maintenance required" or "failure", and the letter
-        that NE 107 gives it, such as "M".
-    health : int
-        Number of the state in OPC UA's DeviceHealthEnumeration.
-    severity : int
-        Severity of an OPC UA event for the state, 1 to 1000; 0 for good.
-    condition : str
-        Condition that led to the state, such as "leak" or "no data".
-    since_s : float or None
-        Time at which the state began, on the clock of the samples [s]; None if unknown.
-    cause, action : str or None, str
-        Cause of the change, None if no cause is known, and the action to take.
+    - `name`, `symbol`: the state, such as "maintenance required", and the letter that NE 107 gives it, such as "M".
+    - `health`: number of the state in OPC UA's DeviceHealthEnumeration.
+    - `severity`: severity of an OPC UA event for the state, 1 to 1000; 0 for good.
+    - `condition`: condition that led to the state, such as "leak" or "no data".
+    - `since_s`: time at which the state began, on the clock of the samples [s]; None if unknown.
+    - `cause`, `action`: cause of the change, None if no cause is known, and the action to take.
     """
 
     name: str
@@ -67,10 +58,9 @@ def state_of(
 ) -> MachineState:
     """Return the state of a machine for a condition of `states.toml`; raise KeyError for an unknown condition.
 
-    The condition gives the name of the state and the action. If `states.toml` lists the `cause` of the change, the
-    action of the cause is used instead, and its state if it has one. With a leak past piston or pump (`LEAKING`) only
-    the condition gives the state. `since_s`: time at which the state began [s]; `action`: replaces that of
-    `states.toml`.
+    State and action are those of the condition or, if `states.toml` lists the `cause` of the change, those of the
+    cause; with a leak past piston or pump (`LEAKING`) only the condition gives the state. `since_s`: time at which the
+    state began [s]; `action`: replaces that of `states.toml`.
     """
     tables = _tables()
     name = tables["conditions"][condition]["state"]
@@ -100,8 +90,8 @@ def joint_causes() -> Mapping[str, tuple[str, ...]]:
 def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = ()) -> str:
     """Return the action of `states.toml` for the cause of a change; without a listed cause, that for the condition.
 
-    `parts` are components whose leakage may be mistaken for that of a worn seal, such as "bypass". For a leak past
-    piston or pump, the text begins with the check of each of them. Raises KeyError for an unknown condition or part.
+    For a leak past piston or pump, the text begins with the checks of `parts`, components whose leakage may be mistaken
+    for that of a worn seal, such as "bypass". Raises KeyError for an unknown condition or part.
     """
     tables = _tables()
     row = tables["causes"].get(cause or "", tables["conditions"][condition])

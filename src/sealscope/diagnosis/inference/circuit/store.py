@@ -7,8 +7,7 @@ areas A_A and A_B, the volume delivered by the middle of block k is
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
 where g_j is the conductance to the outside in block j, P_j the pressure that drives the leak, and tau the length of a
-block (1/2 applies to block k itself). w and v describe the gas temperature and have priors (`priors.toml`). The mean
-volume of a block is far more precise than a mean flow.
+block (1/2 applies to block k itself). w and v describe the gas temperature and have priors (`priors.toml`).
 """
 
 from __future__ import annotations
@@ -30,10 +29,10 @@ if TYPE_CHECKING:
 
 
 def cycle_length(speed: Array, rate: float) -> float | None:
-    """Estimate the period of a machine's cycle [s], from its strokes or else from the spectrum of a speed.
+    """Estimate the period of a machine's cycle [s], from its strokes or else the strongest line of a speed's spectrum.
 
-    Without regular strokes it is the period of the strongest spectral line, or None if the recording has fewer than
-    `MIN_BLOCKS` such periods. `speed` (n,): speed or flow at the sampling `rate` [Hz].
+    Return None if the recording has fewer than `MIN_BLOCKS` periods of that line. `speed` (n,): speed or flow; `rate`
+    [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
@@ -48,8 +47,8 @@ def cycle_length(speed: Array, rate: float) -> float | None:
 def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> dict[str, StepTest]:
     """Test a recording with a position for an external leak that begins within it (`oil_loss_tests`).
 
-    `offset`: sensor offset of p_A - p_B [Pa]. The result is empty for a double rod: its strokes draw no oil from the
-    accumulator, so the check valves may stay shut, and no chamber then has the pressure of the accumulator.
+    `offset`: sensor offset of p_A - p_B [Pa]. Empty for a double rod: its strokes draw no oil from the accumulator, so
+    the check valves may stay shut, and no chamber then has the pressure of the accumulator.
     """
     if not rig.cylinder.single_rod:
         return {}
@@ -62,8 +61,8 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
 def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float) -> dict[str, StepTest]:
     """Test for an external leak of chamber A or B that begins within a recording, by the volume of the accumulator.
 
-    The accumulator is connected to the unloaded side. The oil that it has delivered follows from the pressure of this
-    side by the polytropic law of the gas, less the oil that the rod displaces if the position is recorded. The leak's
+    The accumulator is connected to the unloaded side, whose pressure thus gives the oil that it has delivered, by the
+    polytropic law of the gas; the oil that the rod displaces is subtracted if the position is recorded. The leak's
     conductance is tested for a step between blocks (`step_test`). Blocks are whole multiples of the machine's `cycle`
     [s], so that motion within it averages out, or of any length if it is None. `begin`: time of the first sample [s].
 
@@ -87,7 +86,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
     tests = dict[str, StepTest]()
     for side in "AB":
         pressures = _block_means(signals[f"p_{side}"], edges)
-        if np.isfinite(volumes).all() and np.isfinite(pressures).all():
+        if np.isfinite(volumes + pressures).all():
             test = step_test(_estimate_conductance(volumes, pressures, block_s, begin))
             if test is not None:
                 tests[f"external leak {side}"] = test
@@ -107,9 +106,9 @@ def _block_means(values: Array, edges: Array) -> Array:
 def _estimate_conductance(volume: Array, pressure: Array, block_s: float, begin: float) -> Information:
     """Compute the likelihood of an external leak's conductance [m^3/(s Pa)] in K blocks of `block_s` [s].
 
-    The initial volume and the effect of the gas temperature, linear and quadratic in time, are eliminated. `volume`
-    (K,): block means of the volume [m^3] that the accumulator has delivered so far, up to a constant; `pressure` (K,):
-    block means of the pressure that drives the leak [Pa]; `begin`: start of the first block [s].
+    The initial volume and the effect of the gas temperature are eliminated. `volume` (K,): block means of the volume
+    [m^3] that the accumulator has delivered so far, up to a constant; `pressure` (K,): block means of the pressure that
+    drives the leak [Pa]; `begin`: start of the first block [s].
     """
     n_blocks = len(volume)
     time = (np.arange(n_blocks, dtype=float) + 0.5) * block_s

@@ -9,11 +9,9 @@ returns displaces nothing,
 so the pump delivers just the leakage. D is the pump's displacement per angle theta, G the leakage conductance, and c_j
 are the coefficients of the other terms f_j dg_j. If the pump delivers less than any pump leaks, no loop replaces the
 leakage, and the balance contains no information. While a loop holds the piston at standstill, any test function will
-do. Rows with a missing sample have no weight. Rows of a single rod in which the loaded side changes have no weight
-either, since the circuit then exchanges oil. Sensor offsets up to z may cause a part of the mean pressure difference d
-of a row; only d - z^2/d counts, or 0 below z (Breiman's garrote). If no channel gives a flow, shut valves hold the
-piston, and the leakage of the loaded side moves it slowly. While the command moves, the valve may replace the lost oil,
-and the samples do not count.
+do. Rows of a single rod in which the loaded side changes have no weight, since the circuit then exchanges oil. If no
+channel gives a flow, shut valves hold the piston, and the leakage of the loaded side moves it slowly. While the command
+moves, the valve may replace the lost oil, and the samples do not count.
 
 Sources: M. Shinbrot, Trans. ASME 79 (1957) 547; L. Breiman, Technometrics 37 (1995) 373.
 """
@@ -51,9 +49,8 @@ _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 class CycleBalance(NamedTuple):
     """Volume balance of a recording without position or flow, over whole cycles or times of standstill (holds).
 
-    `blocks`: the recording, reduced to Gram matrices of the balance's columns; `equation`: the balance; `columns`:
-    roles of its columns; `oil_loss`: tests for an external leak of either side by the volume that the accumulator
-    loses, by the name of the term.
+    `columns`: roles of the columns of `equation`; `oil_loss`: tests for an external leak of either side by the volume
+    that the accumulator loses, by the name of the term.
     """
 
     blocks: Blocks
@@ -63,11 +60,11 @@ class CycleBalance(NamedTuple):
 
 
 def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
-    """Compute the volume balances of a recording without position or without flow, over whole cycles and over holds.
+    """Compute the volume balances of a recording without position or without flow; empty if none is possible.
 
-    A hold is a time in which the piston is held at standstill. Without a position, the pump's flow is balanced over
-    cycles and over holds. With a position but no flow, the volume that the creeping piston displaces is balanced over
-    the holds in which valves are shut. The list is empty if no balance is possible.
+    Without a position, the pump's flow is balanced over cycles, and over the times in which the piston is held at
+    standstill (holds). With a position but no flow, the volume that the creeping piston displaces is balanced over the
+    holds in which valves are shut.
     """
     channels, begin = frozenset(recording.channels), float(recording.t[0])
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
@@ -113,8 +110,8 @@ def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
     The averaged flow is near zero below a fraction of its largest value, or below `min_limit` [m^3/s] if this is
-    larger. `flow` (n,): flow [m^3/s] at the sampling `rate` [Hz], infinite where the piston is surely not held. The
-    times of averaging and settling and the fraction are those of `held` in `priors.toml`.
+    larger. `flow` (n,): flow [m^3/s], infinite where the piston is surely not held. The two times and the fraction are
+    those of `held` in `priors.toml`.
     """
     window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
@@ -131,7 +128,7 @@ def _build_blocks(
     """Compute the blocks of a volume balance from rows, each a mean over a triangular window of a `half_width` [s].
 
     `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
-    `one_sided`: use only rows in which the same side has the higher pressure throughout, but for noise. Return None for
+    `one_sided`: use only rows in which one side has the higher pressure throughout, but for noise. Return None for
     fewer than `MIN_BLOCKS` blocks.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
@@ -166,9 +163,9 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
     """Compute rows of a regression: mean rates of c columns over overlapping triangular windows.
 
     `increments`: each column's increments in n sampling intervals; `is_used` (n,): flags of the intervals that may be
-    part of a row (a row with any other interval is flagged as not whole); `half_width`: half the width of a window, and
-    twice the distance of windows [s]; `rate`: sampling rate [Hz]. The integral over a triangle is the second difference
-    of the twice integrated increments.
+    part of a row (a row with any other is flagged as not whole); `half_width`: half the width of a window, and twice
+    the distance of windows [s]. The integral over a triangle is the second difference of the twice integrated
+    increments.
     """
     half_length, n_samples = half_width * rate, len(is_used)
     centres = np.arange(half_length, n_samples - half_length, 0.5 * half_length)
@@ -191,11 +188,10 @@ def _integrate_rows(increments: list[Array], is_used: NDArray[np.bool_], half_wi
 
 
 def _shrink_offset(values: Array, names: list[str]) -> None:
-    """Reduce, in place, the columns of the leak by the part that sensor offsets may cause.
+    """Reduce, in place, the leak's columns of rows `values` (r, c) by the part that sensor offsets may cause.
 
-    `values` (r, c): rows of the volume balance, each a mean over one window of time; `names`: names of the columns. The
-    mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller than
-    the largest usual offset z (Breiman's garrote). The column of an orifice is multiplied by the same factor.
+    The mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller
+    than the largest usual offset z (Breiman's garrote). The column of an orifice is multiplied by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

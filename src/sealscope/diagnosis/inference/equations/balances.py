@@ -6,7 +6,7 @@ chamber behind a servo valve; and one of a pump, or of a held load, while the pi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Iterable
+from collections.abc import Callable, Container
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -37,6 +37,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     Term,
     chamber_terms,
     compensated_leak_term,
+    compliance_term,
     conductance_term,
     external_leak_term,
     fitted_term,
@@ -69,14 +70,9 @@ _CYLINDER = (
 )
 
 
-def _mask_terms(terms: Iterable[Term], mask: Callable[[Signals], Array]) -> tuple[Term, ...]:
-    """Multiply the increments of `terms` by the zeros and ones (n - 1,) that `mask` computes from the signals."""
-
-    def mask_increments(s: Signals, increments: Callable[[Signals], Array]) -> Array:
-        """Compute the masked increments (n - 1,) of one term."""
-        return np.asarray(mask(s) * increments(s))
-
-    return tuple(term._replace(increments=partial(mask_increments, increments=term.increments)) for term in terms)
+def _mask_term(term: Term, mask: Callable[[Signals], Array]) -> Term:
+    """Multiply the increments of a term by the zeros and ones (n - 1,) that `mask` computes from the signals."""
+    return term._replace(increments=lambda s: np.asarray(mask(s) * term.increments(s)))
 
 
 def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array]) -> Equation:
@@ -84,8 +80,8 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
 
     While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
-    hardly changes the flow. Before the terms of the leak, the last ones, the balance gets two terms at rest with
-    unknown coefficients: a flow with the sign that `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B.
+    hardly changes the flow. The balance gets two terms at rest with unknown coefficients: a flow with the sign that
+    `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B.
     """
     left = equation.left
     at_rest = (
@@ -94,7 +90,7 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
             LOADED_NULL_FLOW, lambda s: s.holding(left) * s.pressure_difference * s.dt, "sensor fault", drift="bias"
         ),
     )
-    moving_leaks = _mask_terms(LEAKS, lambda s: s.moving(left))
+    moving_leaks = [_mask_term(term, lambda s: s.moving(left)) for term in LEAKS]
     return equation._replace(terms=(*equation.terms[: -len(LEAKS)], *at_rest, *moving_leaks))
 
 
@@ -120,10 +116,12 @@ def _supply_equation(rig: Rig) -> Equation:
     the supply, if that is recorded.
     """
 
-    def while_fed(side: str, terms: Iterable[Term]) -> tuple[Term, ...]:
+    def while_fed(side: str, *terms: Term) -> list[Term]:
         """Let terms of the chamber `side` count only while the supply feeds it and the piston moves."""
         sign = 1.0 if side == "A" else -1.0
-        return _mask_terms(terms, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0))
+        return [
+            _mask_term(term, lambda s: s.moving(_supply_volume) * (sign * s.mean("q_supply") > 0.0)) for term in terms
+        ]
 
     def direction(s: Signals) -> Array:
         """Compute the sign of the flow in each interval; the meter's offset, part of a magnitude, has the same sign."""
@@ -132,18 +130,17 @@ def _supply_equation(rig: Rig) -> Equation:
     air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
     terms = (
         *map(motion_term, MOTIONS),
-        *while_fed("A", chamber_terms("A")),
-        *while_fed("B", chamber_terms("B")),
+        *while_fed("A", *chamber_terms("A")),
+        *while_fed("B", *chamber_terms("B")),
         LAG_TERM,
         BIAS_TERM._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
-        *while_fed("A", (external_leak_term("A"),)),
-        *while_fed("B", (external_leak_term("B", weight=-1.0),)),
-        *_mask_terms((air,), lambda s: s.moving(_supply_volume)),
-        Term(
+        *while_fed("A", external_leak_term("A")),
+        *while_fed("B", external_leak_term("B", weight=-1.0)),
+        _mask_term(air, lambda s: s.moving(_supply_volume)),
+        fitted_term(
             "compliance of the supply",
             "m^3/Pa",
             lambda s: direction(s) * s.step("p_1"),
-            "sensor fault",
             drift="compliance",
             needs=("p_1",),
         ),
@@ -157,11 +154,10 @@ def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation
     """Make the volume balance of one chamber, `side` "A" or "B", of a cylinder behind a servo valve.
 
     The volume A dx displaced by the piston equals the flow over the valve's edges, less compression and leakage. The
-    left side is -A dx, so that a leak from A to B has a positive coefficient in both balances; a flow into A, which
-    moves the piston by dx > 0, is negative there (`flow_sign`). An overlap of the edges (dead band) reduces the flow in
-    both directions of motion. So does a leak, if friction makes p_A - p_B change its sign with the direction of motion.
-    Only the prior on a healthy piston separates a leak from an overlap. The leak counts only in motion; at rest a flow
-    over the valve's null takes its place, whose unknown sign is the same throughout (`_separate_at_rest`).
+    left side is -A dx, so that a leak from A to B has a positive coefficient in both balances. An overlap of the edges
+    (dead band) reduces the flow in both directions of motion. So does a leak, if friction makes p_A - p_B change its
+    sign with the direction of motion: only the prior on a healthy piston separates the two. The leak counts only in
+    motion; at rest a flow over the valve's null, of one unknown sign, takes its place (`_separate_at_rest`).
     """
     is_A = side == "A"
     area = rig.cylinder.A_A if is_A else rig.cylinder.A_B
@@ -189,17 +185,17 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
 
     The position and both chamber pressures are always needed. Where a valve meters the flow into the chambers, and u
     and p_1 are recorded, there is one balance for each chamber. The pressure of the return is p_2, or `supply.p_return`
-    of the rig if neither p_2 nor a flow meter is recorded. In all other cases there is one balance of the cylinder,
-    whose flow follows from the pump's angle, its speed, a flow meter or, without these, the command.
+    of the rig if neither p_2 nor a flow meter is recorded. Otherwise there is one balance of the cylinder, whose flow
+    is that of `pump_volume`.
     """
+    if not {"x", *PRESSURES} <= channels:
+        return ()
     # without p_2, a metered flow is preferred to an assumed pressure of the return
     has_return = "p_2" in channels or not channels & {*METERS}
-    if not rig.circuit.pump_moves_piston and {"x", "u", "p_1"} <= channels and has_return:
-        if not channels.issuperset(PRESSURES):
-            return ()
+    if not rig.circuit.pump_moves_piston and {"u", "p_1"} <= channels and has_return:
         return tuple(_select_recorded_terms(_chamber_equation(side, rig, channels), channels) for side in "AB")
     left, source = pump_volume(rig, channels), flow_source(channels)
-    if left is None or not {"x", *PRESSURES} <= channels:
+    if left is None:
         return ()
     if source == "q_supply":
         return (_select_recorded_terms(_supply_equation(rig), channels),)
@@ -226,12 +222,11 @@ _STANDSTILL = (*(chamber_terms(side)[0] for side in "AB"), *_STANDSTILL_LEAKS)
 
 
 def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
-    """Return the volume balance of a pump while the piston displaces no net volume.
+    """Return the volume balance of a pump over whole cycles or at standstill; None if circuit or channels allow none.
 
-    The balance holds over whole cycles or at standstill, so the position need not be known. Its signals must contain
-    `START` (`balance.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a
-    steady load, is assumed to be zero. Return None if the pump does not feed the chambers, or if its delivery or a
-    chamber's pressure is not recorded.
+    The piston then displaces no net volume, so that the position need not be known. The signals must contain `START`
+    (`balance.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a steady
+    load, is assumed to be zero.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(PRESSURES):
@@ -245,9 +240,9 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     The left side is the volume that must have leaked from A to B to let the piston move: -dx times the piston's area
     on the loaded side, where x is assumed to grow as A fills. Leaks of seal, valve and line cannot be separated.
 
-    The balance needs the position and both pressures. If a command or the pump's flow is recorded, the circuit must
-    have valves that hold the load, and the command must be recorded: it is constant while they are shut. If neither is
-    recorded, any circuit is accepted, although a control loop may then hold the load and replace the leaking oil.
+    If a command or the pump's flow is recorded, the circuit must have valves that hold the load, and the command must
+    be recorded: it is constant while they are shut. If neither is recorded, any circuit is accepted, although a control
+    loop may then hold the load and replace the leaking oil.
     """
     if not {"x", *PRESSURES} <= channels:
         return None
@@ -260,13 +255,8 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
         """Return the side, "A" or "B", that on average carries the load."""
         return "A" if np.nanmean(s["p_A"] * areas["A"] - s["p_B"] * areas["B"]) > 0.0 else "B"
 
-    compliance = Term(
-        "compliance of the loaded side",
-        "m^3/Pa",
-        lambda s: s.step(f"p_{loaded_side(s)}"),
-        "air in the oil",
-        drift="compliance",
-        needs=PRESSURES,
+    compliance = compliance_term(
+        "compliance of the loaded side", "m^3/Pa", lambda s: s.step(f"p_{loaded_side(s)}"), needs=PRESSURES
     )
     return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
 
@@ -276,7 +266,7 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
     command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
-    that does not feed the chambers. An error of a flow meter's scale shows as an error of the piston areas.
+    that does not feed the chambers.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -294,11 +284,8 @@ def with_rests(equation: Equation) -> Equation:
     """Add three terms to a pump's volume balance, each of which counts in one state of the machine only (`STATES`).
 
     From these columns `regimes.apply_regime` makes the balance for valves that are open, or shut, while the pump rests.
-    The new terms are inserted before those of the leak. Their increments, 0 in all other states, are
-
-    - (p_A - p_B) dt while the pump moves the piston (`TURNING`),
-    - (p_A - p_B) dt while the pump turns and the piston rests, to hold the load (`HOLDING`),
-    - dt while pump and piston move (`MOVING_BIAS`).
+    The increments, 0 in all other states, are (p_A - p_B) dt while the pump moves the piston (`TURNING`) or turns to
+    hold the load (`HOLDING`), and dt while pump and piston move (`MOVING_BIAS`).
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak")
@@ -308,8 +295,7 @@ def with_rests(equation: Equation) -> Equation:
 def shut_at_rest(equation: Equation) -> Equation:
     """Adapt a pump's volume balance to valves that cut the pump off from the cylinder while the pump rests.
 
-    Two terms are added for the pump's leakage: while it moves the piston, and while it only holds the load. The
-    constant flow (`BIAS`) counts only while pump and piston move.
+    The pump's leakage gets its two terms, and the constant flow (`BIAS`) counts only while pump and piston move.
     """
     left = equation.left
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
@@ -326,9 +312,7 @@ def _pump_leakage_terms(
 ) -> tuple[Term, Term]:
     """Make two terms of a pump's leakage: while it moves the piston, and while it turns to hold the load.
 
-    The increments of a term are (p_A - p_B) dt in its state of the machine, and 0 at other times. `pump_volume`
-    computes the volume [m^3] that the pump delivers in each interval; `drift`: entry of `priors.toml` with the prior on
-    the drift of both coefficients, or "" for terms that are not part of every fit.
+    `pump_volume` computes the volume [m^3] that the pump delivers in each interval; `drift`: that of `Term`.
     """
     # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(conductance_term, cause="pump leak", needs=(), drift=drift)
@@ -340,8 +324,8 @@ def _pump_leakage_terms(
 
 def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
     """Return a volume balance with additional terms before the leak's terms, which stay last."""
-    first_leak = len(equation.terms) - len(LEAKS)
-    return equation._replace(terms=(*equation.terms[:first_leak], *terms, *equation.terms[first_leak:]))
+    *other_terms, laminar_leak, orifice_leak = equation.terms
+    return equation._replace(terms=(*other_terms, *terms, laminar_leak, orifice_leak))
 
 
 def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:

@@ -110,9 +110,8 @@ class Signals:
     def direction_weights(self, outward: bool, by_A: bool) -> Array:
         """Return 1 for each interval (n - 1,) of motion in a given direction while a given side carries the load.
 
-        `outward`: true for motion towards B or standstill, false for motion towards A; `by_A`: true if A carries the
-        load (`carried_by_A`), false if B does. The weight of other intervals is 0, and 1/2 if direction or loaded side
-        change within the interval.
+        `outward`: motion towards B, or standstill, as opposed to motion towards A; `by_A`: side A, as opposed to B, has
+        the load (`carried_by_A`). Other intervals have the weight 0, and 1/2 if direction or side change within.
         """
         is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
         return interval_means(is_counted.astype(float))
@@ -120,15 +119,15 @@ class Signals:
     def moving(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which pump and piston move, else 0.
 
-        `pump_volume` computes the left side of the volume balance [m^3] in each interval, for example the volume that
-        the pump delivers; later calls use that of the first one. Without `rest_limits` all intervals count as motion.
+        `pump_volume` computes the left side of the volume balance [m^3] in each interval; later calls use that of the
+        first one. Without `rest_limits` all intervals count as motion.
         """
         return self._find_states(pump_volume)[0]
 
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
 
-        `pump_volume`: as in `moving`. Without `rest_limits` the result is 0 everywhere.
+        `pump_volume`: as in `moving`. Without `rest_limits` it never rests.
         """
         return self._find_states(pump_volume)[1]
 

@@ -1,7 +1,7 @@
 """The terms of a machine's volume balance, computed from recorded channels.
 
-A balance states where the volume of oil goes that the pump delivers: into motion of the piston, compression, air and
-leakage. It is linear in the unknown coefficients of the machine. For a pump-controlled cylinder
+A balance states where the volume of oil goes that the pump delivers. It is linear in the unknown coefficients of the
+machine. For a pump-controlled cylinder
 
     D dtheta = sum_j c_j f_j dg_j + G (p_A - p_B) dt,
 
@@ -10,8 +10,6 @@ for each term; f_j and g_j are functions of the recorded channels. A term comput
 sampling interval dt, so no signal is differentiated (`weak_form`). With a servo valve, each chamber has a balance. Its
 left side is the volume displaced by the piston, and its terms include the orifice flows of the valve's metering edges.
 G is the same in both chambers.
-
-The priors on the drift of each coefficient are in `priors.toml`, with unit and source.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continuity of the chambers, flow of edges).
 """
@@ -71,25 +69,15 @@ class Term(NamedTuple):
 class Equation(NamedTuple):
     """A volume balance of a machine: its left side equals the sum of its terms.
 
-    Parameters
-    ----------
-    name : str
-        Name of the balance, for example "cylinder".
-    left : callable
-        Computes the increments of the left side [m^3] from `Signals`, shape (n - 1,).
-    terms : tuple of Term
-        The terms, those of the leak last.
-    healthy : float
-        Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
-    by_command : bool
-        True if no channel gives the pump's flow. A speed is then computed from the command u
-        (`balance.derive_drive_signals`).
-    flow_sign : float
-        1 if a flow into A is positive on the left side, -1 if it is negative.
-    area_ratio : float
-        Area of the piston on side B over that on side A; 1 in a balance of one chamber.
-    fed_outward : {"", "A", "B"}
-        Chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed circuit.
+    - `left`: computes the increments of the left side [m^3] from `Signals`, shape (n - 1,);
+    - `terms`: those of the leak are the last two;
+    - `healthy`: standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown;
+    - `by_command`: true if no channel gives the pump's flow, and a speed is computed from the command u
+      (`balance.derive_drive_signals`);
+    - `flow_sign`: 1 if a flow into A is positive on the left side, -1 if it is negative;
+    - `area_ratio`: area of the piston on side B over that on side A; 1 in a balance of one chamber;
+    - `fed_outward`: chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed
+      circuit.
     """
 
     name: str
@@ -133,6 +121,8 @@ START = "start"
 PRESSURES = ("p_A", "p_B")
 #: Makes a term whose coefficient changes suddenly only by a sensor fault.
 fitted_term = partial(Term, cause="sensor fault")
+#: Makes a term of oil that the pressure compresses; air in the oil changes its coefficient suddenly.
+compliance_term = partial(Term, cause="air in the oil", drift="compliance")
 
 
 def conductance_term(
@@ -142,7 +132,7 @@ def conductance_term(
     needs: tuple[str, ...] = PRESSURES,
     drift: Coefficient | Literal[""] = "",
 ) -> Term:
-    """Make the term of an unknown conductance; `increments` computes the driving pressure times dt [Pa s]."""
+    """Make the term of a conductance; `increments` computes the driving pressure times dt [Pa s]."""
     return Term(name, "m^3/(s Pa)", increments, cause, drift=drift, needs=needs, driver="pressure")
 
 
@@ -176,7 +166,6 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
     dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, d ln p for dissolving air.
     """
     p, name = f"p_{side}", f"compliance {side}"
-    compliance_term = partial(Term, cause="air in the oil", drift="compliance")
     air_term = partial(Term, cause="air in the oil", drift="air")
     return (
         compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),
@@ -189,9 +178,9 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
 def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    d is the change over a sampling interval; p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at
-    the current position, counted from mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A`
-    computes w, the weight (0 to 1) of chamber A in the balance.
+    p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at the current position, counted from
+    mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0 to 1) of
+    chamber A in the balance.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -215,10 +204,9 @@ def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Ter
 
 
 def external_leak_term(side: str, weight: float = 1.0) -> Term:
-    """Make the term of an external leak from `side` "A" or "B", with the increments `weight` max(p, 0) dt [Pa s].
+    """Make the term of an external leak from `side` "A" or "B" at its gauge pressure p: `weight` max(p, 0) dt [Pa s].
 
-    p is the gauge pressure of the side. `weight`: factor of this flow in the volume balance, 1 for a leak from A, -1
-    for a leak from B, and 0 in a balance of the other chamber alone.
+    `weight`: 1 for a leak from A, -1 for a leak from B, and 0 in a balance of the other chamber alone.
     """
     p = f"p_{side}"
     return conductance_term(
@@ -264,9 +252,9 @@ def metering_edge_terms(
 ) -> tuple[Term, ...]:
     """Make the three terms of the flow over one metering edge of a servo valve: gain, delay and overlap.
 
-    `edge`: name of the edge, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of
-    the command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure
-    [Pa] in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
+    `edge`: its name, for example "P to A"; `upstream`, `downstream`: channels of the pressures; `sign`: sign of the
+    command u that opens the edge, 1 or -1; `channels`: names of the recorded channels; `return_pressure`: pressure [Pa]
+    in place of p_2 if that is not recorded. With dp = upstream pressure - downstream pressure, the flow is
 
         flow = (gain abs(u) - overlap) sign(dp) sqrt(abs(dp)),    overlap = gain times dead band of u,
 

@@ -10,8 +10,8 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.onset import Information, step_tests
-from sealscope.diagnosis.inference.pressures import response
 from sealscope.diagnosis.inference.pressures.leak import ResponseLeak
+from sealscope.diagnosis.inference.pressures.response import measure_leak
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.recording import Recording
@@ -37,7 +37,7 @@ class PressureResponse:
 
     def reading(self, recording: Recording) -> ResponseLeak | None:
         """Measure the leakage of a recording by the response of its pressures; None if that fails."""
-        return response.measure_leak(recording, self.rig)
+        return measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
         """Summarise a healthy recording by its mean conductance past the piston [m^3/(s Pa)]; None if that fails."""
@@ -47,8 +47,7 @@ class PressureResponse:
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test each parameter of a recording's pressure response for a step, measure the leakage, and report both.
 
-        The leakage is compared with that of the healthy recordings in `baseline`. `share` and `judged_until` of the
-        report follow from the samples that were recorded and not filled in. If the leakage cannot be measured or a leak
+        The leakage is compared with that of the healthy recordings in `baseline`. If it cannot be measured or a leak
         would not show, the report states only the reason (`lack`).
         """
         leak = self.reading(recording)

@@ -6,9 +6,9 @@ some theta_k^0,
     y_k(theta_k) = y_k(theta_k^0) + J_k (theta_k - theta_k^0),
 
 with the Jacobian J_k. Of each block only products of residual and Jacobian are kept (`Block`). The likelihood is
-Gaussian in all theta_k together (`Joint`). The covariance of one parameter over all blocks, with all other parameters
-eliminated, is therefore a part of the inverse of the joint precision. Parameters are counted in units that are
-fractions of the widths of their priors.
+Gaussian in all theta_k together (`Joint`), so that the covariance of one parameter over all blocks, with all others
+eliminated, is a part of the inverse of the joint precision. Parameters are counted in units that are fractions of the
+widths of their priors.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
     `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
-    p): sums over the samples of the products of these rows with each other, after removal of the mains hum; `ends` (8,
-    12): simulated states at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2]
-    of `theta` and of the further parameter sets that were simulated with it.
+    p): sums over the samples of their products with each other, without the mains hum; `ends` (8, 12): simulated states
+    at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2] of `theta` and of the
+    further parameter sets that were simulated with it.
     """
 
     theta: Array
@@ -91,6 +91,12 @@ class Linearisation(NamedTuple):
         deviations = prior.deviations(self.theta)
         # gram[0, 0] is the residual sum of squares
         return float(self.gram[0, 0] / variance + deviations @ prior.precision @ deviations)
+
+    def newton_terms(self, variance: float, prior: Normal) -> tuple[Array, Array]:
+        """Compute Hessian (p, p) and negative gradient (p,) of `cost` / 2 by the parameters, per `prior.unit`."""
+        # row and column 0 of the Gram matrix belong to the residual
+        gradient = self.gram[0, 1:] / variance - prior.precision @ prior.deviations(self.theta)
+        return self.gram[1:, 1:] / variance + prior.precision, gradient
 
 
 class Block(NamedTuple):
@@ -146,11 +152,11 @@ class Joint:
         return Joint(priors, theta, mean, covariance, prior_precision, variance)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
-        """Compute the likelihood of one parameter in K blocks, with all other parameters eliminated, as `Information`.
+        """Compute the likelihood of the parameter with the index `parameter` in K blocks, all others eliminated.
 
-        It follows from the fitted posterior by subtracting the prior of the fit. The result then has another prior: on
-        a linear change and on a random walk, both with the scale `wander` over all blocks, in the unit of the
-        parameter. `parameter`: index of the parameter; `time` (K,): middles of the blocks [s].
+        It is the fitted posterior without the prior of the fit. The result has another prior: on a linear change and on
+        a random walk, both with the scale `wander` over all blocks, in the unit of the parameter. `time` (K,): middles
+        of the blocks [s].
         """
         indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         unit = self.priors.unit[parameter]
@@ -180,11 +186,11 @@ def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
 
 
 def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) -> tuple[float, float]:
-    """Compute the variance of the residual [Pa^2], and how much its correlation inflates the variance of parameters.
+    """Compute the variance of the residual [Pa^2], and the factor by which its correlation inflates that of parameters.
 
-    The second result is a factor: the variance of the scores (`Block`) over their variance under white noise, at least
-    1. `deviations` (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index
-    of the tested parameter.
+    The factor is the variance of the scores (`Block`) over their variance under white noise, at least 1. `deviations`
+    (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index of the tested
+    parameter.
     """
     # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
     directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]

@@ -27,8 +27,7 @@ ORIFICE_RATIO: float = PRESSURE.conductance.orifice
 def conductance_scale_error() -> float:
     """Compute the relative standard deviation of the scale error that all fitted conductances share.
 
-    The response of the pressures determines G M/A^2, so errors of the stated mass M and piston area A scale the
-    conductance G: the result is sqrt(s_M^2 + (2 s_A)^2) with their relative standard deviations.
+    The response determines G M/A^2, so errors of the stated mass M and piston area A scale the conductance G.
     """
     return math.hypot(PRESSURE.scale.mass, 2.0 * PRESSURE.scale.area)
 
@@ -48,7 +47,7 @@ class ResponseLeak(LeakMeasure):
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
     - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
 
-    The leakage has no `rise_flow`, since the level of the conductance depends on the assumed friction. It is not
+    The leakage has no `rise_flow`, since the level of the conductance depends on the assumed friction, and is not
     related to the pump's flow, which is only assumed from the command.
     """
 
@@ -90,8 +89,7 @@ class ResponseLeak(LeakMeasure):
         """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
 
         The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
-        of a laminar leak. The result is the mean of the two flows. Its standard error includes their difference, as if
-        the two were the ends of a 95 % interval. Without a step test the flow is 0 with an infinite standard error.
+        of a laminar leak. The result is the mean of the two, which count as the ends of a 95 % interval in its error.
         """
         if self.step is None:
             return UNKNOWN_FLOW
@@ -104,7 +102,7 @@ class ResponseLeak(LeakMeasure):
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa), equal to the mean of abs(p_A - p_B)."""
+        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa): the mean of abs(p_A - p_B)."""
         return float(self.pressure.mean())
 
     @cached_property
@@ -124,9 +122,8 @@ class ResponseLeak(LeakMeasure):
     def bound_flow(self) -> float:
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
-        With healthy recordings the bound is on the leakage above that of these recordings, otherwise on a leak that
-        begins within the recording. An orifice is assumed, which has the largest flow for a fitted conductance, and a
-        scale at the upper end of its 95 % interval (`conductance_scale_error`).
+        With healthy recordings the bound is on the leakage above theirs, otherwise on a leak that begins within the
+        recording. An orifice is assumed, which has the largest flow for a fitted conductance.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
@@ -136,10 +133,9 @@ class ResponseLeak(LeakMeasure):
 
     @property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and the evidence that a step within the recording caused it.
+        """Leakage above that of healthy recordings, and whether a step within the recording explains it.
 
-        The evidence (`step_log_ratio`) is the log likelihood ratio of two hypotheses: the mean conductance rose by as
-        much as the step would cause, and it did not rise. None without healthy recordings.
+        The rise of the mean conductance is compared with the one that the step causes. None without healthy recordings.
         """
         if self.rise is None:
             return None
@@ -158,10 +154,7 @@ class ResponseLeak(LeakMeasure):
         return 1.0 / LITRE_PER_MINUTE if self.stated else None
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
-        """Return a `TotalLeakage` that states only the smallest detectable leak, as the pressures show only changes.
-
-        `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected within the recording, or None.
-        """
+        """Return a `TotalLeakage` that states only the smallest detectable leak, as the pressures show only changes."""
         pump_flow, lpm_per_flow = self.mean_flow, self.lpm_per_flow
         return TotalLeakage(
             lpm=None,

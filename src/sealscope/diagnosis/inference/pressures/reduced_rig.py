@@ -1,10 +1,10 @@
 """Model of the rig reduced to the difference p_A - p_B of its chamber pressures, for many parameter sets at once.
 
 Its seven states are the difference p, the piston's speed v and position, the friction, the motor's speed and current,
-and the integral of the speed loop. The states follow the laws of `sealscope.physics`. Friction has two alternative
-laws, Stribeck's and LuGre's. A leak of conductance G damps the ringing of a compliance C after each reversal by G/C. It
-also reduces the ramp, the breakaway and the fall of the pressure while sliding. `response` fits the parameters to
-recorded pressures. Parameter sets are simulated in parallel lanes of the processor (`physics.lanes`).
+and the integral of the speed loop. The states follow the laws of `sealscope.physics`. A leak of conductance G damps the
+ringing of a compliance C after each reversal by G/C. It also reduces the ramp, the breakaway and the fall of the
+pressure while sliding. `response` fits the parameters to recorded pressures. Parameter sets are simulated in parallel
+lanes of the processor (`physics.lanes`).
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from collections import namedtuple
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from sealscope.compiled import contracted, kernel
 from sealscope.diagnosis.inference.pressures.fit import Priors
@@ -97,12 +96,11 @@ def _advance_friction(
     Returns the friction force after the step and the friction of steady sliding at the speed `v` [m/s] after it, both
     [N]. `friction_0`, `steady_0`: the same two forces before the step; `theta`: fitted parameters; `m`: sizes.
 
-    The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m for the friction force F, with the contact's
-    compliance c and the magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2:
-    with a = h |v|/(c F_m), where |v| is at least the creep speed `m.v_th`, the steady friction F_s at the speed v, and
-    F_s0 before the step,
+    The law, without the damping of the contact, is c dF/dt = v - |v| F/F_m, with the contact's compliance c and the
+    magnitude F_m of the steady friction (`_steady_friction`). The step is L-stable and of order 2: with a = h |v|/(c
+    F_m), |v| being at least the creep speed `m.v_th`, and the steady friction F_s after and F_s0 before the step,
 
-        F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2).
+            F = (F_0 + (a/2) (F_s0 + (1 + a) F_s)) / (1 + a + a^2/2).
 
     In the code numerator and denominator are multiplied by (c F_m)^2.
     """
@@ -116,9 +114,9 @@ def _advance_friction(
 def _rates(y: State, friction: float, omega_ref: float, theta: Parameters, m: Reduced) -> State:
     """Compute the time derivative of the state y = (p, v, omega, i, I, x) of the reduced rig.
 
-    The state contains p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the integral
-    of the speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s]; `theta`:
-    fitted parameters; `m`: sizes of the rig.
+    These are p_A - p_B [Pa], the piston's speed [m/s], the motor's speed [rad/s] and current [A], the integral of the
+    speed error [rad], and the position [m]. `friction` [N]; `omega_ref`: commanded speed [rad/s]; `theta`: fitted
+    parameters; `m`: sizes of the rig.
     """
     # p_A = p/2 and p_B = -p/2, so p changes twice as fast as p_A; 0.0: no leakage of the pump, no force of an end stop
     p, v, omega, i, integral, x = y
@@ -156,23 +154,12 @@ def simulate_response(
 
     The states are integrated by RK4; friction advances by an implicit step from the speed at each stage.
 
-    Parameters
-    ----------
-    command : array of float, shape (n + 1,)
-        Command [V] at the sample before the first and at each of n samples; it is linear in between.
-    rate : float
-        Sampling rate [Hz].
-    n_substeps : int
-        Number of integration steps from sample to sample.
-    sets : array of float, shape (13, lanes)
-        Parameters up to the lag of the transducers, a row for each.
-    states : array of float, shape (8, lanes)
-        p, v, omega, i, I, x (`_rates`), friction and reading at the sample before the first; on return those at the
-        last sample.
-    m : Reduced
-        Sizes of the reduced rig.
-    out : array of float, shape (n, lanes)
-        Receives the readings of p_A - p_B at each sample [Pa].
+    - `command` (n + 1,): command [V] at the sample before the first and at each of n samples, linear in between;
+    - `rate`: sampling rate [Hz]; `n_substeps`: number of integration steps from sample to sample;
+    - `sets` (13, lanes): parameters up to the lag of the transducers;
+    - `states` (8, lanes): p, v, omega, i, I, x (`_rates`), friction and reading at the sample before the first; on
+      return those at the last sample;
+    - `m`: sizes of the reduced rig; `out` (n, lanes): receives the readings of p_A - p_B at each sample [Pa].
     """
     y, friction, reading = _load_six(states, 0), load(states, 6), load(states, 7)
     theta = (*_load_six(sets, 0), *_load_six(sets, 6), load(sets, LAG))
@@ -209,10 +196,9 @@ def simulate_response(
 def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
-    A prior has a centre, a width and a wander (`Priors`), by the table `[response]` of `priors.toml`; that of the
-    contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. These three numbers are multiplied by
-    the rig's value of the parameter, or are absolute if the rig has none. The Coulomb friction is that at the charge
-    pressure. The prior of the bias, a speed, is in volts of the command and is multiplied by the gain.
+    They are the table `[response]` of `priors.toml`, multiplied by the rig's value of the parameter, or absolute if the
+    rig has none; the prior of the contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. The
+    Coulomb friction is that at the charge pressure. The bias, a speed, is in volts of the command.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
@@ -274,10 +260,11 @@ class Machine(NamedTuple):
         """Find the stiffnesses of the oil [Pa] for the two strongest ringing frequencies of p_A - p_B, shape (2,).
 
         The ringing shows in the spectrum of `dp` (n,), i.e. p_A - p_B [Pa], minus that of `total` (n,), i.e. p_A + p_B
-        [Pa], which has the same noise and hum but does not ring. If there is only one peak, both results are equal.
-        `priors`: priors of the parameters. If no frequency of the spectrum lies within the prior of the stiffness, both
-        results are the centre of this prior.
+        [Pa], which has the same noise and hum but does not ring. A single peak is repeated. If no frequency of the
+        spectrum lies within the prior of the stiffness (`priors`), both results are the centre of this prior.
         """
+        from scipy.signal import welch
+
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies
         middle = n_padded / self.ringing_period(priors.centre[K_OIL])  # bin of the ringing at the centre of the prior
@@ -288,11 +275,8 @@ class Machine(NamedTuple):
         )
         if not bins.size:
             return np.full(2, priors.centre[K_OIL])
-        segments = sliding_window_view([dp, total], min(_SEGMENT, dp.size), axis=1)[:, :: _SEGMENT // 2]
-        window = np.hanning(segments.shape[2] + 1)[:-1]  # periodic Hann window
-        spectra = np.fft.rfft(segments * window, n_padded)
-        powers = np.mean(np.abs(spectra) ** 2, axis=1)  # Welch's method: mean over half-overlapping segments
-        difference_power, total_power = powers
+        segment = min(_SEGMENT, dp.size)
+        _, (difference_power, total_power) = welch(np.array([dp, total]), nperseg=segment, nfft=n_padded, detrend=False)
         excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)  # so that ends may be peaks
         peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
         strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)  # a single peak is repeated

@@ -1,13 +1,10 @@
 """Fit of the response of p_A - p_B to the command in a recording without a position, block by block.
 
 One call of the simulation (`reduced_rig`) gives a whole Jacobian: it simulates in parallel the parameters, and the
-parameters with each of them increased in turn. The simulated states continue from block to block. An iterated Kalman
-filter tracks the parameters from block to block (`Follower`), both live and over a recording. Over a recording all
-blocks are then fitted together (`fit.Joint`). Friction follows Stribeck's law, or LuGre's if Stribeck's does not
-explain the beginning of the recording and LuGre's fits better.
-
-The result is the factor p(pressures | command) of the likelihood. A volume balance of position and angle is conditional
-on p_A and p_B, so the two likelihoods may be multiplied.
+parameters with each of them increased in turn. An iterated Kalman filter tracks the parameters from block to block
+(`Follower`), both live and over a recording. Over a recording all blocks are then fitted together (`fit.Joint`).
+Friction follows Stribeck's law, or LuGre's if Stribeck's does not explain the beginning of the recording and LuGre's
+fits better.
 
 Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (iterated filter as Gauss-Newton steps).
 """
@@ -43,6 +40,7 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
     POSITION,
     SCALE,
     SPRING,
+    STRIBECK,
     G,
     Machine,
     response_priors,
@@ -80,7 +78,7 @@ class Segment:
       each parameter up to `SPRING` increased in turn;
     - `waves` (m, n): waves of the mains hum, which are projected out;
     - `sample_weights` (n,): 0 for samples that are missing or recorded while the drive settles, otherwise 1;
-    - `smooth`: width [samples] of a Gaussian that smooths the residual, 0 for no smoothing.
+    - `smooth`: width [samples] of a Gaussian that smooths the residual.
     """
 
     machine: Machine
@@ -103,10 +101,10 @@ class Segment:
         return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
-        """Smooth rows (m, n) of n samples, set samples without a weight to 0, and fit k waves of mains hum to each row.
+        """Smooth rows (m, n), set samples without a weight to 0, and fit k waves of mains hum to each row.
 
-        Returns the smoothed rows (m, n), their products with the waves, and the waves' amplitudes, (m, k) each. The
-        argument `rows` itself may be overwritten.
+        Returns the rows, which may overwrite the argument, and their products with the waves and the waves' amplitudes,
+        (m, k) each.
         """
         rows = gaussian_filter1d(rows, self.smooth) if self.smooth > 0.0 else rows
         if self.n_samples < rows.shape[1]:
@@ -126,11 +124,10 @@ class Segment:
         return np.asarray(np.nan_to_num(squares, nan=np.inf))
 
     def linearise(self, sets: Array) -> Linearisation:
-        """Linearise the residual of the model about the first of up to 5 parameter sets (m, p).
+        """Linearise the model dp = scale * simulated response + offset about the first of up to 5 sets (m, p).
 
-        The residual is dp - scale * simulated response - offset. The rows of the result are the residual of the first
-        set, and the derivatives of scale * response + offset by each parameter, per unit of `priors.unit`. The other
-        sets are simulated only for their residual sums of squares, `squares` of the result.
+        The derivatives are per unit of `priors.unit`. The other sets are simulated only for their residual sums of
+        squares, `squares` of the result.
         """
         theta, n_sets = sets[0], len(sets)
         n_slopes = SPRING + 1  # the derivatives by the first parameters, up to SPRING, are simulated
@@ -152,11 +149,9 @@ class Segment:
         return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
-        """Compute the derivatives (3, n) of scale * response by three parameters without simulation.
+        """Compute the derivatives (3, n) of scale * response by lead, lag and scale, per unit of `priors.unit`.
 
-        The parameters are the lead of the command, the lag of the transducers, and the scale of p_A - p_B. The
-        derivatives are per unit of `priors.unit`. `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B
-        [Pa].
+        `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
         change = np.asarray(np.gradient(response))
         change[1:-1] -= np.diff(change, 2) / 6.0  # accurate to fourth order, since the ringing is fast
@@ -171,15 +166,12 @@ class Segment:
 
         `fit`: linearisation at the start. The steps minimise -2 log posterior under a `prior`, with Levenberg-Marquardt
         damping. `noise`: variance of the noise [Pa^2], None to estimate it from the residual. Fractions of each step
-        are simulated together with the Jacobian at the full step; if none is an improvement, the step is damped. The
-        fit ends if the expected decrease of -2 log posterior is below `_MIN_GAIN`.
+        are simulated together with the Jacobian at the full step; if none is an improvement, the step is damped.
         """
         damping = 0.0
         for _ in range(n_steps):
-            residual_squares = float(fit.gram[0, 0])  # row and column 0 of the Gram matrix belong to the residual
-            variance = noise or self.residual_variance(residual_squares)
-            hessian = fit.gram[1:, 1:] / variance + prior.precision
-            gradient = fit.gram[0, 1:] / variance - prior.precision @ prior.deviations(fit.theta)
+            variance = noise or self.residual_variance(float(fit.squares[0]))
+            hessian, gradient = fit.newton_terms(variance, prior)
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             if not float(gradient @ step) >= _MIN_GAIN:
                 break
@@ -216,17 +208,14 @@ class Segment:
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
     def is_explained(self, cost: float) -> bool:
-        """Return True if a fit explains the n samples: its chi-squared `cost` is at most n + c sqrt(2 n).
+        """Return True if the chi-squared `cost` of a fit to n samples is at most n + c sqrt(2 n).
 
         That is c = `follow.unexplained` (`priors.toml`) standard deviations above the mean of chi-squared.
         """
         return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
 
     def block_sums(self, fit: Linearisation) -> Block:
-        """Reduce a linearised fit of these samples to the sums of products that the joint fit needs (`fit.Joint`).
-
-        The result also has the scores of the leakage conductance G, a sum for each second, without the mains hum.
-        """
+        """Reduce a linearised fit of these samples to sums of products; the scores are those of G for each second."""
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
@@ -237,17 +226,17 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     """Fit the parameters to a first segment of samples, without parameters from an earlier fit.
 
     The ringing causes many local minima. Therefore the slow part of p_A - p_B is fitted first, from the best of several
-    gains and stiffnesses of the load. Then the unsmoothed p_A - p_B is fitted from several breakaway forces and several
-    stiffnesses of the oil, two of which follow from the strongest ringing (`Machine.ringing_stiffnesses`).
-    `total` (n,): p_A + p_B [Pa]; `noise`: variance of the noise [Pa^2].
+    gains and stiffnesses of the load. Then all of it is fitted from several breakaway forces and several stiffnesses of
+    the oil, two of which follow from the strongest ringing. `total` (n,): p_A + p_B [Pa]; `noise`: variance of the
+    noise [Pa^2].
     """
     priors = segment.priors
 
     def rank_starts(section: Segment, theta: Array, n_groups: int, values: dict[int, Array]) -> Array:
-        """Sort 16 variants of the parameters `theta` (p,) by their fit to a section, within each of several groups.
+        """Sort 16 variants of the parameters `theta` (p,) by their fit, within `n_groups` groups of consecutive ones.
 
-        `values` maps the index of a varied parameter to its value in each variant (16,). Consecutive variants form
-        `n_groups` groups. The result has the shape (16/n_groups, n_groups, p), the best of each group first.
+        `values` maps the index of a varied parameter to its value in each variant (16,). The result has the shape
+        (16/n_groups, n_groups, p), the best of each group first.
         """
         sets = np.tile(theta, (SINGLE_WIDTH, 1))
         for parameter, column in values.items():
@@ -276,8 +265,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
     """Fit the parameters to the samples `segment` from several starts (s, p), and return the best fit.
 
-    A few Gauss-Newton steps from all starts are followed by more from the `n_best` best. `noise`: variance of the noise
-    [Pa^2].
+    A few Gauss-Newton steps from all starts are followed by more from the `n_best` best. `noise`: variance [Pa^2].
     """
     fits, prior = [segment.linearise(start[None]) for start in starts], segment.priors.normal
     for n_steps, n_kept in ((_N_STEPS // 6, n_best), (_N_STEPS, 1)):
@@ -290,13 +278,14 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
 class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
-    `machine`: simulator; `priors`: priors of its parameters; `sense`: 1 if p_A - p_B rises with the command, else -1.
+    `rig`: assumed machine; `rate`: sampling rate [Hz]; `sense`: 1 if p_A - p_B rises with the command, else -1; `law`:
+    law of friction, one of `reduced_rig.LAWS`.
     """
 
-    def __init__(self, machine: Machine, priors: Priors, sense: float) -> None:
-        self.machine, self.priors, self.sense = machine, priors, sense
-        self.theta = priors.centre  # parameters (p,)
-        self.covariance = np.diag(priors.variance)  # covariance of the parameters, in units of `priors.unit`
+    def __init__(self, rig: Rig, rate: float, sense: float, law: str = STRIBECK) -> None:
+        self.machine, self.priors, self.sense = Machine.from_rig(rig, rate, law), response_priors(rig, law), sense
+        self.theta = self.priors.centre  # parameters (p,)
+        self.covariance = np.diag(self.priors.variance)  # covariance of the parameters, in units of `priors.unit`
         self.variance = math.nan  # variance of the noise [Pa^2]
         self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
@@ -317,28 +306,26 @@ class Follower:
         # p_A + p_B has the noise of p_A - p_B but does not ring; the squares of the coefficients (1, -3, 3, -1) of a
         # third difference have the sum 20
         noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
-        follower = Follower(Machine.from_rig(rig, recording.rate), response_priors(rig), sense)
+        follower = Follower(rig, recording.rate, sense)
         segment = follower.next_segment(beginning)
         fit = fit_from_priors(segment, total, noise_variance)
         cost = fit.cost(noise_variance, follower.priors.normal)
         if not segment.is_explained(cost):  # try LuGre's friction in place of Stribeck's
-            bristles = Follower(Machine.from_rig(rig, recording.rate, BRISTLES), response_priors(rig, BRISTLES), sense)
+            bristles = Follower(rig, recording.rate, sense, BRISTLES)
             starts = np.array([fit.theta, bristles.priors.centre])
             # the fit with Stribeck's friction says nothing about the compliance
             starts[:, COMPLIANCE] = bristles.priors.centre[COMPLIANCE]
             bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise_variance, n_best=1)
             if bristles_fit.cost(noise_variance, bristles.priors.normal) < cost:
                 follower, fit = bristles, bristles_fit
-        residual_squares = float(fit.gram[0, 0])
-        follower.theta, follower.variance = fit.theta, segment.residual_variance(residual_squares)
+        follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
         follower._converge_on_beginning(recording)
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
         """Refine the parameters by filtering the beginning of a recording, then return to its first sample.
 
-        The refined `theta` is kept; covariance and states are those from before, since the same samples are filtered
-        again, and there is no previous sample.
+        Only `theta` is kept, since the same samples are filtered again.
         """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
@@ -349,11 +336,8 @@ class Follower:
         self.covariance, self.states, self.last = covariance, states, math.nan
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Make a filter for samples of the same machine at another `rate` [Hz] that continues from this one.
-
-        There is no previous sample: as after a gap, the next block starts the simulation anew (`next_segment`).
-        """
-        follower = Follower(Machine.from_rig(rig, rate, self.machine.law), self.priors, self.sense)
+        """Make a filter for samples of the same machine at another `rate` [Hz] that continues as after a gap."""
+        follower = Follower(rig, rate, self.sense, self.machine.law)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
         return follower
@@ -368,14 +352,13 @@ class Follower:
         self.last = math.nan
 
     def next_segment(self, block: Recording) -> Segment:
-        """Prepare the samples of the next block for a fit.
+        """Prepare the samples of the next block for a fit; at the start or after a gap, change `last` and `states`.
 
-        At the start or after a gap the stroke is centred, and samples have no weight until the drive has settled. The
-        attributes `last` and `states` are then changed.
+        The stroke is then centred, and samples have no weight until the drive has settled.
         """
         u, n = block["u"], len(block)
         sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
-        if math.isnan(self.last):  # at the start or after a gap: centre the stroke, and let the drive settle
+        if math.isnan(self.last):
             self.last, self.states = float(u[0]), self.states.copy()
             self.states[POSITION] = self.machine.centred_start(u * self.theta[GAIN])
             sample_weights[: round(_FOLLOW.settling * block.rate)] = 0.0
@@ -403,11 +386,10 @@ class Follower:
         return Normal(self.theta, np.asarray(np.linalg.inv(self.covariance + np.diag(variance))), self.priors.unit)
 
     def _fit_block(self, segment: Segment, block_s: float) -> tuple[Linearisation, Normal]:
-        """Fit the parameters to the next block of samples; return the fit and the prior that it used.
+        """Fit the parameters to the next block of samples, of `block_s` [s]; return the fit and the prior that it used.
 
-        `block_s` [s]: duration of the `segment`, by which the prior is widened. If slow variations of the parameters do
-        not explain the block, fits with a jump of the conductance or of the oil's stiffness are tried as well, and the
-        one with the highest posterior density is returned. `update` advances the filter.
+        If slow variations of the parameters do not explain the block, fits with a jump of the conductance or of the
+        oil's stiffness are tried as well, and the one with the highest posterior density is returned.
         """
 
         def fit_candidate(start: Array, prior: Normal) -> tuple[float, Linearisation, Normal]:
@@ -415,9 +397,8 @@ class Follower:
             fit = segment.descend(segment.linearise(start[None]), prior, _N_STEPS, self.variance)
             return fit.cost(self.variance, prior), fit, prior
 
-        cost, fit, prior = fit_candidate(self.theta, self._prior(block_s))
-        candidates = [(cost, fit, prior)]
-        if not segment.is_explained(cost):
+        candidates = [fit_candidate(self.theta, self._prior(block_s))]
+        if not segment.is_explained(candidates[0][0]):
             # the grid of the conductance after a jump is absolute, that of the stiffness relative to the current one
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
@@ -430,16 +411,14 @@ class Follower:
     def update(self, block: Recording) -> Block:
         """Fit the parameters to the next block of samples, and return the block's sums for a joint fit of all blocks.
 
-        The prior of the fit is the estimate from the earlier blocks. Updates all attributes of the filter except
-        `machine`, `priors`, `sense` and `variance`.
+        The prior of the fit is the estimate from the earlier blocks; that from this block replaces it.
         """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
         chi_squared = fit.cost(self.variance, prior)
         self.excess = (chi_squared - segment.n_samples) / math.sqrt(2.0 * max(segment.n_samples, 1.0))
-        parameter_gram = fit.gram[1:, 1:]  # row and column 0 belong to the residual
-        self.covariance = np.asarray(np.linalg.inv(parameter_gram / self.variance + prior.precision))
-        gradient = fit.gram[0, 1:] / self.variance - prior.precision @ prior.deviations(fit.theta)
+        hessian, gradient = fit.newton_terms(self.variance, prior)
+        self.covariance = np.asarray(np.linalg.inv(hessian))
         # one more Gauss-Newton step, which needs no simulation
         self.theta = np.clip(fit.theta + self.covariance @ gradient * prior.unit, *segment.bounds(fit.theta))
         self.states, self.last = fit.ends, float(block["u"][-1])
@@ -447,11 +426,10 @@ class Follower:
 
 
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
-    """Fit the response of p_A and p_B to the command in a recording; None if no parameters describe it.
+    """Fit the response of p_A and p_B to the command in a recording, once; None if no parameters describe it.
 
-    The parameters are those of the machine, the leakage among them. `recording` must meet the requirements
-    (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and priors. The result is computed only once
-    for a recording.
+    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and
+    priors.
     """
 
     def compute_fit(recording: Recording) -> Joint | None:
@@ -472,7 +450,7 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
 
 
 def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
-    """Measure the leakage of a recording without position by the response of its pressures.
+    """Measure the leakage of a recording by the response of its pressures.
 
     Return None if a requirement is not met (`find_unmet_requirement`), or if no parameters describe the response.
     """
@@ -491,9 +469,9 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
     """Compute the likelihood of each parameter in K blocks, by the parameter's name, from the joint fit of all blocks.
 
-    All other parameters are eliminated. Each likelihood comes with the scale of the priors on a linear change and on a
-    random walk of the parameter: the standard deviation that a walk reaches over the recording (for the leakage
-    conductance G that of a healthy machine). `time` (K,): middles of the blocks [s]; `seconds`: duration recorded [s].
+    Each comes with the scale of the priors on a linear change and on a random walk: the standard deviation that a walk
+    reaches over the recording (for the leakage conductance G that of a healthy machine). `time` (K,): middles of the
+    blocks [s]; `seconds`: duration recorded [s].
     """
     # `Priors.wander` is reached within the time `blocks.wander`; a random walk grows with the root of the time
     growth = math.sqrt(seconds / PRESSURE.blocks.wander)

@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
+from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.laws import compare_laws
 from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
-from sealscope.diagnosis.inference.leak_law import (
-    EXPONENTS,
-    estimate_bend_flows,
-    estimate_older_flow,
-    law_priors,
-    mixture_flow,
-    older_log_ratios,
-)
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import (
     BOUND_PROBABILITY,
@@ -40,20 +33,6 @@ from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR, LITRE_PER_MINUTE
-
-
-class _HoldLaws(NamedTuple):
-    """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow.
-
-    A law is an exponent of `EXPONENTS` (1 laminar, 0.5 orifice) with a growth of the leak; the first law is laminar
-    without growth. `weights` (k,): probability of each law, with the sum 1; `unit_flows`: mean flow [m^3/s] for a
-    coefficient of 1; `flows`, `deviations`: fitted mean flows and their standard deviations [m^3/s].
-    """
-
-    weights: Array
-    unit_flows: Array
-    flows: Array
-    deviations: Array
 
 
 class BalanceLeak(LeakMeasure):
@@ -76,29 +55,22 @@ class BalanceLeak(LeakMeasure):
     def cause(self) -> Cause:
         """Cause of a leak, such as "piston leak", or "piston or pump leak" if the balance cannot separate them.
 
-        Holds are times in which shut valves separate the pump from the loaded cylinder. They measure the leakage if
-        `rise` is the rise in holds, and if the balance assumes shut valves at every rest or the rise is too high for a
-        healthy machine.
-
-        - "piston or external leak" if only the creep of a held load is known: leaking valves and lines cause creep,
-          too. The same if holds measure the leakage, and a leak to the outside explains them with a probability above
-          `held_oil.rare` (`priors.toml`): with one chamber open to the tank, the other loses oil alike by either leak.
-        - "piston leak" in other cases in which holds measure the leakage, if a servo valve drives the cylinder, or if a
-          flow meter measures the flow behind the pump.
-        - "piston or pump leak" otherwise.
+        The creep of a held load shows leaks of the piston, of valves and of lines alike. Holds, in which shut valves
+        separate the pump from the cylinder, measure the leakage if `rise` is the rise in holds, and if the balance
+        assumes shut valves at every rest or the rise is too high for a healthy machine. Behind a servo valve or a flow
+        meter, too, the pump's leakage is not measured.
         """
-        if self.balance.is_creep:
+        balance, rare = self.balance, INFERENCE.held_oil.rare
+        if balance.is_creep:
             return "piston or external leak"
-        hold_rise = self._rises.get(True)
-        is_unusual = hold_rise is not None and hold_rise.chance < INFERENCE.held_oil.rare  # for a healthy machine
-        is_measured_in_holds = hold_rise is not None and self.rise is hold_rise and (self.balance.shut or is_unusual)
-        has_servo_valve = len(self.balance.columns) > 1  # one balance for each chamber
-        chambers = self.balance.chambers
-        if is_measured_in_holds and chambers is not None:
-            is_external = chambers.piston_leak.probability < 1.0 - INFERENCE.held_oil.rare
-            return "piston or external leak" if is_external else "piston leak"
-        is_behind_pump = has_servo_valve or flow_source(self.balance.recording.channels) in METERS
-        return "piston leak" if is_behind_pump or is_measured_in_holds else "piston or pump leak"
+        hold_rise, chambers = self._rises.get(True), balance.chambers
+        is_in_holds = hold_rise is not None and hold_rise is self.rise and (balance.shut or hold_rise.chance < rare)
+        if is_in_holds and chambers is not None:
+            # with one chamber open to the tank, the other loses oil alike by a leak past the piston or to the outside
+            return "piston leak" if chambers.piston_leak.probability >= 1.0 - rare else "piston or external leak"
+        has_servo_valve = len(balance.columns) > 1  # one balance for each chamber
+        is_behind_pump = has_servo_valve or flow_source(balance.recording.channels) in METERS
+        return "piston leak" if is_behind_pump else "piston or pump leak"
 
     @property
     def step(self) -> StepTest | None:
@@ -109,9 +81,8 @@ class BalanceLeak(LeakMeasure):
     def step_flow(self) -> Estimate:
         """Mean flow [m^3/s] of a leak that begins within the recording, from its onset to the end.
 
-        The flow is averaged over the laws, growths and onsets of the leak. The rise over healthy recordings counts, if
-        there is one (`fit_rise`), and so does the flow in holds (`_mix_with_holds`). Without a step test the flow is 0
-        with an infinite standard error.
+        It is averaged over laws, growths and onsets. The rise over healthy recordings counts, if there is one
+        (`fit_rise`), and so does the flow in holds (`_mix_with_holds`).
         """
         balance, test = self.balance, self.balance.test
         if test is None:
@@ -123,19 +94,18 @@ class BalanceLeak(LeakMeasure):
 
     @property
     def flow_per_conductance(self) -> float:
-        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa), equal to the mean of abs(p_A - p_B)."""
+        """Mean flow [m^3/s] of a leak with a conductance of 1 m^3/(s Pa): the mean of abs(p_A - p_B)."""
         return self.balance.mean_pressure()
 
     def _add_law_uncertainty(self, flow: Estimate) -> Estimate:
         """Add the uncertainty of a leak's law, the fraction `size.law` (`priors.toml`) of the flow, to its error."""
-        law: float = INFERENCE.size.law
-        return Estimate(flow.value, float(np.hypot(flow.deviation, flow.value * law)))
+        return Estimate(flow.value, float(np.hypot(flow.deviation, flow.value * INFERENCE.size.law)))
 
     @cached_property
     def rise(self) -> Rise | None:
         """Amount by which the mean leakage [m^3/(s Pa)] exceeds that of healthy recordings; None without these.
 
-        It is the rise in `_rises` with the smaller p-value; if both are equal, the rise in holds.
+        It is the one of `_rises` with the smaller p-value; if both are equal, the rise in holds.
         """
         return min(self._rises.values(), key=lambda rise: rise.chance, default=None)
 
@@ -166,8 +136,8 @@ class BalanceLeak(LeakMeasure):
     def _hold_rise(self) -> Rise | None:
         """Rise of the leakage over healthy recordings [m^3/(s Pa)], from the times in which shut valves hold the load.
 
-        None if it cannot be estimated, or if it shows no leak and says nothing about the rise in the whole recording,
-        because its error exceeds both the error and the value of that rise.
+        None if it cannot be estimated, or if it shows no leak and is too uncertain beside the rise in the whole
+        recording: its error exceeds both the error and the value of that rise.
         """
         motion_rise = self._motion_rise
         if not self.balance.locked or motion_rise is None:
@@ -180,14 +150,10 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def rise_flow(self) -> Estimate:
-        """Mean flow [m^3/s], since its onset, of the leakage above that of healthy recordings.
-
-        Without healthy recordings it is the mean flow of the total leakage.
-        """
-        balance = self.balance
+        """Mean flow [m^3/s] since its onset of the leakage above healthy recordings, or of the total without these."""
         if self.rise is None:
-            total = Interval(*(balance.mean_pressure() * conductance for conductance in balance.conductance))
-            return self._add_law_uncertainty(Estimate(total.value, total.deviation))
+            total, pressure = self.balance.conductance, self.balance.mean_pressure()
+            return self._add_law_uncertainty(Estimate(pressure * total.value, pressure * total.deviation))
         return self._add_law_uncertainty(self._mix_with_holds(self._rise_fits.flow))
 
     @cached_property
@@ -214,8 +180,8 @@ class BalanceLeak(LeakMeasure):
     def _mix_with_holds(self, flow: Estimate) -> Estimate:
         """Combine the flow of a leak since its onset with its flow during holds, if the holds show a leak.
 
-        In a hold shut valves keep the load in place. The estimate from holds has the weight `held_oil.right` of
-        `priors.toml`, the probability that it is right if the two disagree.
+        The weight of the estimate from holds, `held_oil.right` of `priors.toml`, is the probability that it is right if
+        the two disagree.
         """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
         if hold_rise is None or not hold_rise.chance < prior.rare:
@@ -240,62 +206,56 @@ class BalanceLeak(LeakMeasure):
         The variance of `hold_rise`, the rise over healthy recordings in these times, and the relative scatter
         `held_oil.scatter` (`priors.toml`) are added to the variances of the fits.
         """
-        laws = self._hold_laws
-        laminar_unit_flow = laws.unit_flows[0]  # the rise is that of a laminar leak
-        rise_flow_deviation = hold_rise.normal_deviation * laminar_unit_flow
-        scatter = INFERENCE.held_oil.scatter * laws.flows
-        deviations = np.sqrt(rise_flow_deviation**2 + laws.deviations**2 + scatter**2)
-        return mixture_flow(laws.weights, laws.flows, deviations)
+        weights, unit_flows, flows, deviations = self._hold_laws
+        rise_deviation = hold_rise.normal_deviation * unit_flows[0]  # the rise is that of a laminar leak
+        deviations = np.sqrt(rise_deviation**2 + deviations**2 + (INFERENCE.held_oil.scatter * flows) ** 2)
+        return mixture_flow(weights, flows, deviations)
 
     @cached_property
-    def _hold_laws(self) -> _HoldLaws:
-        """Leak past the piston, fitted to the times in which shut valves hold the load, for each law and piston area.
+    def _hold_laws(self) -> Array:
+        """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow, (4, k).
 
-        A law is an exponent of `EXPONENTS` and a relative growth of the coefficient between onset and end
-        (`growth_priors`); the flow is the coefficient times abs(p_A - p_B)^exponent. Each law is fitted with each area
-        of `HeldChambers.area_variants`. The weights of all laws for one area sum to the probability of this area.
+        The rows are the probability of each law, with the sum 1; the mean flow [m^3/s] after the onset for a
+        coefficient of 1; and the fitted mean flow and its standard deviation [m^3/s]. Each of
+        `HeldChambers.law_fits`, of which the first is laminar without growth, is repeated for each piston area of
+        `HeldChambers.area_variants`.
         """
-        chambers = self.balance.chambers
-        assert chambers is not None
-        parts = []
-        for probability, variant in chambers.area_variants():
-            laws = self._fit_hold_laws(variant)
-            parts.append(laws._replace(weights=probability * laws.weights))
-        return _HoldLaws(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        assert self.balance.chambers is not None
+        variants = self.balance.chambers.area_variants()
+        return np.hstack([self._fit_hold_laws(variant, probability) for probability, variant in variants])
 
-    def _fit_hold_laws(self, chambers: HeldChambers) -> _HoldLaws:
-        """Convert the fits of a piston leak under each law (`chambers.law_fits`) to mean flows and weights of the laws.
+    def _fit_hold_laws(self, chambers: HeldChambers, probability: float) -> Array:
+        """Compute the columns of `_hold_laws` for one piston area, with its `probability`.
 
-        The flows are means over the recording after the onset. Their deviations include the uncertain starts of the
-        holds (`HeldChambers.start_error`).
+        The deviations include the uncertain starts of the holds (`HeldChambers.start_error`).
         """
-        recording, unit_flows = self.balance.recording, list[float]()
-        for law, conditions, _, _ in chambers.law_fits:
-            after_onset = recording.t >= conditions.onset
+        recording, rows = self.balance.recording, []
+        best_log_weight = max(fit.log_weight for fit in chambers.law_fits)
+        for leak, fit, log_weight in chambers.law_fits:
+            after_onset = recording.t >= leak.onset
             t = recording.t[after_onset]
             difference = (recording["p_A"] - recording["p_B"])[after_onset]
-            pressure = np.abs(chambers.pressure_difference(t, difference, conditions.offset))
-            # mean flow after the onset for a coefficient of 1
-            unit_flows.append(float(np.nanmean(pressure**law.exponent * law.growth_factor(t, chambers.end))))
-        values, noise_deviations, oil_deviations, _ = np.array([law_fit.fit for law_fit in chambers.law_fits]).T
-        log_weights = np.array([law_fit.log_weight for law_fit in chambers.law_fits])
-        weights = np.exp(log_weights - log_weights.max())
-        start_errors = np.array([chambers.start_error(conditions, law) for law, conditions, _, _ in chambers.law_fits])
-        deviations = np.sqrt(noise_deviations**2 + oil_deviations**2 + (start_errors * values) ** 2)
-        return _HoldLaws(weights / weights.sum(), np.array(unit_flows), values * unit_flows, deviations * unit_flows)
+            pressure = np.abs(chambers.pressure_difference(t, difference, leak.offset))
+            growth = growth_factor(t, leak.growth, leak.onset, chambers.end)
+            unit_flow = float(np.nanmean(pressure**leak.exponent * growth))
+            deviation = np.linalg.norm([fit.deviation, fit.by_oil, chambers.start_error(leak) * fit.value])
+            rows.append((np.exp(log_weight - best_log_weight), unit_flow, fit.value * unit_flow, deviation * unit_flow))
+        laws = np.array(rows).T
+        laws[0] *= probability / laws[0].sum()
+        return laws
 
     def _rise_laws(self) -> list[tuple[float, float]]:
-        """Weigh the laws of a leak's flow, such as laminar, by their fit to the rise over healthy recordings.
+        """Weigh the laws of a leak's flow by their fit to the rise over healthy recordings.
 
-        Returns for each law a mean flow per conductance [Pa] and a log weight. The flow is that of a leak of this law
-        which looks like a laminar leak with a conductance of 1. A law with an exponent e of `EXPONENTS` lies the
-        fraction f = 2 (1 - e) of the way from laminar to orifice flow:
+        Returns for each exponent e of `EXPONENTS` a log weight, and before it the mean flow per conductance [Pa] of a
+        leak that looks like a laminar one with a conductance of 1. The law lies the fraction f = 2 (1 - e) of the way
+        from laminar to orifice flow:
 
             flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
 
-        where L is the log likelihood ratio of an orifice to a laminar leak for one residual, and N = `size.readings`
-        (`priors.toml`) the number of independent residuals. If L is unknown, all laws have the laminar flow and the log
-        weight 0.
+        with the log likelihood ratio L of an orifice to a laminar leak for one residual, and the number N of
+        independent residuals (`size.readings` of `priors.toml`). If L is unknown, all laws have the laminar flow and
+        the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -314,10 +274,10 @@ class BalanceLeak(LeakMeasure):
 
     @property
     def excess(self) -> float | None:
-        """Total leakage minus the limit in the rig's file, over the standard deviation of the leakage (no unit).
+        """Total leakage minus the limit in the rig's file, in standard deviations of the leakage.
 
-        None if the file states no limit, if no flow can be stated in L/min (`Size.stated`), if a servo valve drives the
-        cylinder, if no channel measures the flow, or if healthy recordings are compared instead.
+        None without a limit or a flow in L/min (`Size.stated`), behind a servo valve, if no channel measures the flow,
+        or if healthy recordings are compared instead.
         """
         balance = self.balance
         limit, size = healthy_leakage(balance.rig), balance.size
@@ -334,9 +294,8 @@ class BalanceLeak(LeakMeasure):
     def bound_flow(self) -> float:
         """95 % upper bound of the leak's mean flow over the recording [m^3/s]; infinite if nothing was tested.
 
-        With healthy recordings it is a bound on the leakage above theirs, which also uses the holds (`_hold_bound`) if
-        they measure the leakage. Otherwise it is a bound on a leak that begins within the recording. The uncertain
-        scale of the flows and the uncertain law of the leak raise the bound.
+        With healthy recordings it is a bound on the leakage above theirs, otherwise on a leak that begins within the
+        recording. The uncertain scale of the flows and the uncertain law of the leak raise it.
         """
         test = self.step if self._motion_rise is None else self._motion_rise
         if test is None:
@@ -352,18 +311,18 @@ class BalanceLeak(LeakMeasure):
     def _hold_bound(self) -> float:
         """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
-        In a hold shut valves keep the load in place. The bound is a quantile of a mixture of three hypotheses: the
-        holds say nothing about the leak, so that the whole recording counts; the holds show a leak past the piston; the
-        holds show a leak to the outside.
+        It is a quantile of a mixture of three hypotheses: the holds say nothing about the leak, so that the whole
+        recording counts; they show a leak past the piston; they show a leak to the outside.
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
         piston_probability, fraction_after, fit = chambers.piston_leak
-        mean_leak, pressure, laws = fraction_after * fit.value, self.balance.mean_pressure(), self._hold_laws
-        # standard deviations of the flow under each law, over that under the laminar law without growth
-        relative_deviations = laws.deviations / max(float(laws.deviations[0]), np.finfo(float).tiny)
+        mean_leak, pressure = fraction_after * fit.value, self.balance.mean_pressure()
+        weights, _, _, deviations = self._hold_laws
+        # mean deviation of the flow over that under the laminar law without growth, the first
+        relative_deviation = float(weights @ deviations) / max(float(deviations[0]), np.finfo(float).tiny)
         # mean flow per conductance of a leak past the piston, increased where its law makes the flow less certain
-        unit = pressure * max(float(laws.weights @ relative_deviations), 1.0)
+        unit = pressure * max(relative_deviation, 1.0)
         # the holds show the leak if they are right about it and it did not begin after them
         hold_probability = INFERENCE.held_oil.right * (1.0 - chambers.probability_after_holds)
         # `hold_rise.value` contains the piston's leak times its probability; here the leak is either whole or absent.
@@ -392,63 +351,27 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def step_rise(self) -> LeakRise | None:
-        """Leakage above that of healthy recordings, and the evidence for its causes (`LeakRise`).
+        """Leakage above that of healthy recordings, and whether a step within the recording explains it (`LeakRise`).
 
-        The causes are a leak that began within the recording, with the size of the tested step, and an older leak.
-        `step_log_ratio` compares the rise in holds after the step's onset with the whole step, if shut valves then hold
-        the load. Otherwise it compares the mean rise over the recording with the part of the step that this mean
-        contains. None without healthy recordings. Without a step test, all fields but `rise` keep their defaults.
+        If shut valves hold the load after the step's onset, the rise in these holds is compared with the whole step.
+        Otherwise the mean rise over the recording is compared with the part of the step that this mean contains. None
+        without healthy recordings.
         """
         step, total_rise, motion_rise = self.step, self.rise, self._motion_rise
-        if total_rise is None:
+        if total_rise is None or motion_rise is None:  # both are None, or neither
             return None
-        if step is None or motion_rise is None:  # with a `total_rise`, `motion_rise` is never None
+        if step is None:
             return LeakRise(total_rise)
         balance, chambers = self.balance, self.balance.chambers
         leaks = None if self._hold_rise is None or chambers is None else chambers.leaks_since(step.onset().value)
         sums = balance.recording_sums._replace(held=leaks)
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
-        older_ratios = older_log_ratios(balance.running_blocks, balance.columns, balance.leak)
-        # the likelihood of an older leak is averaged over the laws; that of the step has `law.share`, its law's prior
-        mean_log_ratio = float(np.logaddexp.reduce(older_ratios + np.log(law_priors())))
-        onset_log_ratio = 0.5 * step.score + float(np.log(step.law.share)) - mean_log_ratio
-        # noise[False]: as fitted without a step
-        older_log_ratio, older_flow = self._compare_older_leak(older_ratios, step.noise[False], motion_rise)
-        if rise_after is None:
-            is_after = balance.running_blocks.time >= step.onset().value
-            fraction = float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
-            mean_rise = step.fitted.value * fraction  # mean over the recording
-            step_log_ratio = motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail)
-            return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
-        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(rise / step)
-        # after the onset the holds show the whole step
-        step_log_ratio = rise_after.log_ratio(step.fitted.value, log_deviation)
-        return LeakRise(total_rise, step_log_ratio, onset_log_ratio, older_log_ratio, older_flow)
-
-    def _compare_older_leak(self, log_ratios: Array, noise: float, motion_rise: Rise) -> tuple[float, Estimate | None]:
-        """Compare the rise of the leakage above healthy recordings with the size of a leak older than the recording.
-
-        This size is estimated from the curvature of the leak's flow over the pressure. Returns the fields
-        `older_log_ratio` and `older_flow` of `LeakRise`: the log likelihood ratio of a rise of this size to no rise,
-        and the mean flow of the older leak [m^3/s]. The flow is None if holds measure it better. The result is (0,
-        None) if the curvature is unknown. `log_ratios`: those of `older_log_ratios`; `noise`: as in
-        `estimate_bend_flows`; `motion_rise`: the rise in the whole recording.
-        """
-        balance, total_rise = self.balance, self.rise
-        assert total_rise is not None
-        deviation = motion_rise.normal_deviation
-        units = [unit for unit, _ in self._rise_laws()]  # mean flow for a rise of 1
-        bend_flows = estimate_bend_flows(balance.running_blocks, balance.columns, noise)
-        rises = [flow.value / unit for flow, unit in zip(bend_flows, units, strict=True) if flow is not None]
-        if not rises:
-            return 0.0, None
-        log_deviation: float = INFERENCE.held_oil.agrees  # standard deviation of log(total rise / expected rise)
-        rise_log_ratios = [total_rise.log_ratio(rise, log_deviation) if rise > 0.0 else -np.inf for rise in rises]
-        log_ratio = float(np.logaddexp.reduce(rise_log_ratios) - np.log(len(rises)))
-        if self._hold_rise is not None:
-            return log_ratio, None
-        rise_flows = [Estimate(motion_rise.value * unit, deviation * unit) for unit in units]
-        return log_ratio, self._add_law_uncertainty(estimate_older_flow(log_ratios, rise_flows, bend_flows))
+        if rise_after is not None:
+            # after the onset the holds show the whole step; `agrees`: standard deviation of log(rise / step)
+            return LeakRise(total_rise, rise_after.log_ratio(step.fitted.value, INFERENCE.held_oil.agrees))
+        is_after = balance.running_blocks.time >= step.onset().value
+        mean_rise = step.fitted.value * float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
+        return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -484,11 +407,8 @@ class BalanceLeak(LeakMeasure):
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        The limit is that of the rig's file, None if that states none, or if healthy recordings are compared instead.
         The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
-        the pump. `detectable_flow`: flow [m^3/s] of the smallest leak that would be detected if it began within the
-        recording, computed with the assumed piston area and displacement; None if that was not tested. The result
-        states it as `findable_lpm` and `findable_share`.
+        the pump. `detectable_flow`: as in `LeakMeasure.total`, computed with the assumed piston area and displacement.
         """
         balance = self.balance
         size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
@@ -513,10 +433,7 @@ class BalanceLeak(LeakMeasure):
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over time [L/min] with its 95 % interval; None if L/min cannot be stated (`Size.stated`).
-
-        With an onset `onset_s` [s] it is the growth of the leakage since then, with None the total leakage.
-        """
+        """Return the total leakage over time [L/min], or its growth since `onset_s` [s]; None if not in L/min."""
         balance = self.balance
         if not balance.size.stated:
             return None
@@ -533,7 +450,7 @@ class BalanceLeak(LeakMeasure):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks on contradicting sizes, sensor offsets of p_A - p_B, a delay of x, and unusual conditions."""
+        """Remarks on contradicting sizes, the sensor offset of p_A - p_B, a delay of x, and unusual conditions."""
         balance = self.balance
         size, offset, delay = balance.size, balance.pressure_offset, balance.position_delay
         remarks = list[Remark]()
@@ -544,30 +461,23 @@ class BalanceLeak(LeakMeasure):
         # a delay of one sample is usual
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
             remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
-        return [*remarks, *self._iter_condition_remarks()]
-
-    def _iter_condition_remarks(self) -> Iterator[Remark]:
-        """Yield a remark on each condition (load, speed, oil) outside of the range of the healthy recordings.
-
-        It states load [bar] and oil temperature [deg C] with the range, but the speed over the nearer end of its range.
-        """
-        for condition in find_unusual_conditions(self.balance.recording_sums, self.healthy):
+        for condition in find_unusual_conditions(balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":
-                yield Remark("load beyond", {"value": value / BAR, "low": low / BAR, "high": high / BAR})
-            elif condition.name == "speed":
-                yield Remark("speed beyond", {"ratio": value / (high if value > high else low)})
+                remarks.append(Remark("load beyond", {"value": value / BAR, "low": low / BAR, "high": high / BAR}))
+            elif condition.name == "speed":  # over the nearer end of the range of the healthy recordings
+                remarks.append(Remark("speed beyond", {"ratio": value / (high if value > high else low)}))
             else:
-                yield Remark("oil beyond", {"value": value, "low": low, "high": high})
+                remarks.append(Remark("oil beyond", {"value": value, "low": low, "high": high}))
+        return remarks
 
 
 def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_deviation: float = 0.0) -> Mixture:
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient over healthy recordings.
 
-    It is a mixture of normal distributions whose weights sum to `weight`, as a part of a larger mixture. `value`:
-    estimated rise, a negative one counting as 0; `rise`: source of the distribution of this estimate's error; `unit`:
-    mean flow [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient that uncertain
-    properties of the oil cause.
+    It is a part of a larger mixture, in which it has the `weight`. `value`: estimated rise, a negative one counting as
+    0; `rise`: source of the distribution of this estimate's error; `unit`: mean flow [m^3/s] for a coefficient of 1;
+    `oil_deviation`: standard deviation of the coefficient that uncertain properties of the oil cause.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

@@ -50,18 +50,17 @@ _NO_BALANCE = {
 }
 #: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"
-#: Time that is longer than any machine is recorded [s].
+#: Time that is longer than the life of any machine [s].
 _MAX_AGE_S = 1e11
 #: Minimum number of healthy recordings whose scatter shows whether valves cut the pump off at rest.
 MIN_FOR_SCATTER = 3
 
 
 def compensates_leakage(balance: RecordedBalance) -> bool:
-    """Return True if the pump replaces the oil that leaks, so that the volume balance shows the leakage.
+    """Return True if the pump replaces the oil that leaks, as a control loop holds the piston or returns it.
 
-    The pump does so if a control loop holds the piston or returns it. The balance then shows at least the leakage of
-    the pump itself: the lower end of the 95 % interval of the leakage must exceed the fraction `held.share`
-    (`priors.toml`) of the pump's mean flow.
+    The balance then shows at least the leakage of the pump itself: the lower end of the 95 % interval of the leakage
+    must exceed the fraction `held.share` (`priors.toml`) of the pump's mean flow.
     """
     min_fraction: float = INFERENCE.held.share
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
@@ -131,8 +130,8 @@ class VolumeBalance:
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, without a position or without a flow.
 
-        Only balances of a load behind shut valves, or of a pump that replaces the leakage (`compensates_leakage`), are
-        considered (`cycle_balances`). Return None if there is no such balance.
+        It is one of a load behind shut valves, or of a pump that replaces the leakage (`compensates_leakage`). Return
+        None if there is no such balance.
         """
         balances = compute_once(
             recording, (self.name, self.rig), lambda samples: cycle_balances(samples, self.rig), READ
@@ -145,19 +144,13 @@ class VolumeBalance:
         return min(usable, key=lambda candidate: BalanceLeak(candidate).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks for a volume balance with a position, only once for each recording.
-
-        Return None if the channels or the length of the recording allow no such balance.
-        """
+        """Compute the blocks for a volume balance with a position, once for each recording; None if it allows none."""
         if not equations(self.rig, frozenset(recording.channels)):
             return None
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
     def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the volume balance of a recording from its blocks under one assumption on the valves at rest.
-
-        `regime`: these blocks, either for open or for shut valves while the pump rests.
-        """
+        """Build the volume balance of a recording from its blocks for open or for shut valves while the pump rests."""
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording,
@@ -191,32 +184,29 @@ class VolumeBalance:
         balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:
             return None
-        scale = balance.size.scale if balance.size.stated else 0.0
-        summary = {name: value for name, value in balance.recording_sums._asdict().items() if value is not None}
+        summary = {
+            "terms": list(balance.columns[0].names),
+            "scale": balance.size.scale if balance.size.stated else 0.0,
+            "stroke": balance.recorded_stroke,
+            "creep_odds": balance.creep_log_odds() if balance.is_creep else None,
+            **balance.recording_sums._asdict(),
+        }
         if recorded is not None:
             summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
-        if balance.recorded_stroke is not None:
-            summary["stroke"] = np.array(balance.recorded_stroke)
         if recorded is not None and recorded.shut is not None:
             shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
-            if shut_sums.held is not None and hold_odds is not None:
-                summary |= {"held": shut_sums.held, "held_odds": hold_odds}
-                if shut_sums.held_pump is not None:
-                    summary["held_pump"] = shut_sums.held_pump
-        if balance.is_creep:
-            summary["creep_odds"] = balance.creep_log_odds()
-        return {"terms": list(balance.columns[0].names), "scale": scale, **summary}
+            summary |= {"held": shut_sums.held, "held_odds": hold_odds, "held_pump": shut_sums.held_pump}
+        return {name: value for name, value in summary.items() if value is not None}
 
     def predict_rise(self, summaries: Sequence[Summary], channels: frozenset[str], n_repeats: int = 1) -> Rise:
         """Predict the distribution of the rise [m^3/(s Pa)] that a healthy recording of a later day will seem to show.
 
         The rise is the leakage of a recording minus that of the healthy recordings with the given `summaries`
-        (`learn`). Without a leak it scatters about 0, by differences between days and errors of the estimates; a leak
-        must exceed this scatter. The later recording is taken to have the Gram matrices of the first healthy one, and
-        the median flow and pressure. `channels`: channels of the recordings; `n_repeats`: number of times that each
-        healthy recording counts, as if it were repeated on later days.
+        (`learn`). The later recording is taken to have the Gram matrices of the first healthy one, and the median flow
+        and pressure. `channels`: channels of the recordings; `n_repeats`: number of times that each healthy recording
+        counts, as if it were repeated on later days.
         """
         shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
         healthy = [_sums_from_summary(summary, shut) for summary in summaries]
@@ -230,10 +220,9 @@ class VolumeBalance:
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
         """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
 
-        The prior log odds are `rest.valves` (`priors.toml`). Each recording adds the log odds that follow from its
-        leakage at rest and in motion (`regimes.shut_odds`). The right assumption on the valves also makes the estimated
-        leakage scatter less: n recordings (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if the pump is
-        connected / scatter if it is cut off).
+        Each recording adds those from its leakage at rest and in motion (`regimes.shut_odds`) to the prior log odds
+        `rest.valves` (`priors.toml`). The right assumption on the valves also makes the estimated leakage scatter less:
+        n recordings (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if open / scatter if shut).
         """
         with_rests = [summary for summary in summaries if "shut_sums" in summary]
         odds = float(INFERENCE.rest.valves + _sum_log_odds(with_rests, "shut_odds"))
@@ -247,11 +236,7 @@ class VolumeBalance:
         return odds + (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
 
     def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the column roles of each volume balance of the recorded channels, for open or `shut` valves.
-
-        If the channels allow no balance with a position and a flow, it is that of a load held by valves (`locked`), if
-        they allow this; a balance over cycles (`circulation`) is not among them.
-        """
+        """Return the column roles of each volume balance of channels with a position, for open or `shut` valves."""
         balances = equations(self.rig, channels)
         if not balances and (hold_balance := locked(self.rig, channels)) is not None:
             balances = (hold_balance,)
@@ -282,8 +267,7 @@ class VolumeBalance:
         if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, locked=is_locked, known_stroke=_joint_stroke(summaries))
-        # terms of the leakage of a pump that turns or holds the load; the balance has them only if valves cut the pump
-        # off at rest, and the summaries do not list them
+        # the summaries list the terms without those that only a balance for shut valves has
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
         healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
@@ -293,10 +277,9 @@ class VolumeBalance:
         return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
     def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Report on a recording without a baseline, for each assumption on the valves while the pump rests.
+        """Report on a recording without a baseline, with open valves (False) and, if the pump rests, shut ones (True).
 
-        The key True stands for valves that cut the pump off (missing if it never rests), False for open valves. Empty
-        without a balance.
+        Empty without a balance.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
@@ -307,13 +290,11 @@ class VolumeBalance:
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
-        """Make the report of a volume balance: test results, leakage, and the judged part of the recording.
+        """Report on a volume balance: test results, leakage, and the judged part of the recording.
 
-        `Observed.share` is the fraction of the samples that were used, `Observed.judged_until` the end of the last
-        block with used samples, as a fraction of the recording. The leakage is tested for a step within the recording
-        and compared with that of the `healthy` recordings, if there are any; in a single balance with a position, the
-        motion (`compare_motion`) and the rivals of a leak (`rival_rises`) are, too. If neither is possible, the report
-        states only the reason.
+        The leakage is tested for a step within the recording and compared with that of the `healthy` recordings; in a
+        single balance with a position, the motion (`compare_motion`) and the rivals of a leak (`rival_rises`) are, too.
+        If neither is possible, the report states only the reason.
         """
         leak, rows = BalanceLeak(balance, healthy), balance.blocks.rows
         if leak.step is None and leak.rise is None:
@@ -341,25 +322,23 @@ class VolumeBalance:
 def compare_motion(
     judged_sums: RecordingSums, healthy: Sequence[RecordingSums], roles: ColumnRoles
 ) -> Iterator[Observable]:
-    """Test the ratio of the pump's flow to the piston's speed for a change from the healthy recordings.
+    """Test the ratio of the pump's flow, without leakage, to the piston's speed for a change from healthy recordings.
 
-    Leakage is not part of this flow. Yields the result of the test, or nothing if there are too few healthy recordings.
-    A change means that the recording is from another machine, or that the scale of a sensor has changed. A load or
-    speed outside of the range of the healthy recordings makes the comparison less certain. `roles`: roles of the
+    Yields the result, or nothing for too few healthy recordings. A change means another machine, or another scale of a
+    sensor. A load or speed outside of the healthy range makes the comparison less certain. `roles`: roles of the
     columns of the volume balance.
     """
     prior, healthy_sums = INFERENCE.repeats, np.sum([recording.sums[0] for recording in healthy], axis=0)
-
-    def estimate(sums: RecordingSums) -> Estimate:
-        """Estimate log(ratio of flow to speed in the recording `sums` / ratio in the healthy ones), with its error."""
-        return Estimate(*motion_change(sums.sums[0], healthy_sums, roles))
-
+    # logarithm of the ratio over that of all healthy recordings together
+    judged, *healthy_estimates = (
+        Estimate(*motion_change(sums.sums[0], healthy_sums, roles)) for sums in (judged_sums, *healthy)
+    )
     excess = sum(condition.log_excess for condition in find_unusual_conditions(judged_sums, healthy))
     observable = compare_estimates(
         name="motion",
         data="motion",
-        judged=estimate(judged_sums),
-        healthy=[estimate(sums) for sums in healthy],
+        judged=judged,
+        healthy=healthy_estimates,
         prior=PriorScatter(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
@@ -368,10 +347,10 @@ def compare_motion(
 
 
 def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Array:
-    """Add the log odds of all healthy recordings that the recorded flow has the right sign, for each balance equation.
+    """Add the log odds of all healthy recordings that the recorded flow has the right sign, (`n_balances`,).
 
-    A machine has `n_balances` equations; `summaries` with another number are omitted. The sums are limited, since the
-    sensor may have been reversed since these recordings (`sense.rewired` of `priors.toml`).
+    `summaries` with another number of balances are omitted. The sums are limited, since the sensor may have been
+    reversed since these recordings (`sense.rewired` of `priors.toml`).
     """
     recorded = (summary.get("sign_log_odds", ()) for summary in summaries)
     total = sum((values for values in recorded if len(values) == n_balances), start=np.zeros(n_balances))
@@ -402,16 +381,15 @@ def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
-    """Return the start of a recording [s since 1970], postponed by `n_ages` times a long time (`_MAX_AGE_S`).
+    """Return the start of a recording [s since 1970], postponed by `n_ages` lives of a machine; None if undated.
 
-    This time is longer than the life of any machine, so that copies with different `n_ages` count as recordings of
-    different days. Return None for an undated recording.
+    Copies with different `n_ages` thus count as recordings of different days.
     """
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
 def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the sums of a healthy recording, such as Gram matrices and mean flow, from its summary (`learn`).
+    """Restore the sums of a healthy recording from its summary (`learn`).
 
     `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest. These have additional
     columns for the pump's leakage, which are added here if the recording has no rests. `locked`: true to include the

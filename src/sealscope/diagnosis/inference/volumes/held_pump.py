@@ -7,9 +7,7 @@ time nearly all of the pump's flow q leaks. In the time `held_oil.before` (`prio
 
 with the speed v of the piston. The conductance G, the area A and the compliance C are the same in all holds of a
 recording. The fit is robust, since the pump's flow falls within the last tenth of a second while the valves shut. G
-contains every leak of the loaded side. The leaks past the piston and to the outside, which the holds themselves
-measure, are subtracted; the rest is the pump's own leakage. Called from `volumes.recorded`; compared with healthy
-recordings in `volumes.rivals`.
+contains every leak of the loaded side; without those that the holds measure, it is the pump's own.
 """
 
 from __future__ import annotations
@@ -37,10 +35,9 @@ def estimate_pump_leakage(
 ) -> Estimate | None:
     """Estimate the leakage conductance of the pump [m^3/(s Pa)] from the time just before each hold.
 
-    `pumped` (n - 1,): volume that the pump delivers between the samples of the recording [m^3]; `holds`: holds of the
-    recording, in which shut valves hold the load; `leaks`: leaks measured in the holds. The leak past the piston and
-    the external leak of the loaded side are subtracted. Return None for fewer than two holds or `MIN_SAMPLES` samples,
-    without any flow or pressure, or if the result is not finite.
+    `pumped` (n - 1,): volume that the pump delivers between the samples of the recording [m^3]; `leaks`: leaks measured
+    in the holds, of which those past the piston and to the outside from the loaded side are subtracted. Return None for
+    fewer than two holds or `MIN_SAMPLES` samples, without any flow or pressure, or if the result is not finite.
     """
     rate, t = recording.rate, 0.5 * (recording.t[1:] + recording.t[:-1])
     difference = recording["p_A"] - recording["p_B"]

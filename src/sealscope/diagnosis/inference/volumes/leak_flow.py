@@ -4,16 +4,16 @@ A step of the leak's conductance is fitted at each possible onset, with each law
 each growth after the onset: a seal that continues to wear leaks more towards the end, and a leak may grow from nothing.
 The flow is a mixture over them, weighted by likelihood and prior (`estimate_step_flow`).
 
-If a leak began or grew within the recording, the rise over healthy recordings contains only a part of it, since the
-blocks after the onset have only a part of the information. `fit_rise` therefore estimates the flow from the rise and
-from the changes within the recording together, and bounds it if no leak is found.
+If a leak began or grew within the recording, the rise over healthy recordings contains only a part of it. `fit_rise`
+therefore estimates the flow from the rise and from the changes within the recording together, and bounds it if no leak
+is found.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,16 +55,14 @@ def _step_growths() -> list[tuple[float, float]]:
     `growth.from_nothing` (`priors.toml`) of the probability of all leaks that grow.
     """
     from_nothing: float = INFERENCE.growth.from_nothing
-    steady, *growing = growth_priors()
-    growths = [steady, *((growth, (1.0 - from_nothing) * probability) for growth, probability in growing)]
-    return [*growths, (math.inf, from_nothing * (1.0 - steady[1]))]
+    (no_growth, steady), *growing = growth_priors()
+    growths = [(growth, (1.0 - from_nothing) * probability) for growth, probability in growing]
+    return [(no_growth, steady), *growths, (math.inf, from_nothing * (1.0 - steady))]
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
-    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording.
-
-    `test` counts a prior on the level as one more block before the first (`StepTest.positions`).
-    """
+    """Return the onsets (o,) of `test`, counted in blocks from the start of the recording."""
+    # a prior on the level counts as one more block before the first (`StepTest.positions`)
     return test.positions - float(np.isfinite(leak.level))
 
 
@@ -111,10 +109,9 @@ def _fit_steps(
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
-    It is the mean over combinations of a law (exponent of |p_A - p_B|, `EXPONENTS`), a growth (fraction by which the
-    leak increases from the onset to the end) and an onset, weighted by their likelihood and the prior probability of
-    the growth; its standard error is the standard deviation of their mixture. `leak`: likelihood of the leak's
-    coefficient in the blocks; `test`: step test of this coefficient, whose onsets are used except improbable ones.
+    It is the mean over all combinations of law, growth and onset, weighted by their likelihood and the prior
+    probability of the growth. `leak`: likelihood of the leak's coefficient in the blocks; `test`: step test of this
+    coefficient, whose onsets are used except improbable ones.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
     fits, _ = _fit_steps(blocks, columns, leak, _onset_positions(leak, test)[onsets], onsets)
@@ -127,10 +124,10 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
 class RiseFits(NamedTuple):
     """Leak above healthy recordings under h hypotheses on its onset, growth and law (`fit_rise`).
 
-    `log_weights` (h,): log probabilities, up to a constant; `onsets` (h,): onsets [s], minus infinity for a leak that
-    is older than the recording; `parts` (h,): fraction of the recording after the onset; `flows`, `deviations` (h,):
-    mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if the rise shows the leak, false if
-    it is no evidence. `log_none`: log probability that there is no leak, up to the same constant.
+    `log_weights` (h,), `log_none`: log probabilities of these and of no leak, up to a constant; `onsets` (h,): onsets
+    [s], minus infinity for a leak that is older than the recording; `parts` (h,): fraction of the recording after the
+    onset; `flows`, `deviations` (h,): mean flow after the onset and its standard error [m^3/s]; `by_rise` (h,): true if
+    the rise shows the leak, false if it is no evidence.
     """
 
     log_weights: Array
@@ -140,11 +137,6 @@ class RiseFits(NamedTuple):
     deviations: Array
     by_rise: NDArray[np.bool_]
     log_none: float
-
-    def join(self, fits: Sequence[RiseFits]) -> RiseFits:
-        """Return the hypotheses of all `fits`, one after the other, with the `log_none` of this one."""
-        joined: Any = {name: np.concatenate([getattr(fit, name) for fit in fits]) for name in self._fields[:-1]}
-        return self._replace(**joined)
 
     @property
     def flow(self) -> Estimate:
@@ -197,39 +189,34 @@ def fit_rise(
     - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
       in the blocks; `weights` (K,): weight of each block in the rise (`coefficients.block_weights`); `test`: step test
       of the coefficient, None if the leak can only be older than the recording;
-    - `rise`: mean rise of the coefficient over the recording, and its standard deviation [m^3/(s Pa)];
+    - `rise`: mean rise of the coefficient over the recording [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
     - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, except an older one under the first law.
 
-    With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. Three
-    sources determine s:
-
-    - The changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of
-      the leak to no leak (`step_sizes`).
-    - The flow has a half-normal prior, whose scale is the fraction `size.usual` (`priors.toml`) of the pump's flow; S
-      is the coefficient of a leak with this flow. s'' and e'' are mean and standard deviation of s by this prior and
-      s'.
-    - The rise r, with the standard deviation d, measures f s, where f is the sum of the weights times c_k.
+    With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. The
+    changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of the
+    leak to no leak (`step_sizes`). The flow has a half-normal prior, whose scale is the fraction `size.usual`
+    (`priors.toml`) of the pump's flow; S is the coefficient of such a leak, and s'' and e'' are mean and standard
+    deviation of s by this prior and s'. The rise r, with the standard deviation d, measures f s, where f is the sum of
+    the weights times c_k.
 
     N(x; v) is the density of a normal distribution with the variance v, R the rise by an older leak of the usual flow,
-    p = `size.present` the prior probability of a leak, and q = `size.within` that of its onset within the recording,
-    each onset being as probable. The weights of the hypotheses, up to a common factor and those of law and growth, are
-    as follows, without the factor 2 of the half-normal density; those of leaks are also multiplied by the probability
-    that the flow is positive.
+    p = `size.present` the prior probability of a leak, and q = `size.within` that of its onset within the recording, 0
+    without a step test, each onset being as probable. Up to the factors of law and growth, and for leaks of the
+    probability of a positive flow, the weights of the hypotheses are
 
-        leak within the recording: q exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
-        older leak:                (1 - q) N(r; d^2 + R^2),
-        no leak:                   N(r; d^2) (1 - p) / (2 p).
+            leak within the recording: q exp(L) sqrt(2 pi) e N(s'; S^2 + e^2) N(r - f s''; d^2 + f^2 e''^2),
+            older leak:                (1 - q) N(r; d^2 + R^2),
+            no leak:                   N(r; d^2) (1 - p) / (2 p).
 
-    The flow of an older leak follows from the rise alone. Without a step test q is 0. With the small probability 2
-    `scatter.tail` the rise is no evidence, as the recording is like none that the healthy ones predict. Its density is
-    then 1 / R, and only s'' and e'' give the flow.
+    The flow of an older leak follows from the rise alone. With the small probability 2 `scatter.tail` the rise is no
+    evidence, as the recording is like none that the healthy ones predict. Its density is then 1 / R, and only s'' and
+    e'' give the flow.
     """
     from scipy.special import log_ndtr
 
     unit_flows, law_log_weights = np.array(laws).T
-    ones = np.ones(len(laws))
     usual_flow = INFERENCE.size.usual * max_flow
     usual_rises = usual_flow / unit_flows
     log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
@@ -240,10 +227,9 @@ def fit_rise(
     log_none += float(normal_log_density(rise.value, rise.deviation**2))
     if test is not None:
         log_weights = log_weights + math.log(1.0 - within)
-    flows, deviations = rise.value * unit_flows, rise.deviation * unit_flows
-    # onsets: before the recording; parts: all of it; by_rise: true
-    older = RiseFits(log_weights, -np.inf * ones, ones, flows, deviations, ones > 0.0, log_none)
-    fits = [older]
+    ones = np.ones(len(laws))
+    # hypotheses in the order of the fields of `RiseFits`; first a leak that is older than the recording, under each law
+    fits = [(log_weights, -np.inf * ones, ones, rise.value * unit_flows, rise.deviation * unit_flows, ones > 0.0)]
     if test is not None:
         positions = _onset_positions(leak, test)
         step_fits, part_after = _fit_steps(blocks, columns, leak, positions, np.arange(len(positions)))
@@ -252,13 +238,14 @@ def fit_rise(
             combined = _combine_with_rise(step_fit, rise, usual_flow, usual_rise, weights)
             log_prior = law_log_weights[step_fit.law] + math.log(within / len(positions))
             for by_rise, (likelihoods, flows, deviations) in zip((True, False), combined, strict=True):
-                flags, log_weights = np.full(len(positions), by_rise), log_prior + likelihoods
-                fits.append(RiseFits(log_weights, test.onsets, part_after, flows, deviations, flags, log_none))
-    fit = older.join(fits)
-    log_weights = fit.log_weights + log_ndtr(fit.flows / np.maximum(fit.deviations, _TINY))  # probability of a flow > 0
-    is_excluded = np.abs(fit.flows) > max_flow
+                flags = np.full(len(positions), by_rise)
+                fits.append((log_prior + likelihoods, test.onsets, part_after, flows, deviations, flags))
+    log_weights, onsets, parts, flows, deviations, flags = map(np.concatenate, zip(*fits, strict=True))
+    log_weights += log_ndtr(flows / np.maximum(deviations, _TINY))  # probability of a flow > 0
+    is_excluded = np.abs(flows) > max_flow
     is_excluded[0] = False  # the older leak under the first law always counts, so that a hypothesis remains
-    return fit._replace(log_weights=np.where(is_excluded, -np.inf, log_weights))
+    log_weights[is_excluded] = -np.inf
+    return RiseFits(log_weights, onsets, parts, flows, deviations, flags, log_none)
 
 
 def _combine_with_rise(
@@ -267,9 +254,9 @@ def _combine_with_rise(
     """Combine a step, fitted to the changes within the recording, with the rise over healthy recordings (`fit_rise`).
 
     `usual_flow`: scale of the prior on a leak's flow [m^3/s]; `usual_rise`: rise of the conductance by such a leak, if
-    it is older than the recording; `weights` (K,): weights of the blocks in the rise. Yields two triples of arrays
-    (o,): log weight of each onset, without the priors of law and onset, mean flow after it, and the flow's
-    standard error [m^3/s]. In the first the rise is evidence of the step, in the second it is not.
+    it is older than the recording; `weights` (K,): those of `fit_rise`. Yields two triples of arrays (o,): log weight
+    of each onset, without the priors of law and onset, mean flow after it, and the flow's standard error [m^3/s]. In
+    the first the rise is evidence of the step, in the second it is not.
     """
     unit_flow = np.maximum(fit.unit_flow, MIN_UNIT * float(fit.unit_flow.max()))  # 0 where no pressure is known
     prior_deviation = usual_flow / unit_flow  # of the coefficient

@@ -74,12 +74,9 @@ LOST_FLOW_TIME = 0.05
 
 
 class Size(NamedTuple):
-    """Factor from flows computed with the machine's assumed sizes to its true flows.
+    """Factor `scale` from flows computed with the machine's assumed sizes to its true flows.
 
-    The sizes are the pump's displacement, or the piston's areas behind a servo valve and for a load that shut valves
-    hold. With a flow meter no size is needed.
-
-    - `scale`, `deviation`: the factor, and its relative standard deviation.
+    - `deviation`: relative standard deviation of the factor.
     - `stated`: true if flows can be stated in L/min. The pressures must have units, and a flow meter must be recorded
       or the rig's file must state the size.
     - `ratio`: measured over assumed ratio of displacement to area, None if it is not measured.
@@ -99,8 +96,8 @@ class Size(NamedTuple):
 class RecordedBalance:
     """Volume balance of a recording, and the estimates that follow from it.
 
-    - `blocks`: blocks of the recording with the Gram matrices of the balance.
-    - `equations`, `columns`: the balances, behind a servo valve one for each chamber, and the roles of their columns.
+    - `blocks`, `equations`, `columns`: blocks with the Gram matrices of the balances, of which there is one or, behind
+      a servo valve, one for each chamber; and the roles of their columns.
     - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
     - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
@@ -120,11 +117,6 @@ class RecordedBalance:
     known_stroke: tuple[float, float] | None = None
 
     @property
-    def units(self) -> frozenset[tuple[str, str]]:
-        """Pairs (name, unit) of all recorded channels, such as ("x", "m")."""
-        return frozenset(self.recording.units.items())
-
-    @property
     def is_creep(self) -> bool:
         """True if the balance's flow is the creep of a load that valves hold, since no pump's flow is known."""
         return self.equations[0].name == LOCKED
@@ -133,10 +125,9 @@ class RecordedBalance:
     def _first_motion(self) -> int:
         """Index of the first block tested for steps: the first moving one, or the first after the machine's start.
 
-        The later of the two counts; the index is 0 if too few blocks would remain. The machine starts with the flow of
-        its pump or, behind a servo valve (two balances), with the motion of the piston. In a balance without a position
-        or a flow (`balances.circulation`, `balances.locked`) the first moving block counts. A step test needs
-        `MIN_BLOCKS` blocks.
+        The later of the two counts. The machine starts with the flow of its pump or, behind a servo valve (two
+        balances), with the motion of the piston. Without a position or a flow its start is not known. The index is 0 if
+        too few blocks would remain.
         """
         first = int(np.argmax(self.blocks.is_moving))
         if self.equations[0].name == CYLINDER or len(self.equations) > 1:
@@ -151,7 +142,7 @@ class RecordedBalance:
     def running_blocks(self) -> Blocks:
         """Blocks from the first motion on, which are tested for steps.
 
-        Before that, the machine may be off; if its pump then begins to hold the load, its flow rises without a leak.
+        Before that, the machine may be off: when its pump begins to hold the load, the flow rises without a leak.
         """
         return self.blocks[self._first_motion :]
 
@@ -178,8 +169,7 @@ class RecordedBalance:
     def _leak_and_test(self) -> tuple[Information, StepTest | None]:
         """Likelihood of the leak's conductance in each of `running_blocks`, and the test for a step of it.
 
-        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`). Both are tested, and the one with
-        the larger p-value is returned, since it is unknown which of them holds for this machine.
+        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`); the larger p-value counts.
         """
         laminar = information(self.running_blocks, self.columns, self.columns[0].leak, with_expansion=True)
         candidates = [
@@ -207,12 +197,7 @@ class RecordedBalance:
 
     @cached_property
     def recording_sums(self) -> RecordingSums:
-        """Summary of the recording for comparison with others.
-
-        It contains the sums of the Gram matrices, the start time and the oil temperature. Where they are known, it also
-        contains the leaks measured in holds, the pump's leakage just before the holds, and the pressure difference that
-        resists the motion (`fit_difference`).
-        """
+        """Summary of the recording for comparison with others; what is not known is None."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
         if self.is_creep:
@@ -228,8 +213,7 @@ class RecordedBalance:
     def chambers(self) -> HeldChambers | None:
         """Estimator of the chambers' leaks from holds: times in which the pump rests and shut valves hold the load.
 
-        None if valves are not known to hold the load (`locked`), if no hold is long and loaded, if the pressures have
-        no unit, or if the areas of the piston are unknown.
+        None without `locked`, without a long and loaded hold, or if pressures have no unit or the areas are unknown.
         """
         sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
@@ -275,9 +259,8 @@ class RecordedBalance:
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the pump's flow [m^3/s] beyond the one that moves the piston, shape (n - 1,), at least 0.
 
-        It is positive while the pump holds a load or compresses oil. Both flows are averaged over `LOST_FLOW_TIME`, and
-        the difference is that of their magnitudes. The flow that moves the piston is its speed times the area of the
-        side with the higher pressure, which carries the load.
+        It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
+        the area of the side with the higher pressure. Both are magnitudes, averaged over `LOST_FLOW_TIME`.
         """
         recording = self.recording
         is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
@@ -289,10 +272,9 @@ class RecordedBalance:
         return np.asarray(np.maximum(flow - displaced, 0.0))
 
     def _is_pump_off(self, hold: LockedHold) -> bool:
-        """Return True if the pump probably rests in a hold, since its mean flow is too small to hold the load.
+        """Return True if the pump's mean flow in a hold is probably too small to hold the load, False if it is missing.
 
         To hold a load, a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
-        The result is False if no flow is recorded in the hold.
         """
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
@@ -302,17 +284,18 @@ class RecordedBalance:
         flow = flow[np.isfinite(flow)]
         if not flow.size:
             return False
-        mean_flow = abs(float(flow.mean()))
         variance = float(flow.var()) / flow.size  # variance of the mean flow
-        holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow
-        # `holding_flow` counts as exact, so that its difference from `mean_flow` has the same variance
-        return rest_log_odds(mean_flow, holding_flow, rest_variance=variance, difference_variance=variance) > 0.0
+        holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow  # counts as exact
+        log_odds = rest_log_odds(
+            abs(float(flow.mean())), holding_flow, rest_variance=variance, difference_variance=variance
+        )
+        return log_odds > 0.0
 
     def _is_loaded(self, hold: LockedHold) -> bool:
         """Return True if p_A - p_B in a hold almost certainly is a load, not the sensors' offset at equal pressures.
 
-        At equal pressures a leak has no flow, so that the hold would not show the leak. The largest abs(p_A - p_B) in
-        the hold or just before it counts, since a large leak equalises the pressures while the valves are shutting.
+        At equal pressures a leak has no flow to show. The largest abs(p_A - p_B) in the hold or just before it counts,
+        since a large leak equalises the pressures while the valves are shutting.
         """
         oil, t = INFERENCE.held_oil, self.recording.t
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
@@ -323,10 +306,9 @@ class RecordedBalance:
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
 
     def _load_log_odds(self, pressure: Array) -> Array:
-        """Compute the log odds (n,) that a load causes abs(p_A - p_B), and not an offset between the two sensors.
+        """Compute the log odds (n,) that a load causes abs(p_A - p_B) = `pressure` (n,) [Pa], not a sensor offset.
 
-        `pressure` (n,): values of abs(p_A - p_B) [Pa]. All loads up to the largest of the recording are equally
-        probable; the offset has the prior of `offset_cost`.
+        All loads up to the largest of the recording are equally probable; the offset has the prior of `offset_cost`.
         """
         # an offset z has the log probability density -offset_cost(z) / 2 - log_offset_norm
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
@@ -338,9 +320,8 @@ class RecordedBalance:
     def locked_log_odds(self, conductance: Interval) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
-        With open valves the leakage in holds would be the total leakage of pump and piston; with shut valves it is
-        smaller. The total leakage is measured just before the holds, at the same pressures. If it is unknown there, it
-        is `conductance` [m^3/(s Pa)], that of the whole recording under the assumption of open valves.
+        With open valves the leakage in holds would be the total leakage of pump and piston. This is measured just
+        before the holds, or else is `conductance` [m^3/(s Pa)], that of the whole recording with open valves.
         """
         if self.chambers is None:
             return None
@@ -357,12 +338,12 @@ class RecordedBalance:
 
         The stroke covers the motion of this recording and of the others that are known (`known_stroke`).
         """
-        area_A, area_B, deviation_A, deviation_B = self._signed_areas()
         if (stroke := self.recorded_stroke) is None:
             return None
         # the dead volumes are beyond the motion of all recordings
         lows, highs = zip(stroke, self.known_stroke or stroke, strict=True)
         low, high = min(lows), max(highs)
+        (area_A, deviation_A), (area_B, deviation_B) = self._signed_areas()
         max_area_ratio: float = INFERENCE.held_oil.unlike
         if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
             return None
@@ -378,18 +359,15 @@ class RecordedBalance:
         low, high = np.quantile(x, (END_QUANTILE, 1.0 - END_QUANTILE))
         return float(low), float(high)
 
-    def _signed_areas(self) -> tuple[float, float, float, float]:
+    def _signed_areas(self) -> list[tuple[float, float]]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        Returns both areas, and the standard deviations of the logarithms of their magnitudes. The areas are negative if
-        the position x is reversed, and zero if nothing moves.
-
-        - Areas in the rig's file are used if they are stated, scaled to the flows of the balance, whose ratio to true
-          flows must be known (`Size.stated`).
-        - Otherwise the area of a side is the mean coefficient of the motion under its load in the volume balance,
-          weighted by the sums of squares of the columns. The main side is the one with more motion in which it surely
-          carries the load. The area of the other side is corrected for motion that may belong to the main side
-          (`log_area_ratio`).
+        Returns for either side the area and the standard deviation of the logarithm of its magnitude. The areas are
+        negative if the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are
+        stated and can be scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of
+        the motion under its load, weighted by the sums of squares of the columns. The main side is the one with more
+        motion in which it surely carries the load. The other area is corrected for motion that may belong to the main
+        side (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -407,24 +385,21 @@ class RecordedBalance:
         other = 1 - main
         deviation: float = INFERENCE.size.area
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
-            sign = float(np.sign(areas[main]))
-            area_A, area_B = (sign * area / self.size.scale for area in (self.rig.cylinder.A_A, self.rig.cylinder.A_B))
-            return area_A, area_B, deviation, deviation
+            sign, cylinder = float(np.sign(areas[main])), self.rig.cylinder
+            return [(sign * area / self.size.scale, deviation) for area in (cylinder.A_A, cylinder.A_B)]
         measured = areas[other] / areas[main] if areas[main] else 0.0  # 0: no information
         # the side that carries the largest load is more probably the one without a rod
         highest = [float(np.nanquantile(self.recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
         log_ratio = log_area_ratio(measured, shares[other], is_larger=highest[other] > highest[main])
         other_area, other_deviation = areas[main] * np.exp(log_ratio.value), np.hypot(deviation, log_ratio.deviation)
         sides = [(areas[main], deviation), (float(other_area), float(other_deviation))]
-        (area_A, deviation_A), (area_B, deviation_B) = sides if main == 0 else sides[::-1]
-        return area_A, area_B, deviation_A, deviation_B
+        return sides if main == 0 else sides[::-1]
 
     def _loaded_shares(self) -> tuple[float, float]:
-        """Compute the fractions of A's and of B's motion under load in which the load is certain.
+        """Compute the fractions of A's and of B's motion under load in which the load is certain (`_load_log_odds`).
 
-        A side counts as loaded while it has the higher pressure. The load is certain if p_A - p_B almost certainly is
-        not an offset of the sensors (`_load_log_odds`). The motion is measured by the sum of squared speeds over the
-        samples. A side that is never loaded has the fraction 0.
+        A side counts as loaded while it has the higher pressure. The motion is measured by the sum of squared speeds
+        over the samples. A side that is never loaded has the fraction 0.
         """
         recording = self.recording
         difference = recording["p_A"] - recording["p_B"] - self.pressure_offset
@@ -443,17 +418,15 @@ class RecordedBalance:
 
     @cached_property
     def position_delay(self) -> Estimate | None:
-        """Time by which the recorded position lags behind the flow [s], with its standard deviation; negative if early.
+        """Time by which the recorded position lags behind the flow [s], negative if it is early.
 
-        It is the coefficient of the term `LAG` [m^2 s] over the measured piston area [m^2]. None if the balance has no
-        such term or no motion, or if the measured area is not positive.
+        It is the coefficient of the term `LAG` [m^2 s] over the measured piston area. None without term or area.
         """
-        roles = self.columns[0]
-        if LAG not in roles.names or self._loaded_area is None:
+        roles, area = self.columns[0], self._loaded_area
+        if LAG not in roles.names or area is None:
             return None
-        area = self._loaded_area.measured
         value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
-        return Estimate(self._loaded_area.sign * value / area, deviation / area) if area > 0.0 else None
+        return Estimate(area.sign * value / area.measured.value, deviation / area.measured.value)
 
     def mean_pressure(self) -> float:
         """Compute the mean of abs(p_A - p_B) [Pa] without the sensor offset."""
@@ -490,30 +463,31 @@ class RecordedBalance:
         - A flow meter or a stated displacement gives the factor 1. If a stated area disagrees with the displacement,
           the difference is the uncertainty.
         - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
-          stated, it is 1, with the uncertainty of both.
-        - Without a measured area the factor is 1, with the uncertainty of meter or displacement.
+          stated, or no area is measured, it is 1.
         """
         rig, is_meter = self.rig, measures_flow(self.recording.units)
         prior, source = INFERENCE.size, flow_source(self.recording.channels)
+        units = self.recording.units
         # the measured area scales even a meter in counts, but not an angle, a speed or a command in counts
-        is_flow_scalable = source in METERS or (source, COUNTS) not in self.units
-        has_pressure_unit = not {("p_A", COUNTS), ("p_B", COUNTS)} & self.units
+        is_flow_scalable = source in METERS or units.get(source or "") != COUNTS
+        has_pressure_unit = COUNTS not in (units["p_A"], units["p_B"])
         states_displacement = rig.states("pump.q_b") and is_flow_scalable and source not in METERS
         states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
         if len(self.columns) > 1 or self.is_creep:  # behind a servo valve, or for a load that shut valves hold
             deviation = float(np.hypot(prior.area, prior.creep)) if self.is_creep else prior.area
             return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
-        area = self._loaded_area if ("x", "m") in self.units else None
-        if area is None or not area.measured > 0.0 or not is_flow_scalable:
+        area = self._loaded_area if units.get("x") == "m" else None
+        if area is None or not is_flow_scalable:
             deviation = prior.meter if is_meter else prior.displacement
             return Size(1.0, deviation, stated=(is_meter or states_displacement) and has_pressure_unit)
         if is_meter:
-            return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured)
+            return Size(1.0, prior.meter, stated=has_pressure_unit, area=area.measured.value)
+        value, low, high = area.measured
         # the ratio is inverse to the measured area, so that its lower end follows from the largest area
-        ratio = Interval(*(area.assumed / end for end in (area.measured, area.high, max(area.low, 1e-12))))
+        ratio = Interval(area.assumed / value, area.assumed / high, area.assumed / max(low, 1e-12))
         disagreement = abs(1.0 / ratio.value - 1.0)
         both_deviation = float(np.hypot(prior.displacement, prior.area))
-        size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=area.measured)
+        size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=value)
         if states_displacement:
             disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
             deviation = disagreement if disagrees else prior.displacement
@@ -524,7 +498,7 @@ class RecordedBalance:
 
     @cached_property
     def _loaded_area(self) -> _Area | None:
-        """Piston area of the loaded side, a mean over the directions of motion and the loaded sides; None if unknown.
+        """Piston area, a mean over the directions of motion and the loaded sides; None if unknown or 0.
 
         The balance has one column for each direction and loaded side, with the area as its coefficient. The mean is
         weighted by the sums of squares of the columns.
@@ -536,11 +510,13 @@ class RecordedBalance:
         squares = np.einsum("kii->i", self.blocks.gram[:, 0])[motion]  # sums over all blocks
         weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
         value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
-        sign = -1 if value < 0.0 else 1
-        value, half_width = abs(value), WITHIN_95 * deviation
-        moves_A = [roles.names[k] in motions_of_side(self.equations[0], "A") for k in motion]
-        assumed = np.where(moves_A, cylinder.A_A, cylinder.A_B)
-        return _Area(value, value - half_width, value + half_width, float(weights @ assumed), sign)
+        if not abs(value) > 0.0:
+            return None
+        motions_of_A = motions_of_side(self.equations[0], "A")
+        assumed = [cylinder.A_A if roles.names[k] in motions_of_A else cylinder.A_B for k in motion]
+        half_width = WITHIN_95 * deviation
+        measured = Interval(abs(value), abs(value) - half_width, abs(value) + half_width)
+        return _Area(measured, float(weights @ assumed), sign=-1 if value < 0.0 else 1)
 
     @cached_property
     def conductance(self) -> Interval:
@@ -551,9 +527,8 @@ class RecordedBalance:
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
 
-        A control loop replaces the oil that leaks, so that the piston hardly moves. A displaced flow near zero thus
-        indicates a control loop, and a flow near the leakage of a typical machine indicates creep. The result is 0 if
-        the recording does not determine the flow.
+        A loop replaces the oil that leaks: the piston displaces hardly any flow, not that of a typical machine's
+        leakage. The result is 0 if the recording does not determine the flow.
         """
         holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]  # [m^3/s] of typical leakage
         # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
@@ -578,14 +553,13 @@ class RecordedBalance:
 def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
     """Estimate the logarithm r of the ratio of two piston areas, first side over second, with its standard deviation.
 
-    `measured`: fitted ratio of the areas, without information if it is not positive; the area of the second side is
-    well known. Only a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the
-    second side. Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with
-    the probability `held_oil.sides_told`. Otherwise log w is uniform between 0 and the logarithm of `loaded_share`, the
-    fraction of that motion in which the first side surely carries the load.
-
-    r has a normal prior with the standard deviation `held_oil.sides_deviation`. The prior mean is `held_oil.sides` if
-    the first side is probably the larger one (`is_larger`), else minus this value.
+    `measured`: fitted ratio, without information if it is not positive; the area of the second side is well known. Only
+    a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the second side.
+    Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the
+    probability `held_oil.sides_told`; otherwise log w is uniform between 0 and log `loaded_share`, the fraction of that
+    motion in which the first side surely carries the load. r is normal about `held_oil.sides` if the first side is
+    probably the larger one (`is_larger`), else about minus this value, with the standard deviation
+    `held_oil.sides_deviation`.
     """
     prior = INFERENCE.held_oil
     mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
@@ -606,12 +580,10 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
 class _Area(NamedTuple):
     """Piston area of the loaded side [m^2]: as `measured` by the volume balance, and as `assumed` in the rig's file.
 
-    The measurement uses the assumed displacement or a flow meter. `low`, `high`: 95 % interval of the measured area;
-    `sign`: -1 if the position or the flow is recorded with the opposite sign, which makes the coefficients negative.
+    The measurement uses the assumed displacement or a flow meter. `sign`: -1 if the position or the flow is recorded
+    with the opposite sign, which makes the coefficients negative.
     """
 
-    measured: float
-    low: float
-    high: float
+    measured: Interval
     assumed: float
     sign: int

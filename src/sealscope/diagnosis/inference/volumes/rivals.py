@@ -2,16 +2,15 @@
 
 Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance. The change of
 its coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the changes of
-all other coefficients, including the leak's (`priors.toml`). The scatter of the coefficient among the healthy
-recordings shows which change is normal (`differences`). A leak to the outside and a leak past the piston look nearly
-alike. The likelihood ratio of the two is therefore stated with the observable.
+all other coefficients (`priors.toml`). The scatter of the coefficient among the healthy recordings shows which change
+is normal (`differences`). An external leak and a leak past the piston look nearly alike: the likelihood ratio of the
+two is stated with the observable.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import compress
 
 import numpy as np
 
@@ -44,93 +43,108 @@ def rival_rises(
 ) -> tuple[Observable, ...]:
     """Test for faults other than a leak past the piston that may explain a change since the healthy recordings.
 
-    These rivals of the leak are external leaks, leakage of the turning pump, and free air. The result has one test for
-    each rival that can be compared. Leakages that are measured while shut valves hold the load (`held_rivals`), or just
-    before (`held_pump_rise`), are compared only by these measurements.
+    The result has one test for each rival that can be compared. Leakages that are measured while shut valves hold the
+    load (`held_rivals`), or just before (`held_pump_rise`), are compared only by these measurements.
 
     `columns`: roles of the columns of each balance, the same for all recordings. `volume_ratio`: measured over assumed
     ratio of the piston's area to the pump's displacement, by which prior volumes of air are multiplied. `unit_flows`:
     flow [m^3/s] of an external leak with a conductance of 1 m^3/(s Pa), by the name of its term. A leak without an
     entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
     """
-    names = columns[0].names
-    hold_rivals = held_rivals(judged, healthy, unit_flows)
-    # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
-    turning = (TURNING,) if SPEED_LOSS in names else ()
-    columns_to_test = [k for k, name in enumerate(names) if name in (AIR, *turning) or name.startswith("external leak")]
-    if hold_rivals is not None:
-        columns_to_test = [k for k in columns_to_test if not names[k].startswith("external leak")]
-    laws = compare_laws(judged, healthy, columns)
-    healthy_gram = np.sum([recording.sums for recording in healthy], axis=0)
-    observables = list[Observable]()
+    names, hold_rivals = columns[0].names, held_rivals(judged, healthy, unit_flows)
+    observables = list[Observable | None]()
+    for k, name in enumerate(names):
+        # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
+        if name == TURNING and SPEED_LOSS in names:
+            observables.append(_turning_rise(judged, healthy, columns, k))
+        elif name == AIR:
+            prior_change = INFERENCE.free_air.size * volume_ratio
+            values, error, _ = _compare_changes(judged, healthy, columns, k)
+            *healthy_values, value = values
+            air = compare_with_healthy(AIR, RISE, value, healthy_values, error, prior_change=prior_change)
+            observables.append(_with_log_ratio(air, judged, healthy, columns))
+        elif name.startswith("external leak") and hold_rivals is None:
+            values, error, _ = _compare_changes(judged, healthy, columns, k)
+            *healthy_values, value = values
+            leak = compare_with_healthy(name, RISE, value, healthy_values, error, above=True)
+            leak = None if leak is None else _penalise_size(leak, judged, unit_flows)
+            observables.append(_with_log_ratio(leak, judged, healthy, columns))
+    return (*filter(None, observables), *(hold_rivals or ()))
+
+
+def _compare_changes(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles], tested: int
+) -> tuple[list[float], float, list[RecordingSums]]:
+    """Estimate the change of a coefficient from the healthy recordings, in each of these and in the judged recording.
+
+    A healthy recording is compared with the other healthy ones, and left out if no pressure drives the flow of the
+    tested term. Returns the changes, that of the judged recording last; the part of its standard error that the scatter
+    of the others does not contain (`excess_error`); and the healthy recordings that were compared. `tested`: column of
+    the coefficient.
+    """
+    total = np.sum([recording.sums for recording in healthy], axis=0)
+    change, error = _estimate_change(judged.sums, total, columns, tested)
+    known, values, errors = list[RecordingSums](), list[float](), list[float]()
+    for recording in healthy:
+        healthy_change, healthy_error = _estimate_change(recording.sums, total - recording.sums, columns, tested)
+        if np.isfinite(healthy_error):
+            known.append(recording)
+            values.append(healthy_change)
+            errors.append(healthy_error)
+    return [*values, change], excess_error(error, errors), known
+
+
+def _turning_rise(
+    judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles], tested: int
+) -> Observable | None:
+    """Test the leakage of the turning pump, the coefficient of the column `tested`, for a rise over healthy recordings.
+
+    It describes data of its own, and so does not compete with the leak for the rise of the leakage.
+    """
     pump_rise = held_pump_rise(judged, healthy)
-    for k in columns_to_test:
-        if names[k] == TURNING and pump_rise is not None:
-            observables.append(
-                Observable(
-                    name=TURNING,
-                    data=TURNING_DATA,
-                    score=max(pump_rise.score, 0.0) ** 2,  # a fall does not count
-                    chance=pump_rise.chance,
-                    size=pump_rise.value,
-                )
-            )
-            continue
-        change, error = _estimate_change(judged.sums, healthy_gram, columns, k)
-        # change of each healthy recording from the other healthy ones
-        changes = [_estimate_change(recording.sums, healthy_gram - recording.sums, columns, k) for recording in healthy]
-        is_known = [np.isfinite(healthy_error) for _, healthy_error in changes]
-        changes = list(compress(changes, is_known))  # in the others no pressure drives the flow of this term
-        is_air = names[k] == AIR
-        values = np.array([*(healthy_change for healthy_change, _ in changes), change])
-        # the scatter of the healthy changes contains their own errors already
-        error = excess_error(error, [healthy_error for _, healthy_error in changes])
-        if names[k] == TURNING:
-            turning_columns = [roles.replace_leak(TURNING) for roles in columns]
-            level, _ = coefficient_level(healthy_gram, turning_columns)
-            # levels instead of changes, since the oil's viscosity scales the whole leakage
-            likeliest_oil, *_ = oil_hypotheses([*compress(healthy, is_known), judged])
-            values = _without_oil(level + values, likeliest_oil.thinning)
-        *healthy_values, value = values.tolist()
-        observable = compare_with_healthy(
-            names[k],
-            TURNING_DATA if names[k] == TURNING else RISE,
-            value,
-            healthy_values,
-            error,
-            above=not is_air,  # free air may also decrease
-            prior_change=INFERENCE.free_air.size * volume_ratio if is_air else np.inf,
-        )
-        if observable is None:
-            continue
-        if names[k] == TURNING:  # it describes data of its own, and so does not compete with the leak for the rise
-            turning_rise = rise(judged, healthy, turning_columns)
-            # a rise that warmer oil explains does not count
-            observable = replace(observable, chance=max(observable.chance, turning_rise.chance))
-        else:
-            # rival against a laminar leak, for one independent residual
-            log_ratio = compare_with_leak(judged, healthy, columns, names[k])
-            if log_ratio is not None and laws is not None:
-                log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
-            log_ratio_to_leak = None if log_ratio is None else INFERENCE.size.readings * log_ratio
-            if not is_air:
-                observable = _penalise_size(observable, judged, unit_flows)
-            observable = replace(observable, log_ratio_to_leak=log_ratio_to_leak)
-        observables.append(observable)
-    return (*observables, *(hold_rivals or ()))
+    if pump_rise is not None:  # measured just before valves shut to hold a load
+        score = max(pump_rise.score, 0.0) ** 2  # a fall does not count
+        return Observable(name=TURNING, data=TURNING_DATA, score=score, chance=pump_rise.chance, size=pump_rise.value)
+    changes, error, known = _compare_changes(judged, healthy, columns, tested)
+    turning_columns = [roles.replace_leak(TURNING) for roles in columns]
+    level, _ = coefficient_level(np.sum([recording.sums for recording in healthy], axis=0), turning_columns)
+    # levels instead of changes, since the oil's viscosity scales the whole leakage
+    likeliest_oil, *_ = oil_hypotheses([*known, judged])
+    levels = _without_oil(level + np.array(changes), likeliest_oil.thinning)
+    *healthy_values, value = levels.tolist()
+    observable = compare_with_healthy(TURNING, TURNING_DATA, value, healthy_values, error, above=True)
+    if observable is None:
+        return None
+    # a rise that warmer oil explains does not count
+    return replace(observable, chance=max(observable.chance, rise(judged, healthy, turning_columns).chance))
+
+
+def _with_log_ratio(
+    rival: Observable | None, judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
+) -> Observable | None:
+    """Add the log likelihood ratio of a rival to a leak past the piston, laminar or through an orifice, if known."""
+    log_ratio = None if rival is None else compare_with_leak(judged, healthy, columns, rival.name)
+    if rival is None or log_ratio is None:
+        return rival
+    laws = compare_laws(judged, healthy, columns)
+    if laws is not None:
+        log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
+    return replace(rival, log_ratio_to_leak=INFERENCE.size.readings * log_ratio)  # ratios for one independent residual
 
 
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
     """Remove the effect of the oil's viscosity from leakage coefficients (n + 1,), if healthy ones then scatter less.
 
     `thinning` (n + 1,): logarithm of the factor by which thinner oil raises each coefficient. The last coefficient is
-    that of the judged recording, the others are those of healthy ones, whose scatter is taken relative to their mean.
+    that of the judged recording.
     """
+
+    def relative_scatter(values: Array) -> float:
+        """Compute the standard deviation of the healthy values over their mean."""
+        return float(np.std(values[:-1])) / max(abs(float(values[:-1].mean())), TINY)
+
     corrected = coefficients * np.exp(-thinning)
-    scatters = [
-        float(np.std(values[:-1])) / max(abs(float(values[:-1].mean())), TINY) for values in (coefficients, corrected)
-    ]
-    return corrected if scatters[1] < scatters[0] else coefficients
+    return min(coefficients, corrected, key=relative_scatter)
 
 
 def held_rivals(
@@ -138,9 +152,8 @@ def held_rivals(
 ) -> tuple[Observable, ...] | None:
     """Test chambers A and B for larger external leaks than in healthy recordings, while shut valves hold the load.
 
-    Return one test for each chamber that can be compared (`compare_with_healthy`). Return None if the judged recording
-    has no such holds, or if fewer than `MIN_HEALTHY` healthy recordings have them. `unit_flows`: as in
-    `rival_rises`.
+    Return one test for each chamber that can be compared, None without such holds in the judged recording and in at
+    least `MIN_HEALTHY` healthy ones. `unit_flows`: as in `rival_rises`.
     """
     healthy_leaks = [HeldLeaks(*recording.held) for recording in healthy if recording.held is not None]
     if judged.held is None or len(healthy_leaks) < MIN_HEALTHY:
@@ -163,7 +176,7 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 
     A large external leak is improbable, since someone would have noticed the oil outside. The penalty is 2 log(prior
     density / largest prior density) of the leak's flow, and 0 for flows below the centre of the prior (`outside` in
-    `priors.toml`). `observable`: the test; `unit_flows`: as in `rival_rises`.
+    `priors.toml`). `unit_flows`: as in `rival_rises`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
     return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
@@ -173,10 +186,9 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     """Estimate the change of a coefficient of a recording from healthy recordings, with its standard error.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
-    equations; `columns`: roles of their columns; `tested`: column of the coefficient, which counts as 0 in the healthy
-    recordings. The differences of the other coefficients have normal priors and are eliminated. Except for the leak,
-    columns without a finite prior deviation are left out: `RecordingSums.sums` no longer contain them. Without
-    information the change is 0 and the error infinite.
+    equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The differences of the
+    other coefficients have normal priors and are eliminated. Except for the leak, columns without a finite prior
+    deviation are left out: `RecordingSums.sums` no longer contain them. Without information the result is (0, inf).
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):

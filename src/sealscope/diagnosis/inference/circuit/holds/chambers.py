@@ -13,22 +13,21 @@ with
 - I: time integral of a power of p_A - p_B - z, where z is the sensor offset; I_A, I_B: those of the gauge pressures;
 - p_0: atmospheric pressure.
 
-A leaking piston moves oil from A to B. A leaking rod seal drains one side only: the piston gives way. A check valve may
-fill a side that is at the charge pressure, or the side without the load may be open to the charge line; no balance
+A leaking piston moves oil from A to B; a leaking rod seal drains one side only, and the piston gives way. A check valve
+may fill a side that is at the charge pressure, or the side without the load may be open to the charge line; no balance
 holds for that side then. A reading is the mean of neighbouring samples of a hold (`LockedHold.edges`). The first is of
 the time in which the valves may still shut; it counts only on the side of the lower pressure, whose oil comes through a
-leak alone: a large leak equalises the pressures within that time. The readings of all holds form one regression, each
-side of a hold about its mean. The dead volumes and the logarithms of K and alpha have normal priors (`held_oil` in
-`priors.toml`); the regression is linearised about the estimate, iteratively. Uncertain areas are varied
-(`HeldChambers.area_variants`). The onset of the leak and the offset z are those with the highest posterior; a leak that
-has equalised the pressures determines z. The three leaks are hypotheses, each with its probability. A leak past the
-piston may grow from its onset on.
+leak alone: a large leak equalises the pressures within that time. The readings of all holds form one regression
+(`oil`), each side of a hold about its mean. The onset of the leak and the offset z are those with the highest
+posterior; a leak that has equalised the pressures determines z. The three leaks are hypotheses, each with its
+probability. A leak may grow from its onset on.
 
 Source: Merritt, Hydraulic Control Systems, 1967, section 6.3 (continuity of the chambers).
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -41,20 +40,19 @@ from sealscope.diagnosis.inference.blocks import offset_cost
 from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
 from sealscope.diagnosis.inference.circuit.holds.leaks import (
     BOTH,
-    LAMINAR,
     NEITHER,
     UNKNOWN,
     HeldLeaks,
     LawFit,
     LeakFit,
     LeakHypothesis,
-    LeakLaw,
-    PistonFit,
+    PistonLeak,
     SideSupplies,
     SideSupply,
     UnitLeak,
     average_fits,
     flow_of_side,
+    growth_factor,
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import (
     CylinderSides,
@@ -98,22 +96,21 @@ class HeldChambers:
     charge: float
 
     def area_variants(self) -> list[tuple[float, HeldChambers]]:
-        """Return variants of this estimator with other areas of the less certain side, each with its probability.
+        """Return this estimator with three areas of the less certain side, each with its probability.
 
-        The logarithm of the area takes the three values of the Gauss-Hermite quadrature of its normal distribution. How
-        well a variant fits the holds does not change its probability: errors by delays of the sensors repeat from hold
-        to hold. If both areas are known (`size.area` in `priors.toml`), there is only this estimator.
+        The areas are the Gauss-Hermite quadrature of the normal distribution of the area's logarithm. How well one fits
+        the holds does not count: errors by delays of the sensors repeat from hold to hold. If both areas are known
+        (`size.area` in `priors.toml`), there is only this estimator.
         """
         sides = self.sides
-        if max(sides.deviation_A, sides.deviation_B) <= INFERENCE.size.area:
+        deviation = max(sides.deviation_A, sides.deviation_B)
+        if deviation <= INFERENCE.size.area:
             return [(1.0, self)]
+        name = "area_A" if sides.deviation_A > sides.deviation_B else "area_B"
         variants = []
         for node, probability in zip(AREA_NODES, AREA_WEIGHTS, strict=True):
-            if sides.deviation_A > sides.deviation_B:
-                varied = sides._replace(area_A=sides.area_A * float(np.exp(node * sides.deviation_A)))
-            else:
-                varied = sides._replace(area_B=sides.area_B * float(np.exp(node * sides.deviation_B)))
-            variants.append((probability, replace(self, sides=varied)))
+            area = getattr(sides, name) * math.exp(node * deviation)
+            variants.append((probability, replace(self, sides=sides._replace(**{name: area}))))
         return variants
 
     @property
@@ -135,8 +132,7 @@ class HeldChambers:
         """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
         The leak moves equal volumes from one side to the other, and the piston follows the side that loses oil. If the
-        side that gains oil has the larger area, its volume grows by more than the leak supplies, and the check valve
-        opens. With equal areas neither side is refilled.
+        other side has the larger area, its volume grows by more than the leak supplies, and the check valve opens.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         if area_A == area_B:
@@ -155,8 +151,8 @@ class HeldChambers:
         An open side has the probability `held_oil.open` (`priors.toml`). It is above the charge pressure, by more than
         the back pressure `held_oil.tank` of its line, only while it empties: for the fraction a = `held_oil.above` of a
         hold. Each hold with a larger fraction f multiplies the probability by exp(-(f - a) / a). If check valves keep
-        both sides at their pressure, a side that gains oil must drain to the tank. The charge pressure is then that of
-        a tank line, whose gauge pressure has a normal prior with the mean 0 and the standard deviation `held_oil.tank`.
+        both sides at their pressure, a side that gains oil drains to the tank: the charge pressure is then that of a
+        tank line, which is normal about 0 gauge with the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
@@ -181,15 +177,14 @@ class HeldChambers:
 
     @cached_property
     def _above_charge(self) -> list[NDArray[np.bool_]]:
-        """Flags (2, n) for each hold of n samples, true where A (row 0) or B (row 1) is above the charge pressure."""
+        """Flags (2, n) of the samples of each hold in which A (row 0) or B (row 1) is above the charge pressure."""
         return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
 
     @cached_property
     def _possible_supplies(self) -> list[SideSupplies]:
         """Supplies of A and B that are tried for a leak.
 
-        Check valves are tried if one of their sides is at the charge pressure in some samples, and an open side if it
-        is at this pressure nearly all the time.
+        Check valves are tried if a side is at the charge pressure in some samples, an open side if it nearly always is.
         """
         possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
         if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
@@ -200,43 +195,45 @@ class HeldChambers:
         """Flag the samples in which A (row 0) or B (row 1) is closed, (2, n) for each hold of n samples.
 
         A side is always closed without a supply, never if it is open, and above the charge pressure if a check valve
-        refills it. `supplies`: those of A and B.
+        refills it.
         """
-        is_shut = np.array([supply is SideSupply.SHUT for supply in supplies])[:, None]
-        has_check = np.array([supply is SideSupply.CHECK for supply in supplies])[:, None]
+        is_shut, has_check = (
+            np.array([[supply is kind] for supply in supplies]) for kind in (SideSupply.SHUT, SideSupply.CHECK)
+        )
         return [is_shut | (has_check & flags) for flags in self._above_charge]
 
     def _closed_share(self, supplies: SideSupplies) -> float:
         """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
 
-        `supplies`: as in `_closed_flags`. While a side is not closed, its readings (sample means) fit any leak, so that
-        the variance of all readings is too small by this factor.
+        While a side is not closed, its readings fit any leak: the variance of all readings is too small by this factor.
         """
         share = float(np.concatenate(self._closed_flags(supplies), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
-    def _unit_piston_leak(self, offset: float, supplies: SideSupplies = NEITHER, law: LeakLaw = LAMINAR) -> UnitLeak:
-        """Compute the flow past the piston in each hold for a leak with a coefficient of 1, in Pa^e.
+    def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
+        """Compute the flow past the piston in each hold for a `leak` with a coefficient of 1.
 
-        With the exponent e of the `law` and dp = p_A - p_B - z, the flow out of A is sign(dp) |dp|^e times the law's
-        growth factor, which is 1 until the law's onset (`LeakLaw.growth_factor`). The flow out of B is its negative.
-        The sensor offset z in a hold may differ from the recording's `offset` [Pa] (`LockedHold.driving_pressure`). The
-        flow of a side counts as 0 while the side is not closed (`_closed_flags`).
+        With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`. The sensor offset z
+        in a hold may differ from the recording's (`LockedHold.driving_pressure`).
         """
         flows = []
         for hold in self.holds:
-            difference = hold.driving_pressure(offset)
-            flow = np.sign(difference) * np.abs(difference) ** law.exponent * law.growth_factor(hold.t, self.end)
+            difference = hold.driving_pressure(leak.offset)
+            flow = np.sign(difference) * np.abs(difference) ** leak.exponent
+            flow *= growth_factor(hold.t, leak.growth, leak.onset, self.end)
             flows.append(np.array([flow, -flow]))
+        return self._while_closed(flows, leak.supplies)
+
+    def _while_closed(self, flows: Sequence[Array], supplies: SideSupplies) -> UnitLeak:
+        """Set `flows` (2, n) out of A and B, for each hold of n samples, to 0 while a side is not closed."""
         is_closed = self._closed_flags(supplies)
         return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
 
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
 
-        Outside of holds the sensor offset is the `offset` [Pa] of the recording. From the start of a hold to the end of
-        its rest it is the offset of the hold (`LockedHold.offset_in_hold`). Pressures that a leak has equalised then
-        differ by 0.
+        It is the `offset` [Pa] of the recording or, from the start of a hold to the end of its rest, that of the hold
+        (`LockedHold.offset_in_hold`). Pressures that a leak has equalised then differ by 0.
         """
         prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
         for hold in self.holds:
@@ -246,19 +243,15 @@ class HeldChambers:
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
-        """Compute the flow [Pa] of a laminar leak with a conductance of 1 from A (or B, if not `is_A`) to the outside.
-
-        It is the chamber's gauge pressure, or 0 while the chamber is not closed (`_closed_flags`).
-        """
+        """Compute the flow [Pa] of a leak with a conductance of 1 from A (or B, if not `is_A`): the gauge pressure."""
         pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
         flows = [flow_of_side(np.maximum(p - P_ATM, 0.0), is_A) for p in pressures]
-        is_closed = self._closed_flags(supplies)
-        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
+        return self._while_closed(flows, supplies)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow [Pa] from A (or B, if not `is_A`) through open valves and the pump, for a conductance of 1.
 
-        No flow counts for the other chamber, since check valves or a shuttle valve keep it at the charge pressure.
+        The other chamber has no flow, since check valves or a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
         flows = []
@@ -271,60 +264,49 @@ class HeldChambers:
     @cached_property
     def _fits_without_leak(self) -> dict[SideSupplies, LeakRegression]:
         """Fits of the oil's properties without any leak, by the supplies of A and B."""
-        n_rows = len(self._regressions[NEITHER].displaced)  # the same in all regressions
-        no_columns = np.empty((n_rows, 0))
         return {
-            supplies: fit_leaks(regression, no_columns, self.n_readings)
+            supplies: fit_leaks(regression, np.empty((len(regression.displaced), 0)), self.n_readings)
             for supplies, regression in self._regressions.items()
         }
 
-    def fit_piston_leak(self, conditions: PistonFit, law: LeakLaw = LAMINAR) -> LeakFit:
-        """Fit the coefficient of a leak past the piston, given onset, sensor offset and supplies (`conditions`).
+    def fit_piston_leak(self, leak: PistonLeak) -> LeakFit:
+        """Fit the coefficient of a leak past the piston; the likelihood includes the priors on offset and supplies."""
+        fit = self._fit_leak(self._unit_piston_leak(leak), leak.onset)
+        return fit._replace(log_likelihood=fit.log_likelihood + self._conditions_log_prior(leak))
 
-        The likelihood includes the priors on the sensor offset and on the supplies.
+    def _conditions_log_prior(self, leak: PistonLeak) -> float:
+        """Compute the log prior of a leak's supplies and sensor offset, up to a constant.
+
+        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the recording's
+        (`LockedHold.offset_in_hold`).
         """
-        unit_leak = self._unit_piston_leak(conditions.offset, conditions.supplies, law)
-        fit = self._fit_leak(unit_leak, conditions.onset)
-        log_prior = self._supply_log_prior(conditions.supplies, drains=True)
-        log_prior -= 0.5 * self._offset_cost(conditions.offset)
-        return fit._replace(log_likelihood=fit.log_likelihood + log_prior)
+        offset_costs = [float(offset_cost(leak.offset)), *(hold.offset_in_hold(leak.offset)[1] for hold in self.holds)]
+        return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * sum(offset_costs)
 
-    def start_error(self, conditions: PistonFit, law: LeakLaw) -> float:
+    def start_error(self, leak: PistonLeak) -> float:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
 
-        The coefficient is the volume that has left a chamber, divided by the time integral of the flow u of a leak with
-        a coefficient of 1. A hold starts when its valves are shut. This time is known to within s = `held_oil.settles`
-        (`priors.toml`), and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each
-        hold, the error is
+        The coefficient is the volume that has left a chamber, over the time integral of the flow u of a leak with a
+        coefficient of 1. The time at which the valves shut is known to within s = `held_oil.settles` (`priors.toml`),
+        and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each hold, the error
+        is
 
-            s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds.
-
-        Only the time after the onset (`conditions`) counts: a leak that begins within a hold has no such error there.
+                    s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
         """
         start_flows, integrals = [0.0], [0.0]
         for hold in self.holds:
-            is_after = hold.t >= conditions.onset
-            unit_flow = np.where(is_after, np.abs(hold.driving_pressure(conditions.offset)) ** law.exponent, 0.0)
+            is_after = hold.t >= leak.onset
+            unit_flow = np.where(is_after, np.abs(hold.driving_pressure(leak.offset)) ** leak.exponent, 0.0)
             start_flows.append(float(unit_flow[: hold.edges[1]].max()))
             integrals.append(float(np.trapezoid(unit_flow, hold.t)))
         time_error: float = INFERENCE.held_oil.settles
         return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
-    def _offset_cost(self, offset: float) -> float:
-        """Compute the cost of a sensor offset [Pa]: -2 log of its prior density, up to a constant, plus costs of holds.
-
-        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from `offset`, in
-        standard deviations. A hold that is taken as loaded has the offset `offset` and adds 0
-        (`LockedHold.offset_in_hold`).
-        """
-        return float(offset_cost(offset)) + sum(hold.offset_in_hold(offset)[1] for hold in self.holds)
-
     def leaks_since(self, onset: float) -> Array | None:
-        """Estimate the conductances of three leaks from the holds, each followed by its standard deviation, shape (6,).
+        """Estimate the conductances of three leaks and their deviations, (6,), in the order of `HeldLeaks`.
 
-        They are in the order of `HeldLeaks`. The conductance past the piston is that of a leak since `onset` [s], times
-        the probability of this leak (`piston_leak`); the leaks to the outside are means over the recording. Return None
-        if no hold shows a flow past the piston after the onset.
+        The one past the piston is that of a leak since `onset` [s], times its probability (`piston_leak`); the leaks to
+        the outside are means over the recording. Return None if no hold shows a flow past the piston after the onset.
         """
         fits = self._fits_over_offsets(onset)
         if not fits:
@@ -334,28 +316,22 @@ class HeldChambers:
         return np.array(self.leaks._replace(piston=probable, deviation=leak.deviation))
 
     def _fits_over_offsets(self, onset: float) -> list[LeakFit]:
-        """Fit a leak past the piston since `onset` [s] for several sensor offsets, on which it may depend strongly.
-
-        Fits without any flow are omitted.
-        """
+        """Fit a leak past the piston since `onset` [s] for several sensor offsets, omitting fits without any flow."""
         best = self.piston_fit._replace(onset=onset)
-        fits = [
-            self.fit_piston_leak(best._replace(offset=float(offset))) for offset in (*self._offset_grid, best.offset)
-        ]
+        offsets = (*self._offset_grid.tolist(), best.offset)
+        fits = [self.fit_piston_leak(best._replace(offset=offset)) for offset in offsets]
         return [fit for fit in fits if fit.deviation < UNKNOWN]
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit the coefficient (>= 0) of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if it has no flow."""
         column = self._leak_columns(leak, np.array([onset]))
-        fit_without_leak = self._fits_without_leak[leak.supplies]
-        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, fit_without_leak.variance
+        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, self._fits_without_leak[leak.supplies].variance
         if column.any():
             fit = fit_leaks(self._regressions[leak.supplies], column, self.n_readings)
             # the leak is the only coefficient
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # no leak flows from the lower to the higher pressure
                 value, variance = float(fit.coefficients[0]), fit.variance
-        # readings of a side that is not closed have no residual, so that their variance is too small
         closed_variance = variance / self._closed_share(leak.supplies)
         return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * math.log(closed_variance))
 
@@ -363,18 +339,17 @@ class HeldChambers:
     def onsets(self) -> Array:
         """Possible onsets of a leak [s] in order of time: the beginning of the recording, between holds, within them.
 
-        One onset within each hold is the time at which p_A - p_B changes most, since a large leak equalises the
-        pressures at once.
+        One within each hold is the time at which p_A - p_B changes most, as a large leak equalises the pressures at
+        once.
         """
         lows, highs = self._onset_ranges
         return np.sort(np.concatenate([0.5 * (lows + highs), [hold.steepest_time() for hold in self.holds]]))
 
     @cached_property
     def _onset_ranges(self) -> tuple[Array, Array]:
-        """First and last time [s] that each of g possible onsets stands for, (g,) each.
+        """First and last time [s] that each of g possible onsets, without the steepest times, stands for, (g,) each.
 
-        These are `onsets` without those of the largest pressure change. The beginning of the recording and the evenly
-        spaced onsets within a hold stand for themselves, one between two holds for all times between them.
+        An onset between two holds stands for all times between them, the others for themselves.
         """
         lows, highs = [self.begin], [self.begin]
         for k, hold in enumerate(self.holds):
@@ -389,15 +364,14 @@ class HeldChambers:
     @cached_property
     def _onset_log_priors(self) -> Array:
         """Log prior probability (o,) of each of `onsets`: `held_oil.from_start` for the first; the others are equal."""
-        from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1
-        return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / max(n_later, 1)))))
+        from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1  # each hold has later ones
+        return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / n_later))))
 
     def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
         """Compute the volume lost up to each of r readings through a leak that begins at each of o `onsets`, (r, o).
 
         With the volume V(t) that a leak from the start of the hold has lost, a sample at t shows V(t) - V(onset), or 0
-        before the onset. The readings (sample means) of each hold, side A before side B, are relative to their mean
-        over the hold.
+        before the onset. The rows are those of `build_regression`.
         """
         columns = []
         for hold, sides in zip(self.holds, leak.flows, strict=True):
@@ -417,10 +391,9 @@ class HeldChambers:
     def _onset_posteriors(self, leak: UnitLeak, growth: float = 0.0) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
-        The result is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
+        It is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
         coefficient >= 0, with the properties of the oil eliminated. The variance of the readings weights the priors of
-        the properties: at first the variance without a leak, then the variance with the most probable onset. `growth`:
-        as in `LeakLaw`.
+        these: first without a leak, then with the most probable onset. `growth`: as in `PistonLeak`.
         """
         regression = self._regressions[leak.supplies]
         variance, n_rows = self._fits_without_leak[leak.supplies].variance, len(regression.displaced)
@@ -431,13 +404,11 @@ class HeldChambers:
         return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
 
     def _growing_leak_columns(self, leak: UnitLeak, growth: float) -> Array:
-        """Compute the volume lost up to each of r readings (`_leak_columns`) for each of `onsets` of a leak that grows.
+        """Compute the volume lost up to each of r readings through a leak that grows from each of `onsets`, (r, o).
 
         With the relative growth g from the onset s to the end e of the recording, the flow u of the leak becomes
 
-            (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
-
-        The result has the shape (r, o).
+                    (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
         """
         columns = self._leak_columns(leak, self.onsets)
         if not growth:
@@ -451,122 +422,101 @@ class HeldChambers:
     def _offset_grid(self) -> Array:
         """Candidates for the sensor offset of p_A - p_B [Pa], sorted: a fixed grid and the last reading of each hold.
 
-        If a leak has equalised the pressures by the end of a hold, the offset is the recorded p_A - p_B.
+        The latter is the offset if a leak has equalised the pressures by then.
         """
         ends = [hold.mean(hold.difference)[-1] for hold in self.holds]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
-    def piston_fits(self) -> dict[float, PistonFit]:
-        """Most probable onset and sensor offset for a leak past the piston, by the exponent of the leak's law."""
-        return {exponent: self._find_piston_fit(exponent) for exponent in EXPONENTS}
+    def piston_fits(self) -> list[PistonLeak]:
+        """Most probable leak past the piston, without growth, for each exponent of `EXPONENTS`."""
+        return [self._find_piston_fit(exponent) for exponent in EXPONENTS]
 
     @property
-    def piston_fit(self) -> PistonFit:
-        """Most probable onset and sensor offset for a laminar leak past the piston."""
-        return self.piston_fits[1.0]
+    def piston_fit(self) -> PistonLeak:
+        """Most probable laminar leak past the piston, without growth."""
+        return self.piston_fits[0]
 
-    def _find_piston_fit(self, exponent: float) -> PistonFit:
-        """Find the most probable onset, sensor offset and supplies of the sides for a leak past the piston.
+    def _find_piston_fit(self, exponent: float) -> PistonLeak:
+        """Find the most probable onset, sensor offset and supplies for a leak past the piston with an `exponent`.
 
         They have the highest joint posterior probability, on a grid of onsets and a grid of offsets that is refined
-        once, for each possible choice of the supplies (`_supply_log_prior`). `exponent`: as in `LeakLaw`.
+        once, for each possible choice of the supplies.
         """
-        grid, fits = self._offset_grid, list[tuple[float, PistonFit]]()
+        grid, fits = self._offset_grid, list[tuple[float, PistonLeak]]()
         for supplies in self._possible_supplies:
-            posteriors = [self._find_onset(float(offset), supplies, exponent)[0] for offset in grid]
-            best = int(np.argmax(posteriors))
+            leak = PistonLeak(exponent, supplies=supplies)
+            coarse_fits = [self._find_onset(leak._replace(offset=offset)) for offset in grid.tolist()]
+            best = int(np.argmax([posterior for posterior, _ in coarse_fits]))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
-            fits += [self._find_onset(float(offset), supplies, exponent) for offset in (*refined, grid[best])]
+            fits += [self._find_onset(leak._replace(offset=offset)) for offset in refined.tolist()]
+            fits.append(coarse_fits[best])
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
-    @cached_property
-    def _law_onsets(self) -> dict[tuple[float, float], Array]:
-        """Log posteriors (o,) of all `onsets` by the law of a leak past the piston: its exponent and its growth.
+    def _find_onset(self, leak: PistonLeak) -> tuple[float, PistonLeak]:
+        """Find the most probable onset of a `leak` with given offset and supplies; return its log posterior first."""
+        posteriors = self._onset_posteriors(self._unit_piston_leak(leak))
+        index = int(posteriors.argmax())
+        # the variance of readings, which is too small by this share, must be no evidence for sides that are not closed
+        correction = 0.5 * self.n_readings * math.log(self._closed_share(leak.supplies))
+        log_posterior = float(posteriors[index]) + self._conditions_log_prior(leak) + correction
+        return log_posterior, leak._replace(onset=float(self.onsets[index]))
 
-        Each includes the priors of law and growth. Sensor offset and supplies are those of `piston_fits`.
+    @cached_property
+    def _laws(self) -> list[tuple[PistonLeak, float, Array]]:
+        """Leak past the piston under each law, the law's log prior, and the log posteriors (o,) of all `onsets`.
+
+        A law is an exponent (`law_priors`) and a growth (`growth_priors`), with its own most probable onset. Sensor
+        offset and supplies are those of `piston_fits`.
         """
-        posteriors = dict[tuple[float, float], Array]()
-        for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
-            leak = self._unit_piston_leak(conditions.offset, conditions.supplies, LeakLaw(exponent))
+        laws = []
+        for leak, law_prior in zip(self.piston_fits, law_priors(), strict=True):
+            unit_leak = self._unit_piston_leak(leak)
             for growth, growth_prior in growth_priors():
-                log_prior = float(np.log(law_prior * growth_prior))
-                posteriors[exponent, growth] = log_prior + self._onset_posteriors(leak, growth)
-        return posteriors
+                log_prior = math.log(law_prior * growth_prior)
+                posteriors = log_prior + self._onset_posteriors(unit_leak, growth)
+                onset = float(self.onsets[posteriors.argmax()])
+                laws.append((leak._replace(growth=growth, onset=onset), log_prior, posteriors))
+        return laws
 
     @cached_property
     def law_fits(self) -> list[LawFit]:
-        """Fits of a leak past the piston for each law (exponent of `EXPONENTS`) and growth after its onset.
+        """Fits of a leak past the piston for each law (exponent and growth); the first is laminar without growth."""
+        fits = [(leak, self.fit_piston_leak(leak), log_prior) for leak, log_prior, _ in self._laws]
+        return [LawFit(leak, fit, fit.log_likelihood + log_prior) for leak, fit, log_prior in fits]
 
-        Each has its own most probable onset. The weight of a fit is its likelihood times the priors of law and growth
-        (`law_priors`, `growth_priors`).
-        """
-        fits = []
-        for growth, growth_prior in growth_priors():
-            for (exponent, conditions), law_prior in zip(self.piston_fits.items(), law_priors(), strict=True):
-                onset = float(self.onsets[int(self._law_onsets[exponent, growth].argmax())])
-                law, law_conditions = LeakLaw(exponent, growth, onset), conditions._replace(onset=onset)
-                fit = self.fit_piston_leak(law_conditions, law)
-                log_weight = fit.log_likelihood + float(np.log(growth_prior * law_prior))
-                fits.append(LawFit(law, law_conditions, fit, log_weight))
-        return fits
+    def _fit_growing_leak(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
+        """Fit a leak that is not past the piston and may grow, and return the fit with the index of its onset.
 
-    def _fit_over_supplies(self, leaks: Sequence[UnitLeak]) -> tuple[LeakFit, int]:
-        """Fit a leak that is not past the piston and may grow, under each possible choice of the sides' supplies.
-
-        `leaks`: flows of this one leak, for each choice. Returns the most probable fit and the index of its onset in
-        `onsets`. The likelihood of the fit is replaced by the sum over all choices, each times its prior probability.
-        """
-        fits = [self._fit_growing_leak(leak) for leak in leaks]
-        log_priors = [self._supply_log_prior(leak.supplies, drains=False) for leak in leaks]
-        log_weights = [fit.log_likelihood + prior for (fit, _), prior in zip(fits, log_priors, strict=True)]
-        fit, index = fits[int(np.argmax(log_weights))]
-        return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
-
-    def _fit_growing_leak(self, leak: UnitLeak) -> tuple[LeakFit, int]:
-        """Fit a leak that may grow from its onset on; its coefficient is the mean from the onset to the end.
-
-        Each growth of `growth_priors` has its own most probable onset. Returns the fit with the most probable growth,
-        and the index of its onset in `onsets`. The likelihood of the fit is replaced by the mean over all growths,
-        weighted by their prior probabilities.
+        `leaks`: flows of this one leak, for each possible choice of the sides' supplies. Of all choices and growths,
+        each with its own most probable onset, the most probable is returned. Its coefficient is the mean from the onset
+        to the end; its likelihood is replaced by the sum over all choices and growths, each times its prior
+        probability.
         """
         fits, log_weights = list[tuple[LeakFit, int]](), list[float]()
-        for growth, probability in growth_priors():
+        for leak, (growth, probability) in itertools.product(leaks, growth_priors()):
             index = int(self._onset_posteriors(leak, growth).argmax())
-            law = LeakLaw(exponent=1.0, growth=growth, onset=float(self.onsets[index]))
+            onset = float(self.onsets[index])
             flows = [
-                flow * law.growth_factor(hold.t, self.end) for flow, hold in zip(leak.flows, self.holds, strict=True)
+                flow * growth_factor(hold.t, growth, onset, self.end)
+                for flow, hold in zip(leak.flows, self.holds, strict=True)
             ]
-            fit = self._fit_leak(leak._replace(flows=flows), law.onset)
+            fit = self._fit_leak(leak._replace(flows=flows), onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
-            log_weights.append(fit.log_likelihood + float(np.log(probability)))
+            log_prior = math.log(probability) + self._supply_log_prior(leak.supplies, drains=False)
+            log_weights.append(fit.log_likelihood + log_prior)
         fit, index = fits[int(np.argmax(log_weights))]
         return fit._replace(log_likelihood=float(np.logaddexp.reduce(log_weights))), index
 
-    def _mean_unit_flow(self, conditions: PistonFit, law: LeakLaw) -> float:
+    def _mean_unit_flow(self, leak: PistonLeak) -> float:
         """Compute the mean magnitude of the flow past the piston in holds after the onset, for a coefficient of 1."""
-        leak = self._unit_piston_leak(conditions.offset, law=law)
+        unit_leak = self._unit_piston_leak(leak._replace(supplies=NEITHER))
         flows = [  # row 0 is the flow out of A
-            np.abs(sides[0])[hold.t >= conditions.onset] for hold, sides in zip(self.holds, leak.flows, strict=True)
+            np.abs(sides[0])[hold.t >= leak.onset] for hold, sides in zip(self.holds, unit_leak.flows, strict=True)
         ]
         after_onset = np.concatenate(flows)
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
-
-    def _find_onset(self, offset: float, supplies: SideSupplies, exponent: float) -> tuple[float, PistonFit]:
-        """Find the most probable onset of a leak past the piston, given the sensor offset of p_A - p_B [Pa].
-
-        `supplies`, `exponent`: as in `PistonFit` and `LeakLaw`. Return the log posterior of this onset, and the onset
-        together with `offset` and `supplies`.
-        """
-        posteriors = self._onset_posteriors(self._unit_piston_leak(offset, supplies, LeakLaw(exponent)))
-        index = int(posteriors.argmax())
-        log_posterior = float(posteriors[index]) - 0.5 * self._offset_cost(offset)
-        log_posterior += self._supply_log_prior(supplies, drains=True)
-        # readings of a side that is not closed have no residual; without this correction the smaller variance would be
-        # evidence
-        log_posterior += 0.5 * self.n_readings * math.log(self._closed_share(supplies))
-        return log_posterior, PistonFit(float(self.onsets[index]), offset, supplies)
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
@@ -574,10 +524,9 @@ class HeldChambers:
 
         Leaks to the outside are fitted with check valves on both sides and, if possible, with an open unloaded side.
         """
-        # if BOTH is not possible, no reading is at the charge pressure, and it flags the same samples as NEITHER
-        possible = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies] or [
-            BOTH
-        ]
+        tried = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies]
+        # if BOTH is not tried, no sample is at the charge pressure, and it flags the same samples as NEITHER
+        possible = tried or [BOTH]
         return self._weigh_hypotheses(
             [[self._unit_outside_leak(is_A, supplies) for supplies in possible] for is_A in (True, False)]
         )
@@ -585,19 +534,19 @@ class HeldChambers:
     def _weigh_hypotheses(self, leaks: Sequence[Sequence[UnitLeak]]) -> list[LeakHypothesis]:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
 
-        Each of `leaks` is one leak with the flows that it has under each possible choice of the sides' supplies.
-
-        Each leak may grow from its onset on. The coefficient past the piston is that of the most probable law,
+        Each of `leaks` is one leak with the flows that it has under each possible choice of the sides' supplies. It may
+        grow from its onset on. The coefficient past the piston is that of the most probable law,
         converted to the conductance of a laminar leak with the same mean flow in the holds; the others are means from
         the onset to the end. The likelihood of a leak is a mean over its laws and growths, by their priors.
         """
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
-        unit_ratio = self._mean_unit_flow(best.conditions, best.law) / self._mean_unit_flow(best.conditions, LAMINAR)
+        laminar = best.leak._replace(exponent=1.0, growth=0.0)
+        unit_ratio = self._mean_unit_flow(best.leak) / self._mean_unit_flow(laminar)
         log_weights = [fit.log_weight for fit in self.law_fits]
         # each fit with the index of its onset in `onsets`
-        index = int(np.abs(self.onsets - best.conditions.onset).argmin())
+        index = int(np.abs(self.onsets - best.leak.onset).argmin())
         fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
-        fits += [self._fit_over_supplies(leak) for leak in leaks]
+        fits += [self._fit_growing_leak(leak) for leak in leaks]
         log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
         probabilities = np.exp(log_posteriors - log_posteriors.max())
         probabilities /= probabilities.sum()
@@ -610,8 +559,8 @@ class HeldChambers:
     def total_leak(self) -> Estimate:
         """Estimate the mean conductance [m^3/(s Pa)] of all leaks in the holds, even if the valves are open.
 
-        A leak may be past the piston, to the outside, or through open valves and the pump; each of these is weighted by
-        its probability. A check valve would hide the oil that leaves a chamber, so no refilling is assumed.
+        A leak may be past the piston, to the outside, or through open valves and the pump, each with its probability. A
+        check valve would hide the oil that leaves a chamber, so no refilling is assumed.
         """
         # without a charge pressure check valves stay closed; if they do so anyway, the cached fits serve
         chambers = self if self._closed_share(BOTH) == 1.0 else replace(self, charge=0.0)
@@ -619,7 +568,7 @@ class HeldChambers:
         leaks = [[chambers._unit_outside_leak(is_A)] for is_A in sides]
         leaks += [[chambers._unit_pump_leak(is_A)] for is_A in sides]
         hypotheses = chambers._weigh_hypotheses(leaks)
-        means = [hypothesis.probability * hypothesis.fraction_after * hypothesis.fit.value for hypothesis in hypotheses]
+        means = [hypothesis.mean for hypothesis in hypotheses]
         deviations = [hypothesis.fraction_after * hypothesis.fit.deviation for hypothesis in hypotheses]
         # a leak that is estimated as 0 adds no uncertainty
         variance = sum(deviation**2 for mean, deviation in zip(means, deviations, strict=True) if mean > 0.0)
@@ -630,13 +579,12 @@ class HeldChambers:
     def leaks(self) -> HeldLeaks:
         """Mean leaks over the recording, from the times in which shut valves hold the load.
 
-        Each leak is its estimate times its probability. Its standard deviation is not multiplied by the probability,
-        and excludes the uncertainty of the oil's properties.
+        Each is its estimate times its probability. Its standard deviation is not multiplied by the probability, and
+        excludes the uncertainty of the oil's properties.
         """
         values_and_deviations = []
         for leak in self._leak_hypotheses:
-            mean = leak.fraction_after * leak.fit.value
-            values_and_deviations += [leak.probability * mean, leak.fraction_after * leak.fit.deviation]
+            values_and_deviations += [leak.mean, leak.fraction_after * leak.fit.deviation]
         # the standard deviation of the piston's leak includes the uncertainty of the offset of p_A - p_B
         fits = [fit._replace(by_oil=0.0) for fit in self._fits_over_offsets(self.piston_fit.onset)]
         deviation = average_fits(fits).deviation if fits else UNKNOWN
@@ -649,10 +597,7 @@ class HeldChambers:
 
     @property
     def probability_after_holds(self) -> float:
-        """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it.
-
-        It is the probability that it begins within the recording, times the fraction of the time after the last hold.
-        """
+        """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it."""
         time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
@@ -660,10 +605,10 @@ class HeldChambers:
     def piston_onset(self) -> Interval | None:
         """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
 
-        It is averaged over the laws of the leak. The interval is widened on either side to the next of the evenly
-        spaced onsets within holds, or to the whole time between two holds.
+        The interval is widened on either side to the next of the evenly spaced onsets within holds, or to the whole
+        time between two holds.
         """
-        posteriors = np.logaddexp.reduce(list(self._law_onsets.values()))
+        posteriors = np.logaddexp.reduce([posteriors for _, _, posteriors in self._laws])
         weights = np.exp(posteriors - posteriors.max())
         first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
         if first < 2:  # the onset may be the beginning of the recording or the first one within a hold

@@ -28,7 +28,7 @@ class LockedHold:
     """Samples of one hold, in which shut valves hold the load.
 
     `t`: time [s]; `p_A`, `p_B`: absolute pressures [Pa]; `x`: position [m], (n,) each. `edges` (k + 1,): indices of the
-    samples that bound k intervals, whose means are readings. In the first interval the valves may still be shutting.
+    samples that bound k intervals, whose means are readings. In the first one the valves may still be shutting.
     """
 
     t: Array
@@ -51,12 +51,8 @@ class LockedHold:
         """Recorded p_A - p_B [Pa] at each sample, shape (n,)."""
         return self.p_A - self.p_B
 
-    def carries(self, is_A: bool) -> bool:
-        """Return True if the side A (or B, if `is_A` is False) has the higher pressure when the hold begins."""
-        return self._is_A_higher == is_A
-
     @cached_property
-    def _is_A_higher(self) -> bool:
+    def is_A_loaded(self) -> bool:
         """True if A has the higher pressure in the first interval."""
         settling = slice(self.edges[0], self.edges[1])
         return float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
@@ -66,7 +62,7 @@ class LockedHold:
 
         The first reading of the side with the higher pressure becomes 0, since the valves may still be shutting.
         """
-        first = int(self.carries(is_A))  # first reading that counts: 1 on the side with the higher pressure, else 0
+        first = int(self.is_A_loaded == is_A)  # first reading that counts: 1 on the side with the higher pressure
         centred = np.asarray(readings - readings[first:].mean(axis=0))
         centred[:first] = 0.0
         return centred
@@ -74,13 +70,10 @@ class LockedHold:
     def offset_in_hold(self, offset: float) -> tuple[float, float]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
-        The offset varies with the pressure if the two sensors differ in gain. The offset of a hold is therefore normal
-        about `offset`; its standard deviation s is `held_oil.gain` (`priors.toml`) times the higher of both pressures
-        at the end of the hold. The more probable of two cases is assumed:
-
-        - A leak has equalised the pressures. The recorded p_A - p_B at the end is then the offset of the hold.
-        - A load causes p_A - p_B at the end, equally probable up to the higher pressure. The offset of the hold is
-          `offset`.
+        If the two sensors differ in gain, the offset of a hold is normal about `offset`, with a standard deviation s of
+        `held_oil.gain` (`priors.toml`) times the higher pressure at the end of the hold. The more probable of two cases
+        is assumed: a leak has equalised the pressures, and the recorded p_A - p_B at the end is the offset of the hold;
+        or a load causes p_A - p_B, equally probable up to the higher pressure, and the offset is `offset`.
 
         Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
         """
@@ -95,9 +88,9 @@ class LockedHold:
     def driving_pressure(self, offset: float) -> Array:
         """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
 
-        Once a leak has equalised the pressures, small differences d are errors of the sensors. Their integral over the
-        hold may exceed the integral of the large but short-lived difference before. In such holds d is therefore
-        multiplied by d^2 / (d^2 + `held_oil.resolved`^2).
+        Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
+        exceed that of the large difference before. In such holds d is multiplied by d^2 / (d^2 +
+        `held_oil.resolved`^2).
         """
         offset_here, cost = self.offset_in_hold(offset)
         difference = np.asarray(self.difference - offset_here)
@@ -106,9 +99,9 @@ class LockedHold:
         return difference
 
     def steepest_time(self) -> float:
-        """Find the start [s] of the time window of the length `held_oil.equalises` in which p_A - p_B changes most.
+        """Find the start [s] of the window in which p_A - p_B changes most.
 
-        Within such a time (`priors.toml`) a large leak equalises the pressures.
+        Its length is `held_oil.equalises` (`priors.toml`), the time in which a large leak equalises the pressures.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
@@ -119,9 +112,9 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
     """Find the pressure [Pa] that check valves maintain in a chamber without load.
 
     It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
-    equalise the pressures in every rest. If the pump never rests, it is the lowest pressure of the recording, which may
-    be too low by the drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): lower chamber
-    pressure [Pa]; `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate [Hz].
+    equalise the pressures in every rest. If the pump never rests, it is the lowest of all, which may be too low by the
+    drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): lower chamber pressure [Pa];
+    `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
@@ -136,9 +129,9 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
     """Extend each rest of the pump back to the time at which its flow has fallen to half of its earlier level.
 
     Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
-    most this time. A large leak may equalise the pressures earlier, as soon as the valves shut. `rests` (n,): flags of
-    the sampling intervals in which the pump rests; `flow` (n,): flow of the pump without the part that moves the piston
-    [m^3/s], since valves do not hold a moving piston; `rate`: sampling rate [Hz].
+    most this time. `rests` (n,): flags of the sampling intervals in which the pump rests; `flow` (n,): flow of the pump
+    without the part that moves the piston [m^3/s], since valves do not hold a moving piston; `rate`: sampling rate
+    [Hz].
     """
     window = max(1, round(INFERENCE.rest.averaged * rate))
     magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
@@ -154,10 +147,10 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
-    The time in which the valves shut is the first interval of a hold; the time in which they open is left out. Holds
-    that are too short, or have missing samples, are omitted. `channels`: time [s], absolute pressures of A and B [Pa],
-    and position [m], (n,) each; `rests` (n - 1,): flags of the sampling intervals in which the pump rests; `rate`:
-    sampling rate [Hz]. Neighbouring samples are averaged to a rate below 2 `MAX_RATE`.
+    The time in which the valves open is left out, and so are holds that are too short or have missing samples.
+    `channels`: time [s], absolute pressures of A and B [Pa], and position [m], (n,) each; `rests` (n - 1,): flags of
+    the sampling intervals in which the pump rests; `rate`: sampling rate [Hz]. Neighbouring samples are averaged to a
+    rate below 2 `MAX_RATE`.
     """
     prior, holds = INFERENCE.held_oil, list[LockedHold]()
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one

@@ -1,4 +1,4 @@
-"""Leaks of closed chambers: their laws, their flow with a coefficient of 1, and the results of fits."""
+"""Leaks of closed chambers: their laws, their flows with a coefficient of 1, and the results of fits."""
 
 from __future__ import annotations
 
@@ -14,28 +14,6 @@ from sealscope.recordings.recording import Array
 
 #: Standard deviation of a leak without information.
 UNKNOWN = 1e30
-
-
-class LeakLaw(NamedTuple):
-    """Law of a leak past the piston: its flow is a coefficient times |p_A - p_B|^`exponent`, and grows from its onset.
-
-    `growth`: relative increase of the coefficient from the `onset` [s] to the end of the recording.
-    """
-
-    exponent: float = 1.0
-    growth: float = 0.0
-    onset: float = 0.0
-
-    def growth_factor(self, t: Array, end: float) -> Array:
-        """Compute the coefficient at times `t` (n,) [s] relative to its value at the onset.
-
-        `end`: end of the recording [s]. The factor is 1 before the onset and grows linearly to 1 + `growth`.
-        """
-        return 1.0 + self.growth * np.clip((t - self.onset) / max(end - self.onset, np.finfo(float).tiny), 0.0, 1.0)
-
-
-#: A laminar leak that does not grow.
-LAMINAR = LeakLaw()
 
 
 class SideSupply(Enum):
@@ -81,22 +59,24 @@ class HeldLeaks(NamedTuple):
     deviation_B: float
 
 
-class PistonFit(NamedTuple):
-    """Most probable `onset` of a leak past the piston [s], and sensor `offset` of p_A - p_B [Pa].
+class PistonLeak(NamedTuple):
+    """A leak past the piston: its flow is a coefficient times |p_A - p_B - z|^`exponent`, with the sensor offset z.
 
-    `supplies`: most probable supplies of A and B.
+    `growth`: relative increase of the coefficient from the `onset` [s] to the end of the recording; `offset`: z [Pa];
+    `supplies`: those of A and B.
     """
 
-    onset: float
-    offset: float
-    supplies: SideSupplies
+    exponent: float = 1.0
+    growth: float = 0.0
+    onset: float = 0.0
+    offset: float = 0.0
+    supplies: SideSupplies = NEITHER
 
 
 class LeakFit(NamedTuple):
-    """Fitted coefficient of a leak: `value` [m^3/(s Pa^e)], and `log_likelihood` of the fit.
+    """Fitted coefficient of a leak, its `value` [m^3/(s Pa^e)] for the exponent e of the leak's law.
 
-    e is the exponent of the leak's law. The coefficient has two standard deviations in the same unit: `deviation` due
-    to noise, and `by_oil` due to the uncertain properties of the oil.
+    It has two standard deviations: `deviation` due to noise, and `by_oil` due to the uncertain properties of the oil.
     """
 
     value: float
@@ -111,14 +91,12 @@ class LeakFit(NamedTuple):
 
 
 class LawFit(NamedTuple):
-    """Fit of a leak past the piston under one `law`.
+    """Fitted coefficient of a `leak` past the piston with one law, i.e. one exponent and one growth.
 
-    `conditions`: onset, sensor offset and supplies of the sides; `fit`: fitted coefficient; `log_weight`: log
-    likelihood of the fit plus the log prior probability of the law.
+    `log_weight`: log likelihood of the fit plus the log prior probability of the law.
     """
 
-    law: LeakLaw
-    conditions: PistonFit
+    leak: PistonLeak
     fit: LeakFit
     log_weight: float
 
@@ -129,6 +107,19 @@ class LeakHypothesis(NamedTuple):
     probability: float
     fraction_after: float
     fit: LeakFit
+
+    @property
+    def mean(self) -> float:
+        """Expected mean conductance over the recording: the fitted one times its probability and `fraction_after`."""
+        return self.probability * self.fraction_after * self.fit.value
+
+
+def growth_factor(t: Array, growth: float, onset: float, end: float) -> Array:
+    """Compute the coefficient of a growing leak at times `t` (n,) [s], relative to its value at the `onset` [s].
+
+    It is 1 before the onset, and grows linearly to 1 + `growth` at the `end` of the recording [s].
+    """
+    return 1.0 + growth * np.clip((t - onset) / max(end - onset, np.finfo(float).tiny), 0.0, 1.0)
 
 
 def flow_of_side(flow: Array, is_A: bool) -> Array:

@@ -1,8 +1,8 @@
 """Regression of the volumes in closed chambers on the properties of their oil, and on leaks.
 
 The compressed oil and the free air of the stroke and of the dead volumes take up what the piston displaces; the rest
-has leaked. The compressibility, the free air and the dead volumes have priors (`held_oil` in `priors.toml`); the
-regression is linearised about the estimate, iteratively.
+has leaked. The logarithms of compressibility and free air, and the dead volumes, have normal priors (`held_oil` in
+`priors.toml`); the regression is linearised about the estimate, iteratively.
 """
 
 from __future__ import annotations
@@ -49,9 +49,8 @@ class CylinderSides(NamedTuple):
 class OilRegression(NamedTuple):
     """Regression of displaced volumes on the properties of the oil, over r readings (sample means) of all holds.
 
-    The properties are compressibility, dead volume of A, dead volume of B, and free air, each divided by its usual
-    value. The unknowns are their `changes` (4,), which have a normal prior with the mean 0: relative changes of the
-    dead volumes, and logarithms of the other two.
+    The unknowns are `changes` (4,) from the usual properties, with a normal prior about 0: logarithm of the
+    compressibility, relative changes of the dead volumes of A and B, and logarithm of the free air.
 
     - `displaced` (r,): volume displaced by the piston [m^3].
     - `strained`, `aired` (r, 3): volumes [m^3] taken up by the compression of the oil and of the free air, with the
@@ -82,8 +81,8 @@ class OilRegression(NamedTuple):
 def _oil_factors(changes: Array) -> tuple[float, float, Array]:
     """Convert `changes` (4,) of the oil's properties (`OilRegression`) to factors on compressed volumes.
 
-    Returns a factor on the compressibility, a factor on the free air, and factors (3,) on the volume of the stroke
-    (always 1, since it is not estimated) and on the dead volumes of A and B.
+    Returns factors on the compressibility and on the free air, and factors (3,) on the volumes of the stroke (1, since
+    it is not estimated) and on the dead volumes of A and B.
     """
     compressibility, dead_A, dead_B, air = changes
     return float(np.exp(compressibility)), float(np.exp(air)), np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
@@ -96,10 +95,7 @@ def _oil_deviations() -> Array:
 
 
 def _lowest_changes() -> Array:
-    """Return lower limits (4,) of the changes of compressibility, dead volumes A and B, and free air.
-
-    Only the dead volumes are limited; the other changes are logarithms (`OilRegression`).
-    """
+    """Return lower limits (4,) of the changes of compressibility, dead volumes A and B, and free air."""
     prior = INFERENCE.held_oil
     lowest_volume_change = prior.least_dead / prior.dead - 1.0
     return np.array([-np.inf, lowest_volume_change, lowest_volume_change, -np.inf])
@@ -124,9 +120,6 @@ def build_regression(
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
     The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the hold.
-    The columns are volumes [m^3] that the compression of the oil (`strained`) and of its free air (`aired`, by Boyle's
-    law) takes up with the usual properties: in the stroke, in the dead volume of A, and in that of B. Pressures are
-    absolute.
 
     `flags` (2, n), for each hold of n samples: true in samples in which A (row 0) or B (row 1) is closed, so that
     displacement and compression of that side count; `n_readings`: effective number of independent readings.
@@ -169,10 +162,9 @@ def _sum_changes(values: Array, is_closed: NDArray[np.bool_]) -> Array:
 def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> LeakRegression:
     """Fit the coefficients of c leaks together with the properties of the oil.
 
-    `columns` (r, c): volume [m^3] that has left a chamber up to each of r readings (means of samples), for each leak
-    with a coefficient of 1; `n_readings`: effective number of independent readings. The properties are found by
-    iteration, and so is the variance of a reading, which weights their priors against the readings. A dead volume that
-    reaches its lower limit stays there. The covariance is split into two parts (`LeakRegression`).
+    `columns` (r, c): volume [m^3] that has left a chamber up to each of r readings, for each leak with a coefficient of
+    1; `n_readings`: effective number of independent readings. The properties are found by iteration, and so is the
+    variance of a reading, which weights their priors. A dead volume that reaches its lower limit stays there.
     """
     n_leaks = columns.shape[1]
     changes = np.zeros(4)  # changes of the oil's properties, at first none
@@ -221,11 +213,11 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
 def residual_squares(regression: OilRegression, columns: Array, variance: float) -> Array:
     """Compute the residual sum of squares of the fit of a leak with a coefficient >= 0, for each of o onsets, (o,).
 
-    The changes of the oil's properties relative to their usual values, at which the `regression` is linearised, are
-    fitted as well, and their weighted squares, by the priors, are part of the sum. Each has a lower limit: it may fall
-    by `MAX_DECREASE` standard deviations of its logarithm, and a dead volume not below its least. `columns` (r, o):
-    volume lost up to each reading through a leak with a coefficient of 1 since each onset; `variance`: variance of a
-    reading, which weights the priors against the readings.
+    The changes of the oil's properties, at whose usual values the `regression` is linearised, are fitted as well, and
+    their weighted squares, by the priors, are part of the sum. Each may fall by at most `MAX_DECREASE` standard
+    deviations of its logarithm, and a dead volume not below its least. `columns` (r, o): volume lost up to each reading
+    through a leak with a coefficient of 1 since each onset; `variance`: variance of a reading, which weights the
+    priors.
     """
     usual = np.zeros(4)
     leaked, oil = regression.leaked(usual), regression.slopes(usual)
