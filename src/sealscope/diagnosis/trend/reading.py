@@ -109,12 +109,11 @@ class LeakReading:
 def estimate_reading(
     recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = ""
 ) -> LeakReading:
-    """Estimate the leakage of a recording.
+    """Estimate the leakage of a recording; if that is impossible, `problem` of the result states the reason.
 
     `rig` states the sizes of the machine, as for `diagnose`. If it is None, the thesis's rig is assumed, and L/min can
     be stated only for a simulation with these sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
-    recording's name, by default that of its file. If no estimate is possible, `problem` of the result states the
-    reason.
+    recording's name, by default that of its file.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -137,12 +136,10 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the leakage of a recording by the most specific of three methods that its channels allow.
+    """Estimate the leakage by the most specific of `BASES` that the channels of a recording's usable `part` allow.
 
-    These are the volume balance, the pressure response and the damping of the pressures' ringing, in this order.
-    `part`: corrected samples of the recording that can be used; `rig`: a rig with the sizes of the machine; `machine`:
-    these sizes, and who stated them. Returns the fields of `LeakReading` that depend on the method; only `problem` if
-    no method is possible.
+    `rig` has the sizes of the `machine`. Returns the fields of `LeakReading` that depend on the method; only `problem`
+    if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
@@ -163,9 +160,8 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
             "size_error": conductance_scale_error(),
         }
     log_rms, _ = measure_levels(part)
-    judged_columns = [QUANTITIES.index(name) for name in JUDGED]
     log_rms_by_chamber = log_rms.reshape(-1, len(QUANTITIES))  # a row for each chamber
-    damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
+    damping = float(-np.mean(log_rms_by_chamber[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
     reasons = dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None)  # each once
@@ -198,8 +194,7 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     """Make the prior on the standard deviation of a healthy machine's leakage level between recordings.
 
-    The level (`LeakReading.level`) is estimated by the method `basis`. The scale of the prior, in the level's unit, is
-    proportional to the typical level `usual` for the volume balance, and constant for other methods.
+    For the volume balance its scale is proportional to the typical level `usual`, for other methods constant.
     """
     between = TREND.between
     if basis == "pressure response":
@@ -244,12 +239,11 @@ def build_timeline(
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
     """Sort leakage readings by time and group those that can be compared with each other.
 
-    Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area (`_group_scales`). This ratio changes if a sensor is replaced by one with another
-    scale, and from machine to machine. `every` is the time between readings [s], by which they are dated in the order
-    of their file names; None if their times are known. Returns the readings with their groups, and for each group a
-    text on its difference from the first group, "" for the first. Raises InputError if the time of a reading is
-    unknown.
+    Only readings of the most frequent method are used. Those of a group have nearly the same measured ratio of pump
+    displacement to piston area, which differs between sensors and machines. `every` is the time between readings [s],
+    by which they are dated in the order of their file names; None if their times are known. Returns the readings with
+    their groups, and for each group a text on its difference from the first group, "" for the first. Raises InputError
+    if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -278,35 +272,25 @@ def _group_scales(scales: Sequence[float | None]) -> list[int]:
     """Group readings with nearly the same ratio of displacement to area, and return the group number of each reading.
 
     `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; a reading whose
-    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group if their
-    logarithms differ by at most
-
-        log(1 + `reading.scale`) + `reading.scatter` * median difference of neighbours    (`priors.toml`).
-
-    The second term is for a machine whose recordings do not determine the ratio well, so that it scatters. It counts if
-    there are at least `reading.fewest` differences.
+    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group unless
+    their logarithms differ by more than a limit.
     """
     known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
     gaps = np.diff(np.log(known))
     prior = TREND.reading
     limit = math.log1p(prior.scale)
-    if len(gaps) >= prior.fewest:
+    if (
+        len(gaps) >= prior.fewest
+    ):  # the recordings of some machines do not determine the ratio well, so that it scatters
         limit += prior.scatter * float(np.median(gaps))
     # by ratio, the number of its cluster, counted from the smallest ratio
-    clusters = dict(zip(known, np.concatenate([[0], np.cumsum(gaps > limit)]).tolist(), strict=True)) if known else {}
-    numbers: dict[int | None, int] = {}  # number of the group of each cluster
-    groups = []
-    for scale in scales:
-        cluster = clusters.get(scale) if scale is not None else None
-        groups.append(numbers.setdefault(cluster, len(numbers)) if cluster is not None else 0)
-    return groups
+    clusters: dict[float | None, int] = dict(zip(known, np.cumsum([0, *(gaps > limit)]).tolist(), strict=False))
+    numbers: dict[int, int] = {}  # number of the group of each cluster
+    return [numbers.setdefault(clusters[scale], len(numbers)) if scale in clusters else 0 for scale in scales]
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time; raise InputError if a time is unknown.
-
-    With `every`, the time between readings [s], they are dated in the order of their file names.
-    """
+    """Sort readings by time, with the start times that follow from `every`; raise InputError if a time is unknown."""
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
@@ -343,8 +327,8 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
     """List the findings on a trend: wrong times, recordings left out, and groups that cannot be compared.
 
-    `points` are in the order of time; `differences` has a text for each group on its difference from the first.
-    Recordings left out for reasons that differ only in numbers share one finding.
+    `points` and `differences` are those of `build_timeline`. Recordings left out for reasons that differ only in
+    numbers share one finding.
     """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
@@ -368,19 +352,16 @@ def _join_files(readings: Iterable[LeakReading]) -> str:
 
 
 def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative difference of the measured ratio `scale` of displacement to area from the ratio `other`.
-
-    The result is 0 if one of them is unknown.
-    """
+    """Compute the relative difference of the ratio `scale` of displacement to area from `other`; 0 if one is None."""
     return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    The recordings are `ordered` by time. The first sign is recordings that overlap. If none do, the second sign is
-    times that fall while the numbers in the file names rise, provided that the names seem to be numbered in the order
-    of time. Recordings dated without a time of day have the same start and do not count as overlapping.
+    The recordings are `ordered` by time. The first sign is recordings that overlap; those dated without a time of day
+    have the same start and do not count. The second sign is times that fall while the numbers in the file names rise,
+    if the names seem to be numbered in the order of time.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"
