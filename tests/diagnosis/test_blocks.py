@@ -7,7 +7,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.rms_change.blocks import cut_blocks, measure_levels
+from sealscope.diagnosis.rms_change.blocks import column_names, cut_blocks, measure_levels
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import details
@@ -72,7 +72,7 @@ def test_blocks_are_shares_of_the_cycle(command: str, phases: int, length: float
     blocks = cut_blocks(recording)
     assert blocks.phases == phases
     assert blocks.edges.size == len(blocks.log_rms) + 1
-    assert blocks.log_rms.shape[1] == len(blocks.names) == 10
+    assert blocks.log_rms.shape[1] == len(column_names(blocks.chambers)) == 10
     np.testing.assert_allclose(np.diff(blocks.edges), length, rtol=2e-3, atol=1.01 / RATE)
     inside = details(recording["p_A"]).inside()
     assert blocks.edges[0] == pytest.approx(recording.t[inside.start])
@@ -89,7 +89,7 @@ def test_log_rms_is_that_of_the_details() -> None:
         series = {f"d{level}": result[level] for level in (1, 2, 3, 4)} | {"d3d4": result[3] * result[4]}
         for quantity, values in series.items():
             direct = [np.sqrt(np.mean(values[a:b] ** 2)) for a, b in pairwise(bounds)]
-            column = blocks.names.index(f"{quantity} of {chamber}")
+            column = column_names(blocks.chambers).index(f"{quantity} of {chamber}")
             np.testing.assert_allclose(np.exp(blocks.log_rms[:, column]), direct, rtol=1e-9)
             inside = values[result.inside()]
             assert measure_levels(recording)[0][column] == pytest.approx(np.log(np.sqrt(np.mean(inside**2))), rel=1e-9)
@@ -102,7 +102,7 @@ def test_each_phases_own_level_is_taken_out() -> None:
     p_A = 3e5 + loud * random.normal(size=len(recording))
     recording = Recording(recording.t, {**recording.channels, "p_A": p_A}, recording.units, RATE)
     blocks = cut_blocks(recording)
-    d1 = [blocks.names.index(f"d1 of {chamber}") for chamber in blocks.chambers]
+    d1 = [column_names(blocks.chambers).index(f"d1 of {chamber}") for chamber in blocks.chambers]
     assert blocks.phases == 4
     means = np.array([blocks.log_rms[phase::4].mean(axis=0) for phase in range(4)])
     np.testing.assert_allclose(means, np.tile(means[0], (4, 1)), atol=1e-9)

@@ -84,19 +84,15 @@ class Examination:
         Healthy recordings of which only summaries are stored are left out, as these may rest on other channels.
         """
         names = set(channels)
-
-        def select_channels(recording: Recording) -> Recording:
-            """Return the recording with those of its channels that are in `names`."""
-            return recording.only(name for name in recording.channels if name in names)
-
-        baseline = [select_channels(healthy) for healthy in self.baseline if isinstance(healthy, Recording)]
-        return replace(self, recording=select_channels(self.recording), baseline=baseline)
+        healthy = [entry for entry in self.baseline if isinstance(entry, Recording)]
+        judged, *baseline = (
+            recording.only(name for name in recording.channels if name in names)
+            for recording in (self.recording, *healthy)
+        )
+        return replace(self, recording=judged, baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Return the observations of the detector called `name`, which runs at the first call only.
-
-        Raises KeyError if there is no such detector.
-        """
+        """Return the observations of the detector called `name`, which runs at the first call only."""
         if name not in self._reports:
             rig = load_rig(self.rig)
             self._reports[name] = run_detector(name, self.recording, self.baseline, rig, distrust=self.distrust)
@@ -131,7 +127,7 @@ class Examination:
 
         Detectors that measure the leak (`ORDER`) run one after the other until one of them decides; all others always
         run. The verdict cannot be "no leak" if a measuring detector failed, or if none of the given healthy recordings
-        could be compared, for all detectors (`refusal`) or for a measuring one (`Observed.refusal`).
+        could be compared by it.
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
         # the test results in these reports may show causes other than a leak, whichever detector decides
@@ -146,10 +142,7 @@ class Examination:
         return combine(list(decisions.values()), refusal)
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
-        """Decide from the observations of the detector called `name` if the machine leaks.
-
-        `reports` of other detectors may show another cause of an alarm, which competes with a leak if `weigh_rivals`.
-        """
+        """Decide from the observations of the detector called `name` if the machine leaks (`decide`)."""
         probability = self.false_alarm_probability
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)

@@ -42,9 +42,8 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
     """Compose the reason of a verdict in words.
 
     For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
-    upper `bound` of an undetected leak [m^3/s] or, if leakage is not measured, that of a change of the ringing
-    (`_bound_text`). The cause of a change follows: the event `other` or, if that is None and there is an alarm against
-    which other causes are weighed, the most probable of these. Remarks on the measured leakage come last.
+    upper `bound` of an undetected leak [m^3/s], or of a change of the ringing. The cause of a change follows: the event
+    `other` or else, after an alarm, the most probable of the causes that are weighed.
     """
     if evidence.verdict == LEAK:
         return _leak_text(case, evidence, alarm) + _remarks(case)
@@ -67,19 +66,12 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe in words a leak that the test `alarm` detected, by the change that it makes if leakage is not measured.
-
-    An alarm by the limit in the rig's file is described by the total leakage and this limit, if both are known in
-    L/min. The text also says if the leak's flow is not stated in L/min.
-    """
+    """Describe in words a leak that the test `alarm` detected, or without measured leakage the change that it makes."""
     if case.leak is None:
-        rarest = case.tested_observable
-        assert rarest is not None  # it raised the alarm
+        rarest = _tested_observable(case)
         if rarest.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
-        where = _onset_text(rarest) or _against_text(case.judge.ringing)
-        return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
+        return text_of("leak", "details", what=f"RMS: {rarest.name}", **_change_values(rarest, case.judge.ringing))
     test_name = alarm.name if alarm else ""  # with the verdict `leak` there always is an alarm
     key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
     if key == "within" and not case.has_onset_within:
@@ -96,15 +88,16 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     """State in words the largest leak that may have remained undetected.
 
-    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. If leakage is measured, the text states
-    the bound in L/min, as a percentage of the pump's flow, or as "any size", in this order of preference. With the
-    verdict `cannot tell`, it also says how to record better. If leakage is not measured, the text describes the
-    pressures' ringing: its change if there is an alarm, else the limit of an undetected fall.
+    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. With the verdict `cannot tell`, the text
+    also says how to record better. If leakage is not measured, it describes the pressures' ringing: its change if there
+    is an alarm, else the limit of an undetected fall.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
-            return _changed_ringing_text(case, ringing)
+            rarest, leak_percent = _tested_observable(case), 100.0 * case.leak_probability(case.alarms[0])
+            values = _change_values(rarest, ringing)
+            return text_of("bound", "ringing_changed", what=rarest.name, leak=leak_percent, **values)
         return _ringing_text(evidence, ringing, case.judge.provider)
     mean_pump_flow, _ = leak.pump_flow
     # a comparison with healthy recordings bounds the mean flow over the recording, and not that since an onset
@@ -124,10 +117,8 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     """State in words the 95 % upper limit [%] of an undetected fall of the ringing (RMS of the pressures' details).
 
-    The fall is relative to healthy recordings or, without these, to the start of the same recording. With the verdict
-    `cannot tell`, the text says that such a fall would not show. If the sampling rate is too low, the text begins with
-    the names of unused columns or, if there are none, with the rate. If the ringing was not measured (None), the text
-    is that the detector `provider` sees no change.
+    If the sampling rate is too low, the text begins with the names of unused columns or, if there are none, with the
+    rate. If the ringing was not measured (None), the text is that the detector `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -144,22 +135,20 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     return text if ringing.healthy else text + text_of("bound", "start")
 
 
-def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe the rarest change of the pressures' ringing (RMS of wavelet details), and the probability of a leak."""
-    rarest = case.tested_observable
-    assert rarest is not None  # it raised the alarm
-    percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
-    where = _onset_text(rarest) or _against_text(ringing)
-    leak = 100.0 * case.leak_probability(case.alarms[0])
-    return text_of("bound", "ringing_changed", what=rarest.name, percent=percent, where=where, leak=leak)
+def _tested_observable(case: Case) -> Observable:
+    """Return the observable that raised the alarm of a detector that does not measure leakage."""
+    assert case.tested_observable is not None
+    return case.tested_observable
+
+
+def _change_values(observable: Observable, ringing: Ringing | None) -> dict[str, Any]:
+    """Compute the values for a text on a change of the ringing: its size [%], and its onset or what it is against."""
+    percent = 100.0 * abs(np.expm1(observable.size))  # `size`: change of the logarithm of the RMS
+    return {"percent": percent, "where": _onset_text(observable) or _against_text(ringing)}
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State the number of healthy recordings with which the ringing was compared.
-
-    The text also mentions if their dates are not known. It is "" if the ringing was not measured, or not compared with
-    healthy recordings.
-    """
+    """State the number of healthy recordings with which the ringing was compared; "" if there was no comparison."""
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)
@@ -169,10 +158,8 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation of an `alarm` other than a leak, and the way to tell it from a leak.
 
-    The stated probability is that of all explanations without a leak. If the explanation has several events, only the
-    first one in `events.toml` is described. If this event has no cause to name, such as a start, the text states only
-    its time, the onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no
-    explanation without a leak.
+    The stated probability is that of all explanations without a leak. Of several events, only the first one in
+    `events.toml` is described; of an event without a cause only its time, if known.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
