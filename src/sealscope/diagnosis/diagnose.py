@@ -47,33 +47,16 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """A recording to judge and its healthy baseline, prepared for one detector or all of them.
+    """A recording to judge and its healthy baseline, prepared for one detector or all of them."""
 
-    Attributes
-    ----------
-    recording : Recording
-        The samples to judge. Gaps are bridged and no sample is missing.
-    baseline : sequence of Recording or SummarisedRecording
-        Leak-free recordings of the same machine, possibly none.
-    false_alarm_probability : float
-        Allowed probability of the verdict "leak" on a leak-free recording.
-    rig : Rig, str or path-like
-        Sizes of the machine that the detectors assume.
-    distrust : str or None
-        Reason why the pressures cannot be trusted, in which case no detector runs.
-    refusal : str or None
-        Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
-    share, judged_until : float
-        Fractions of the original samples: those that `recording` contains, and those up to its last time.
-    """
-
-    recording: Recording
-    baseline: Sequence[Healthy] = ()
+    recording: Recording  # samples to judge; gaps are bridged and no sample is missing
+    baseline: Sequence[Healthy] = ()  # leak-free recordings of the same machine
     _: KW_ONLY
-    false_alarm_probability: float
-    rig: Rig | str | os.PathLike[str] = "thesis"
-    distrust: str | None = None
-    refusal: str | None = None
+    false_alarm_probability: float  # allowed probability of the verdict "leak" on a leak-free recording
+    rig: Rig | str | os.PathLike[str] = "thesis"  # sizes of the machine that the detectors assume
+    distrust: str | None = None  # reason why the pressures cannot be trusted, in which case no detector runs
+    refusal: str | None = None  # reason why none of the given healthy recordings can be compared
+    # fractions of the original samples: those that `recording` contains, and those up to its last time
     share: float = 1.0
     judged_until: float = 1.0
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)  # by detector; `replace` starts anew

@@ -32,42 +32,25 @@ _MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
 _SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)
 TINY = float(np.finfo(float).tiny)
 
-#: Indices of `Coefficients.numbers`, which explains them.
-ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
+#: Indices of `Coefficients.numbers`.
+ROWS = 0  # number of equations in the sums
+MOTION = 1  # sum of squares of their left sides
+NOISE = 2  # variance of an equation's residual
+ENERGY = 3  # sum of squares of the leak's column
+SHIFT = 4  # subtracted from the estimates of the leak, so that their series remains continuous
+MISFIT = 5  # residual variance of the last block over the usual variance
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of a volume balance other than the leak's, and the sums over blocks from which they are computed.
+    """Nuisances of a volume balance, n in number, and the sums over blocks from which they are computed."""
 
-    They are called nuisances; n is their number. The left side of the balance is the measured volume.
-
-    Attributes
-    ----------
-    sums : ndarray, shape (n + 2, n + 2)
-        Weighted products of the columns of nuisances, leak and left side.
-    values : ndarray, shape (n,)
-        The coefficients.
-    leak_products : ndarray, shape (n,)
-        Products of the leak's column with the nuisances' columns.
-    numbers : ndarray, shape (6,)
-        By index:
-
-        - `ROWS`: number of equations in the sums,
-        - `MOTION`: sum of squares of their left sides,
-        - `NOISE`: variance of an equation's residual,
-        - `ENERGY`: sum of squares of the leak's column,
-        - `SHIFT`: shift that is subtracted from the estimates of the leak, so that their series remains continuous,
-        - `MISFIT`: residual variance of the last block over the usual variance.
-    block, matrix : ndarray, shape (n + 2, n + 2) and (n, n + 3)
-        Work arrays: the products of one block, and the normal equations.
-    """
-
-    sums: Any
-    values: Any
-    leak_products: Any
-    numbers: Any
-    block: Any
-    matrix: Any
+    sums: Any  # (n + 2, n + 2): weighted products of the columns of nuisances, leak and left side
+    values: Any  # (n,): the nuisances
+    leak_products: Any  # (n,): products of the leak's column with the nuisances' columns
+    numbers: Any  # (6,): by the indices above
+    # work arrays
+    block: Any  # (n + 2, n + 2): products of one block
+    matrix: Any  # (n, n + 3): normal equations
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
@@ -161,7 +144,7 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Estimate the nuisances by least squares, and the variance of an equation's residual, into `model`."""
+    """Estimate the nuisances (`values`) by least squares, and the variance of an equation's residual (`NOISE`)."""
     n = len(model.matrix)
     solution = model.matrix[:, n:]
     solution[:] = 0.0  # only column 0, the estimate, is needed

@@ -48,62 +48,29 @@ BASES: tuple[Basis, ...] = get_args(Basis)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """Leakage of a machine in one recording.
+    """Leakage of a machine in one recording."""
 
-    Attributes
-    ----------
-    file, start, duration : str, float or None, float
-        Name of the recording, time of its first sample [s since 1970], if known, and duration [s].
-    basis : Basis or None
-        Method by which the level was estimated. None if no level can be stated; `problem` then tells why.
-    level, error : float
-        Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)], or minus the mean log RMS
-        of the pressures' wavelet details ("ringing"); relative to the assumed machine unless `states_flow`.
-    states_flow : bool
-        True if the level can be stated in L/min.
-    area : float or None
-        Piston area [m^2] that converts a creep speed to a flow on the level's scale, None if there is no such area.
-    pressure : float
-        Mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing.
-    temperature : float or None
-        Temperature of the oil [deg C], None if neither measured nor stated.
-    scale : float or None
-        Measured ratio of displacement to area, relative to the assumed ratio.
-    machine : AssumedMachine or None
-        What was assumed of the machine.
-    digest : str
-        Hash of the chamber pressures, equal for copies.
-    problem : str
-        Reason why there is no level, else "".
-    pump : float
-        Mean flow of the pump [m^3/s], by the volume balance only while the machine moves; nan for the basis "ringing".
-    size_error : float
-        Relative standard error of flows due to the machine's sizes (displacement, piston area).
-    sums, terms : RecordingSums or None, tuple of ColumnRoles
-        Sums of the volume balance, None without a balance, and the roles of its columns, one entry for each equation.
-    ringing : Summary or None
-        Summary of the pressures' ringing (RMS of their wavelet details); None if the channels do not allow it.
-    """
-
-    file: str
-    start: float | None
-    duration: float
-    basis: Basis | None = None
+    file: str  # name of the recording
+    start: float | None  # time of its first sample [s since 1970]
+    duration: float  # [s]
+    basis: Basis | None = None  # method by which the level was estimated, None if there is no level
+    problem: str = ""  # reason why there is no level
+    # leakage conductance of pump and piston together [m^3/(s Pa)], or minus the mean log RMS of the pressures' wavelet
+    # details ("ringing"), and its standard error; relative to the assumed machine unless `states_flow`
     level: float = np.nan
     error: float = np.nan
-    states_flow: bool = False
-    area: float | None = None
-    pressure: float
-    temperature: float | None
-    scale: float | None = None
-    machine: AssumedMachine | None
-    digest: str
-    problem: str = ""
-    pump: float = np.nan
-    size_error: float = 0.0
-    sums: RecordingSums | None = None
-    terms: tuple[ColumnRoles, ...] = ()
-    ringing: Summary | None = None
+    states_flow: bool = False  # True if the level can be stated in L/min
+    area: float | None = None  # piston area [m^2] that converts a creep speed to a flow on the level's scale
+    pressure: float  # mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing
+    temperature: float | None  # temperature of the oil [deg C]
+    scale: float | None = None  # measured ratio of displacement to area, relative to the assumed ratio
+    machine: AssumedMachine | None  # what was assumed of the machine
+    digest: str  # hash of the chamber pressures, equal for copies
+    pump: float = np.nan  # mean flow of the pump [m^3/s]; by the volume balance only while the machine moves
+    size_error: float = 0.0  # relative standard error of flows due to the machine's sizes (displacement, piston area)
+    sums: RecordingSums | None = None  # sums of the volume balance
+    terms: tuple[ColumnRoles, ...] = ()  # roles of its columns, one entry for each equation
+    ringing: Summary | None = None  # summary of the pressures' ringing (RMS of their wavelet details)
 
 
 def estimate_reading(
