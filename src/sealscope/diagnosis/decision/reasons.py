@@ -45,11 +45,10 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
     upper `bound` of an undetected leak [m^3/s], or of a change of the ringing. The cause of a change follows: the event
     `other` or else, after an alarm, the most probable of the causes that are weighed.
     """
-    if evidence.verdict == LEAK:
-        return _leak_text(case, evidence, alarm) + _remarks(case)
-    text = _bound_text(case, evidence, bound)
+    text = _leak_text(case, evidence, alarm) if evidence.verdict == LEAK else _bound_text(case, evidence, bound)
     if other is not None:
         name = other.observable.name
+        count = float(f"{1.0 / max(other.chance, 1e-4):.2g}")  # rounded to two digits, up to 10 000
         text += text_of(
             "doubt",
             "event",
@@ -58,20 +57,20 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
             # the description may contain the name of the observable already
             shown="" if name in other.description else text_of("doubt", "shown", name=name),
             sure=100.0 * other.probability,
-            rarity=_rarity_text(other.chance),
+            rarity=text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " ")),
         )
-    elif alarm is not None and case.weigh_rivals:
+    elif alarm is not None and case.weigh_rivals and evidence.verdict != LEAK:
         text += _rivals_text(case, alarm)
-    return text + _remarks(case)
+    remarks = () if case.leak is None else case.leak.remarks
+    return text + "".join(text_of("remark", remark.key, **remark.values) for remark in remarks)
 
 
 def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
     """Describe in words a leak that the test `alarm` detected, or without measured leakage the change that it makes."""
     if case.leak is None:
-        rarest = _tested_observable(case)
-        if rarest.data == "plug-in":
+        if case.tested_observable is not None and case.tested_observable.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        return text_of("leak", "details", what=f"RMS: {rarest.name}", **_change_values(rarest, case.judge.ringing))
+        return text_of("leak", "details", **_change_values(case))
     test_name = alarm.name if alarm else ""  # with the verdict `leak` there always is an alarm
     key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
     if key == "within" and not case.has_onset_within:
@@ -95,9 +94,8 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
-            rarest, leak_percent = _tested_observable(case), 100.0 * case.leak_probability(case.alarms[0])
-            values = _change_values(rarest, ringing)
-            return text_of("bound", "ringing_changed", what=rarest.name, leak=leak_percent, **values)
+            leak_percent = 100.0 * case.leak_probability(case.alarms[0])
+            return text_of("bound", "ringing_changed", leak=leak_percent, **_change_values(case))
         return _ringing_text(evidence, ringing, case.judge.provider)
     mean_pump_flow, _ = leak.pump_flow
     # a comparison with healthy recordings bounds the mean flow over the recording, and not that since an onset
@@ -135,16 +133,13 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     return text if ringing.healthy else text + text_of("bound", "start")
 
 
-def _tested_observable(case: Case) -> Observable:
-    """Return the observable that raised the alarm of a detector that does not measure leakage."""
-    assert case.tested_observable is not None
-    return case.tested_observable
-
-
-def _change_values(observable: Observable, ringing: Ringing | None) -> dict[str, Any]:
-    """Compute the values for a text on a change of the ringing: its size [%], and its onset or what it is against."""
-    percent = 100.0 * abs(np.expm1(observable.size))  # `size`: change of the logarithm of the RMS
-    return {"percent": percent, "where": _onset_text(observable) or _against_text(ringing)}
+def _change_values(case: Case) -> dict[str, Any]:
+    """Compute the values for a text on the change of the ringing that raised an alarm."""
+    rarest = case.tested_observable
+    assert rarest is not None
+    percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
+    where = _onset_text(rarest) or _against_text(case.judge.ringing)
+    return {"what": rarest.name, "percent": percent, "where": where}
 
 
 def _against_text(ringing: Ringing | None) -> str:
@@ -190,15 +185,3 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
 def _onset_text(observable: Observable) -> str:
     """State the time [s] at which the change of an observable began; "" for an observable without an onset."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
-
-
-def _rarity_text(chance: float) -> str:
-    """State the p-value `chance` of a change in words, as 1 in n healthy recordings, with n up to 10 000."""
-    count = float(f"{1.0 / max(chance, 1e-4):.2g}")  # rounded to two digits
-    return text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " "))
-
-
-def _remarks(case: Case) -> str:
-    """Join the texts of all remarks on the measured leakage; "" if there are no remarks or no leakage is measured."""
-    leak = case.leak
-    return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

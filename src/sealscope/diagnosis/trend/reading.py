@@ -227,12 +227,12 @@ def build_timeline(
             scales.append(point.scale)
         elif point.group >= 0 and scales[point.group] is None:
             scales[point.group] = point.scale  # the first that is known
-    differences = [
-        f"position or angle is scaled by {100.0 * _relative_change(scale, scales[0]):+.2g} %: a sensor exchanged, or "
-        "another machine"
-        for scale in scales
-    ]
-    return points, ("", *differences[1:]) if scales else ()
+    differences = [""] * len(scales)
+    for number, scale in enumerate(scales[1:], 1):
+        percent = 0.0 if scale is None or scales[0] is None else 100.0 * (scale / scales[0] - 1.0)
+        cause = "a sensor exchanged, or another machine"
+        differences[number] = f"position or angle is scaled by {percent:+.2g} %: {cause}"
+    return points, tuple(differences)
 
 
 def _group_scales(scales: Sequence[float | None]) -> list[int]:
@@ -316,11 +316,6 @@ def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> l
 def _join_files(readings: Iterable[LeakReading]) -> str:
     """Join up to three file names of recordings to a text for messages."""
     return join_names((reading.file for reading in readings), 3)
-
-
-def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative difference of the ratio `scale` of displacement to area from `other`; 0 if one is None."""
-    return 0.0 if scale is None or other is None else scale / other - 1.0
 
 
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:

@@ -113,11 +113,7 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Compute the present leakage at `pressure` [Pa], with an interval that includes the error of the machine's sizes.
-
-    `total` is the estimate with its own interval [L/min], and `size_deviation` the relative standard error of the
-    machine's sizes.
-    """
+    """Add the error of the machine's sizes to the interval of the present leakage `total` [L/min]."""
     half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
     return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
