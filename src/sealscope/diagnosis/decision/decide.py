@@ -33,7 +33,7 @@ import numpy as np
 from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.decision.reasons import reason_of
+from sealscope.diagnosis.decision.reasons import leak_text, no_leak_text, text_of
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
 from sealscope.diagnosis.priors.decision import DECISION
@@ -78,7 +78,9 @@ def decide(
         observables += [observable for report in rivals for observable in report.observables]
     case = Case(judge, observables, null, false_alarm_probability, weigh_rivals)
     alarm = next((alarm for alarm in case.alarms if case.shows_leak(alarm)), None)
-    return _decide_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+    evidence = _decide_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+    remarks = [] if case.leak is None else [text_of("remark", note.key, **note.values) for note in case.leak.remarks]
+    return replace(evidence, reason="".join([evidence.reason, *remarks]))
 
 
 def _decide_without_leak(case: Case) -> Evidence:
@@ -92,17 +94,15 @@ def _decide_without_leak(case: Case) -> Evidence:
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
-    cause = None if other is None else other.cause
-    evidence = Evidence(verdict, reason="", cause=cause, rarest_chance=case.rarest_chance)
-    evidence = _add_tests(case, evidence, alarm or next(iter(case.tests), None))
+    fields: dict[str, Any] = {"cause": None if other is None else other.cause, "rarest_chance": case.rarest_chance}
     if leak is not None:
-        evidence = replace(
-            evidence,
-            bound_lpm=bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
-            total_leakage=leak.total(detectable_flow=_findable_step(case)),
-            course=leak.history(onset_s=None),
-        )
-    return replace(evidence, reason=reason_of(case, evidence, alarm, bound, other))
+        fields |= {
+            "bound_lpm": bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
+            "total_leakage": leak.total(detectable_flow=_findable_step(case)),
+            "course": leak.history(onset_s=None),
+        }
+    evidence = _add_tests(case, Evidence(verdict, reason="", **fields), alarm or next(iter(case.tests), None))
+    return replace(evidence, reason=no_leak_text(case, evidence, alarm, bound, other))
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
@@ -130,7 +130,7 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
     if onset is not None:
         fields |= {"onset_s": onset.value, "onset_interval_s": (onset.low, onset.high)}
     evidence = _add_tests(case, Evidence(LEAK, reason="", **fields), alarm)
-    return replace(evidence, reason=reason_of(case, evidence, alarm, bound=np.inf, other=None))
+    return replace(evidence, reason=leak_text(case, evidence, alarm))
 
 
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:

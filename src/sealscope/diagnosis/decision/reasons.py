@@ -17,7 +17,6 @@ from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (
     AGAINST,
     CANNOT_TELL,
-    LEAK,
     NO_LEAK,
     PRESSURE_RESPONSE,
     WITHIN,
@@ -38,14 +37,13 @@ def text_of(table: str, key: str, **values: Any) -> str:
     return _texts()[table][key].format(**values)
 
 
-def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict in words.
+def no_leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
+    """Compose the reason why no leak is stated.
 
-    For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
-    upper `bound` of an undetected leak [m^3/s], or of a change of the ringing. The cause of a change follows: the event
-    `other` or else, after an alarm, the most probable of the causes that are weighed.
+    The text states the 95 % upper `bound` of an undetected leak [m^3/s], or of a change of the ringing. The cause of a
+    change follows: the event `other` or else, after an `alarm`, the most probable of the causes that are weighed.
     """
-    text = _leak_text(case, evidence, alarm) if evidence.verdict == LEAK else _bound_text(case, evidence, bound)
+    text = _bound_text(case, evidence, bound)
     if other is not None:
         name = other.observable.name
         count = float(f"{1.0 / max(other.chance, 1e-4):.2g}")  # rounded to two digits, up to 10 000
@@ -59,20 +57,18 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
             sure=100.0 * other.probability,
             rarity=text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " ")),
         )
-    elif alarm is not None and case.weigh_rivals and evidence.verdict != LEAK:
+    elif alarm is not None and case.weigh_rivals:
         text += _rivals_text(case, alarm)
-    remarks = () if case.leak is None else case.leak.remarks
-    return text + "".join(text_of("remark", remark.key, **remark.values) for remark in remarks)
+    return text
 
 
-def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
+def leak_text(case: Case, evidence: Evidence, alarm: LeakTest) -> str:
     """Describe in words a leak that the test `alarm` detected, or without measured leakage the change that it makes."""
     if case.leak is None:
         if case.tested_observable is not None and case.tested_observable.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
         return text_of("leak", "details", **_change_values(case))
-    test_name = alarm.name if alarm else ""  # with the verdict `leak` there always is an alarm
-    key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
+    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name, "level")
     if key == "within" and not case.has_onset_within:
         key = "older"
     total = evidence.total_leakage

@@ -43,7 +43,6 @@ class RmsBlocks:
     # (n, 4), see `DUTY`: log RMS of the command, of its rate and of the pressure difference dp, and mean(dp)/RMS(dp)
     duty: Array
     chambers: tuple[str, ...]  # names of the chamber pressures
-    phases: int  # number of blocks per cycle of the duty; 1 if a block is a whole cycle or longer, or without one
     cycle: float | None  # period of the duty [s], None if nothing repeats
     frozen: str | None = None  # description of the first block with a stuck pressure reading, if any
     n_left_out: int = 0  # number of blocks that were left out because samples are missing
@@ -126,7 +125,7 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     bounds, phases = _block_bounds(transformed[0].inside(), recording.rate, cycle)
     if len(bounds) == 1:  # too short for a block
         no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
-        return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, phases, cycle)
+        return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, cycle)
     log_rms, duty = _measure_blocks(recording, transformed, bounds)
     times = recording.t[0] + bounds / recording.rate
     is_complete = ~flag_bridged(recording, bounds)
@@ -141,8 +140,7 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     # starts of the complete blocks, and the end of the last one
     end = times[1:][is_complete][-1:] if is_complete.any() else times[:1]
     edges = np.append(times[:-1][is_complete], end)
-    n_left_out = int(np.count_nonzero(~is_complete))
-    return RmsBlocks(edges, log_rms, duty, chambers, phases, cycle, frozen, n_left_out)
+    return RmsBlocks(edges, log_rms, duty, chambers, cycle, frozen, n_left_out=int(np.count_nonzero(~is_complete)))
 
 
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
