@@ -40,7 +40,7 @@ from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveRise
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, Cause, Evidence
+from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.formats.timebase import clock_text, counts_from_1970
@@ -199,11 +199,12 @@ class Watch:
         leak = self.leak
         probability = self._false_alarm_probability(STEP, self.block_seconds) if leak is None else leak.allowed
         measure = None if leak is None and not len(self._compared) else self._measure(probability)
+        report = Observed(WATCH, leak=measure)
         if measure is None or (leak is None and not math.isfinite(measure.bound_flow)):
             reasons = f": {', '.join(self.counters)}" if self.counters else ""
-            return Evidence(CANNOT_TELL, f"waits for the first blocks{reasons}", detector=WATCH, usable=False)
+            report = Observed(WATCH, lack=f"waits for the first blocks{reasons}")
         # other causes were weighed before the alarm (`_explain`)
-        return decide(Observed(WATCH, leak=measure), (), HealthyNull(), probability, weigh_rivals=False)
+        return decide(report, (), HealthyNull(), probability, weigh_rivals=False)
 
     def _measure(self, probability: float) -> LeakMeasure:
         """Describe the detected leak or, without one, the present score and the bound of the test for a step.

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.trend.reading import (
@@ -24,7 +27,7 @@ from sealscope.diagnosis.trend.reading import (
 )
 from sealscope.diagnosis.trend.trend_leak import decide_trend
 from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, find_episodes, outlier_excess
-from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK, Evidence, Verdict
+from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, Evidence, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import MachineState, state_of
@@ -299,7 +302,8 @@ def trend(
     notes = [point.note for point in points if point.note]
     lack = f"no recording states a level: {notes[0]}" if notes else "no recording states a level"
     result = Trend(
-        decision=Evidence(CANNOT_TELL, lack, usable=False),  # replaced by `_add_episodes` if recordings are compared
+        # replaced by `_add_episodes` if there are comparable recordings
+        decision=decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0),
         basis=compared[0].basis if compared else None,
         unit="L/min" if states_flow else "%",
         pressure=float(np.median([point.pressure for point in compared])) if states_flow else None,
