@@ -110,7 +110,7 @@ class Examination:
 
         Detectors that measure the leak (`ORDER`) run one after the other until one of them decides; all others always
         run. The verdict cannot be "no leak" if a measuring detector failed, or if none of the given healthy recordings
-        could be compared by it.
+        could be compared, by all detectors or by a measuring one.
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
         # the test results in these reports may show causes other than a leak, whichever detector decides

@@ -34,7 +34,7 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect the `detector`'s summaries of healthy recordings, as far as they have one, stored or by its `learn`."""
+    """Collect a detector's summaries of healthy recordings, stored or computed by its `learn`; some may have none."""
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

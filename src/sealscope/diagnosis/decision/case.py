@@ -133,8 +133,8 @@ class Case:
     def shows_leak(self, alarm: LeakTest) -> bool:
         """Return True if a leak probably caused an `alarm`, or if an internal and an external leak cannot be separated.
 
-        They cannot if the probability of either is above `named`, that of the external leak alone is not, and each of
-        the two is possible (above 1 - `sure`; limits in `[explanation]` of `priors.toml`).
+        They cannot if the probability of the two together is above `named`, that of the external leak alone is not, and
+        the probability of each is above 1 - `sure` (limits in `[explanation]` of `priors.toml`).
         """
         limits, leak = DECISION.explanation, self.leak_probability(alarm)
         if leak > limits.leak:

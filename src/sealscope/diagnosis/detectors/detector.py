@@ -90,7 +90,7 @@ def make_observable(
 def validate_report(report: Any, name: str) -> Observed:
     """Check the report, an `Observed` or a single `Observable`, of the detector called `name`; mark it with this name.
 
-    Raises TypeError, ValueError, or ArithmeticError for a score that is not finite.
+    Raises TypeError or ValueError if it does not fit, and ArithmeticError for a score that is not finite.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))

@@ -204,7 +204,7 @@ def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
 
 
 def mean_flow(flows: Array, errors: Array) -> Estimate:
-    """Average the flows of n blocks (n,) with standard `errors` (n,), and add these to the scatter of the flows."""
+    """Compute the mean of n `flows`, whose standard error is due to their own `errors` and to their scatter."""
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
     return Estimate(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))

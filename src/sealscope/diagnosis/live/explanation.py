@@ -48,8 +48,8 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     to the outside from a sensor fault; until then, only a leak past piston or pump counts as a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable explanation
-    without a leak. It is `UNKNOWN` if the blocks show no significant change (p-value below `_MAX_CHANCE`) of the kind
-    `data` that could be explained so.
+    without a leak. It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if
+    a leak, although more probable, affects none of the significant changes.
     """
     leak_names = ALARMING if is_settled else LEAK_EVENTS
     leak_events = [event for event in load_events() if event.name in leak_names]

@@ -91,8 +91,8 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        The variances by the prior, for its degrees of freedom, and by n changes between neighbours in a group, for n
-        degrees of freedom, are averaged.
+        Its square is the mean of two variances: that of the prior, weighted by its degrees of freedom, and that of the
+        changes between neighbours in a group, weighted by their number.
         """
         prior = self.prior
         # a change between neighbours has twice the variance of a level
@@ -156,9 +156,9 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        Each is combined with several prior scales of its size. A step is some multiples of the scatter tau
-        (`change.steps` in `priors.toml`). A growth, in units per month, rises by tau in some multiples of the median
-        interval of recordings (`change.intervals`).
+        Each is combined with several prior scales of its size: for a step, multiples of the scatter tau (`change.steps`
+        in `priors.toml`); for a growth per month, tau over multiples of the median interval of recordings
+        (`change.intervals`).
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
