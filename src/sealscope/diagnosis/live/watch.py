@@ -213,7 +213,7 @@ class Watch:
         are those of a laminar leak, conductance times mean pressure; `flow_factors` are the ratios of the smallest and
         the largest possible flow to these.
         """
-        leak, estimator = self.leak, self.estimator
+        leak, estimator = self.leak, self._used_estimator
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
         else:
@@ -265,7 +265,7 @@ class Watch:
         if not follows:
             self._samples.restart("pauses between samples")
         for run in self._samples.runs(remove_dropouts(samples)):
-            results = self.estimator.take(run)
+            results = self._used_estimator.take(run)
             while True:
                 with np.errstate(all="ignore"):  # sums of impossible readings may overflow
                     result = next(results, None)
@@ -275,10 +275,10 @@ class Watch:
                     self._samples.count(result.counter)
                 else:
                     yield self.judge(result), self.leak
-            self._samples.is_final = self.estimator.has_begun
+            self._samples.is_final = self._used_estimator.has_begun
 
     @property
-    def estimator(self) -> Estimator:
+    def _used_estimator(self) -> Estimator:
         """Estimator of the conductance for the channels in use; a new one if a position came later."""
         if self._estimator is None or self._estimator.method != self.method:
             if self.method == PressureEstimator.method:
@@ -381,7 +381,7 @@ class Watch:
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
-            states_lpm = self._states_litres and self.estimator.states_level
+            states_lpm = self._states_litres and self._used_estimator.states_level
             self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, states_lpm=states_lpm)
             self._learning = BaselineLearning()
 
@@ -432,14 +432,14 @@ class Watch:
             self._forget()
             return UNKNOWN
         with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
-            observables = self.estimator.observables(self._since, block.end, rise.interval.value)
+            observables = self._used_estimator.observables(self._since, block.end, rise.interval.value)
         if observables is None:
             return RiseExplanation(is_leak=True)
         is_settled = n_since >= _EXPLANATION.settles
-        explanation = explain_rise(observables, self.estimator.data, rise.interval, is_settled)
+        explanation = explain_rise(observables, self._used_estimator.data, rise.interval, is_settled)
         if explanation.other_events and is_settled:
             self._samples.count(f"changes that are no leak: {explanation.other_events}")
-            self.estimator.relearn(rise.interval.high)
+            self._used_estimator.relearn(rise.interval.high)
             self._forget()
         return explanation
 
@@ -450,7 +450,7 @@ class Watch:
         with healthy recordings if the estimator states levels. Without either, nothing is tested.
         """
         healthy: HealthyLevel | None = self.baseline
-        if healthy is None and self.estimator.states_level:
+        if healthy is None and self._used_estimator.states_level:
             healthy = self.healthy
         if healthy is None:
             return
@@ -515,7 +515,7 @@ class Watch:
             rise_sd=rise.deviation,
             pressure=block.pressure,
             test=rise.test,
-            cause=cause or self.estimator.cause,
+            cause=cause or self._used_estimator.cause,
             reason="; ".join(filter(None, texts)),
             score=rise.score,
             threshold=threshold,
@@ -550,7 +550,7 @@ class Watch:
         """
         if not self._states_litres:
             return estimate
-        estimator = self.estimator
+        estimator = self._used_estimator
         lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
         mean_lpm = float(lpm.mean())
         # `noise`: actual over stated variance of the conductances
@@ -596,7 +596,7 @@ class Watch:
         watch = cls(_parse_rig(require_part(state, "rig", str)), rate, hours, litres=litres)
         restore_attributes(watch, _SAVED, state, _SAVED_TYPES)
         if (estimator := require_part(state, "estimator", (Mapping, type(None)))) is not None:
-            watch.estimator.load_state(estimator)
+            watch._used_estimator.load_state(estimator)
         return watch
 
 

@@ -49,18 +49,19 @@ def decide_trend(
     allowed probability of a false alarm is `interval` divided by `years`, the mean time between false alarms.
     """
     wear = episode.wear
+    before, since = _split_at_onset(points, wear)
     # `interval` over the mean time until a healthy machine scores as high, exp(log_days); > 0 even if that underflows
     chance = float(np.clip(np.exp(np.log(interval) - episode.log_days), np.finfo(float).tiny, 1.0))
     if points[0].basis == "ringing":
-        report = _report_ringing(points, wear, chance)
+        report = _report_ringing(before, wear, chance)
     else:
         leak = _measure_leak(points, wear, chance, trend_units_per_level, pressure)
-        report = Observed(leak.provider, _rival_changes(points, wear), leak)
+        report = Observed(leak.provider, _rival_changes(points[-1], before, since), leak)
     if len(points) < MIN_RECORDINGS:
         lack = f"{len(points)} comparable recordings are too few, {MIN_RECORDINGS} are needed"
         report = Observed(report.provider, lack=lack)
     probability = interval / (years * DAYS_PER_YEAR)
-    return decide(report, [_report_rms_change(points, wear)], HealthyNull(), probability)
+    return decide(report, [_report_rms_change(points[-1], before)], HealthyNull(), probability)
 
 
 def _measure_leak(
@@ -119,19 +120,16 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
     return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
 
 
-def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
+def _report_ringing(before: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing (RMS of their wavelet details) since the last repair.
 
-    `chance` is the probability of such a decrease in a healthy machine.
+    `chance` is the probability of such a decrease in a healthy machine; `before` are the recordings before its onset.
     """
     size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
     # a score is twice the logarithm of a likelihood ratio, here of 1 / chance
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
-    ringing = None
-    if wear.onset is not None:
-        before, _ = _split_at_onset(points, wear)
-        ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated
-    return Observed(RMS_CHANGE, (fall,), ringing=ringing)
+    ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated
+    return Observed(RMS_CHANGE, (fall,), ringing=None if wear.onset is None else ringing)
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
@@ -145,16 +143,18 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
     return before, comparable[len(before) :]
 
 
-def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
+def _rival_changes(
+    last: TrendPoint, before: Sequence[TrendPoint], since: Sequence[TrendPoint]
+) -> tuple[Observable, ...]:
     """Test the other terms of the volume balance for a change at the onset of the leak, which may explain the increase.
 
-    Only recordings whose balance has the same terms as that of the last one are used. The result is empty if there are
-    none from before or none since the onset, or if the last recording has no balance or several.
+    Recordings `before` and `since` the onset are compared, if their balance has the same terms as that of the `last`
+    one. The result is empty if there are none, or if the last recording has no balance or several.
     """
-    names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
+    names = [roles.names for roles in last.terms]  # names of the terms of each balance
     sums_before, sums_since = (
         [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]
-        for part in _split_at_onset(points, wear)
+        for part in (before, since)
     )
     if not sums_before or not sums_since or len(names) != 1:
         return ()
@@ -163,19 +163,18 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     # all recordings since the onset as one; leaks in holds (`held`) are not compared
     judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure, held=None)
     healthy = [sums._replace(held=None) for sums in sums_before]
-    return rival_rises(judged, healthy, points[-1].terms)
+    return rival_rises(judged, healthy, last.terms)
 
 
-def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
-    """Test the ringing (RMS of the pressures' wavelet details) of the last recording for a change since the onset.
+def _report_rms_change(last: TrendPoint, before: Sequence[TrendPoint]) -> Observed:
+    """Test the ringing (RMS of the pressures' wavelet details) of the `last` recording for a change since the onset.
 
-    It is compared with that of the recordings before the onset that have the same channels and sampling rate. Nothing
+    It is compared with that of the recordings `before` the onset that have the same channels and sampling rate. Nothing
     is tested without them, or in a trend of the ringing itself.
     """
-    judged = points[-1].ringing
-    before, _ = _split_at_onset(points, wear)
+    judged = last.ringing
     observables: tuple[Observable, ...] = ()
-    if judged is not None and points[-1].basis != "ringing":
+    if judged is not None and last.basis != "ringing":
         healthy = [
             point.ringing
             for point in before
