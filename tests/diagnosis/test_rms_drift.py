@@ -43,7 +43,7 @@ def log_rms(noise: np.ndarray, machine: np.ndarray) -> np.ndarray:
 def blocks_of(values: np.ndarray, cycle: float | None = 1.5, duty: np.ndarray | None = None) -> RmsBlocks:
     n = len(values)
     duty = np.zeros((n, len(DUTY))) if duty is None else duty
-    return RmsBlocks(np.arange(n + 1) * BLOCK, values, duty, ("p_A", "p_B")[: values.shape[1] // 5], 1, cycle)
+    return RmsBlocks(np.arange(n + 1) * BLOCK, values, duty, ("p_A", "p_B")[: values.shape[1] // 5], cycle)
 
 
 def judge_blocks(blocks: RmsBlocks, probability: float) -> Evidence:

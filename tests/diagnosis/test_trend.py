@@ -253,7 +253,7 @@ def test_a_rise_that_another_event_explains_is_no_leak(monkeypatch: pytest.Monke
     alone = trend_of(days, healthy=8)
     assert alone.verdict == "leak" and alone.decision.cause == "piston or pump leak"
     lost = Observable(name="external leak A", data="rise", score=200.0, chance=1e-40)
-    monkeypatch.setattr(trend_leak, "_rival_changes", lambda points, wear: (lost,))
+    monkeypatch.setattr(trend_leak, "_rival_changes", lambda last, before, since: (lost,))
     trend = trend_of(days, healthy=8)
     assert trend.alarm is not None and trend.verdict != "leak"
     assert trend.decision.cause == "external leak" and trend.state.cause == "external leak"

@@ -47,33 +47,16 @@ def check_probability(probability: float) -> None:
 
 @dataclass(frozen=True, eq=False)
 class Examination:
-    """A recording to judge and its healthy baseline, prepared for one detector or all of them.
+    """A recording to judge and its healthy baseline, prepared for one detector or all of them."""
 
-    Attributes
-    ----------
-    recording : Recording
-        The samples to judge. Gaps are bridged and no sample is missing.
-    baseline : sequence of Recording or SummarisedRecording
-        Leak-free recordings of the same machine, possibly none.
-    false_alarm_probability : float
-        Allowed probability of the verdict "leak" on a leak-free recording.
-    rig : Rig, str or path-like
-        Sizes of the machine that the detectors assume.
-    distrust : str or None
-        Reason why the pressures cannot be trusted, in which case no detector runs.
-    refusal : str or None
-        Reason why none of the given healthy recordings can be compared; None if one can, or if none was given.
-    share, judged_until : float
-        Fractions of the original samples: those that `recording` contains, and those up to its last time.
-    """
-
-    recording: Recording
-    baseline: Sequence[Healthy] = ()
+    recording: Recording  # samples to judge; gaps are bridged and no sample is missing
+    baseline: Sequence[Healthy] = ()  # leak-free recordings of the same machine
     _: KW_ONLY
-    false_alarm_probability: float
-    rig: Rig | str | os.PathLike[str] = "thesis"
-    distrust: str | None = None
-    refusal: str | None = None
+    false_alarm_probability: float  # allowed probability of the verdict "leak" on a leak-free recording
+    rig: Rig | str | os.PathLike[str] = "thesis"  # sizes of the machine that the detectors assume
+    distrust: str | None = None  # reason why the pressures cannot be trusted, in which case no detector runs
+    refusal: str | None = None  # reason why none of the given healthy recordings can be compared
+    # fractions of the original samples: those that `recording` contains, and those up to its last time
     share: float = 1.0
     judged_until: float = 1.0
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)  # by detector; `replace` starts anew
@@ -84,19 +67,15 @@ class Examination:
         Healthy recordings of which only summaries are stored are left out, as these may rest on other channels.
         """
         names = set(channels)
-
-        def select_channels(recording: Recording) -> Recording:
-            """Return the recording with those of its channels that are in `names`."""
-            return recording.only(name for name in recording.channels if name in names)
-
-        baseline = [select_channels(healthy) for healthy in self.baseline if isinstance(healthy, Recording)]
-        return replace(self, recording=select_channels(self.recording), baseline=baseline)
+        healthy = [entry for entry in self.baseline if isinstance(entry, Recording)]
+        judged, *baseline = (
+            recording.only(name for name in recording.channels if name in names)
+            for recording in (self.recording, *healthy)
+        )
+        return replace(self, recording=judged, baseline=baseline)
 
     def report(self, name: str) -> Observed:
-        """Return the observations of the detector called `name`, which runs at the first call only.
-
-        Raises KeyError if there is no such detector.
-        """
+        """Return the observations of the detector called `name`, which runs at the first call only."""
         if name not in self._reports:
             rig = load_rig(self.rig)
             self._reports[name] = run_detector(name, self.recording, self.baseline, rig, distrust=self.distrust)
@@ -131,7 +110,7 @@ class Examination:
 
         Detectors that measure the leak (`ORDER`) run one after the other until one of them decides; all others always
         run. The verdict cannot be "no leak" if a measuring detector failed, or if none of the given healthy recordings
-        could be compared, for all detectors (`refusal`) or for a measuring one (`Observed.refusal`).
+        could be compared, by all detectors or by a measuring one.
         """
         names = sorted(detectors(), key=rank)  # the detectors of `ORDER` first
         # the test results in these reports may show causes other than a leak, whichever detector decides
@@ -146,10 +125,7 @@ class Examination:
         return combine(list(decisions.values()), refusal)
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
-        """Decide from the observations of the detector called `name` if the machine leaks.
-
-        `reports` of other detectors may show another cause of an alarm, which competes with a leak if `weigh_rivals`.
-        """
+        """Decide from the observations of the detector called `name` if the machine leaks (`decide`)."""
         probability = self.false_alarm_probability
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)

@@ -34,10 +34,7 @@ Healthy = Recording | SummarisedRecording
 
 
 def healthy_summaries(detector: Any, baseline: Sequence[Healthy]) -> list[Summary]:
-    """Collect the `detector`'s summaries of healthy recordings, either stored or computed by `detector.learn`.
-
-    Recordings without a summary by this detector are skipped.
-    """
+    """Collect a detector's summaries of healthy recordings, stored or computed by its `learn`; some may have none."""
     summaries = (
         recording.summaries.get(detector.name)
         if isinstance(recording, SummarisedRecording)

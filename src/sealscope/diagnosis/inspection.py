@@ -68,11 +68,7 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
 
 
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
-    """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted.
-
-    A recording cannot be trusted if a chamber pressure is constant or stuck, if the readings of all chamber pressures
-    are mostly clipped or mostly impossible, or if no hydraulic machine gives such channels (`find_implausibility`).
-    """
+    """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted."""
     chambers = chambers_of(recording)
     # `stuck`: names of chamber pressures that repeat one value for too long
     part, corrections, stuck, share = correct_samples(recording)
@@ -105,11 +101,10 @@ class Baselines(NamedTuple):
 def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baselines:
     """Inspect the baselines of a judged recording and choose those that can be compared with it.
 
-    A baseline is left out if it cannot be trusted, if it lacks a chamber pressure of the judged recording or has it in
-    another unit, or if its samples are those of the judged recording. Of baselines with the same samples, the one with
-    the most channels is kept. Differences of speed, load and temperature are accepted, as the detectors allow for them.
-    From the judged recording, channels that no comparable baseline has are left out, unless they change slowly, such as
-    the oil temperature: estimates from different channels would not be comparable.
+    Of baselines with the same samples, the one with the most channels is kept. Differences of speed, load and
+    temperature are accepted, as the detectors allow for them. From the judged recording, channels that no comparable
+    baseline has are left out, unless they change slowly, such as the oil temperature: estimates from different channels
+    would not be comparable.
     """
     healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest
@@ -148,10 +143,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:
-    """Find the reason why the baseline `entry` cannot be compared with `judged`; None if it can.
-
-    The reason is the severity and the text of a finding.
-    """
+    """Find severity and text of why the baseline `entry` cannot be compared with `judged`; None if it can."""
     if isinstance(entry, Inspection) and entry.defect is not None:  # no summary is stored with a defect
         return "warning", entry.defect
     if entry.digest == judged.digest:

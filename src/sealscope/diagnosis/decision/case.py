@@ -72,19 +72,18 @@ class Case:
     def tested_observable(self) -> Observable | None:
         """Observable by which a judging detector that does not measure leakage is tested for a leak; None without one.
 
-        Of those that a piston leak affects, it has the smallest p-value, as stated by the detector. The other leak
-        event, "pump leak", affects the volume balance alone, which measures leakage.
+        Of those that a piston leak affects, it has the smallest p-value, as stated by the detector.
         """
+        # the other leak event, "pump leak", affects the volume balance alone, which measures leakage
         leak = next(event for event in load_events() if event.name == LEAK_EVENTS[0])
         affected = [observable for observable in self.judge.observables if leak.affects(observable)]
         return min(affected, key=lambda observable: observable.chance, default=None)
 
     @property
     def rarest_chance(self) -> float:
-        """Probability of p-values down to the lowest one here among the observables of a healthy recording.
+        """Smallest calibrated p-value of the observables, times the number of tests (Bonferroni correction).
 
-        It is the smallest calibrated p-value times the number of tests (Bonferroni correction). Observables with the
-        same distribution in healthy recordings (`null_key`) count as one test.
+        Observables with the same distribution in healthy recordings (`null_key`) count as one test.
         """
         n_tests = len({null_key(observable) for observable in self.observables})
         return min(1.0, n_tests * min(map(self.null.chance, self.observables), default=1.0))
@@ -119,8 +118,7 @@ class Case:
 
         That is so if L_external / (L_external + L_leak) > 1 - `sure` (`[explanation]` of `priors.toml`), with the
         likelihoods L of the rise by either leak (`Observable.log_ratio_to_leak`). Priors, such as that a large external
-        leak would have been seen, do not count. The result is False for an `alarm` by another test than the comparison
-        with healthy recordings, or if rivals are not weighed.
+        leak would have been seen, do not count.
         """
         if not self.weigh_rivals or self._data_kind(alarm) != RISE:
             return False
@@ -132,14 +130,10 @@ class Case:
         )
 
     def shows_leak(self, alarm: LeakTest) -> bool:
-        """Return True if a leak probably caused an alarm, or if an internal and an external leak cannot be separated.
+        """Return True if a leak probably caused an `alarm`, or if an internal and an external leak cannot be separated.
 
-        `alarm` is the test that raised the alarm. The result is True in two cases, with the limits `leak`, `named` and
-        `sure` from the table `[explanation]` of `priors.toml`:
-
-        - The probability of a leak past piston or pump is above `leak`.
-        - The probability that it is one of the two, a leak past piston or pump or an external leak, is above `named`,
-          the probability of the external leak alone is not, and each of the two has a probability above 1 - `sure`.
+        They cannot if the probability of the two together is above `named`, that of the external leak alone is not, and
+        the probability of each is above 1 - `sure` (limits in `[explanation]` of `priors.toml`).
         """
         limits, leak = DECISION.explanation, self.leak_probability(alarm)
         if leak > limits.leak:
@@ -149,18 +143,12 @@ class Case:
         return joint > limits.named >= external and min(leak, external) > 1.0 - limits.sure
 
     def _data_kind(self, alarm: LeakTest) -> str:
-        """Return the kind of data (`Observable.data`) from which the test `alarm` was computed.
-
-        It is that of `tested_observable` without measured leakage, and `RISE` for a comparison of measured leakage with
-        healthy recordings. Otherwise it is the kind of the judging detector's first observable: volume balance and
-        pressure response list first their tests for steps, all of one kind. For a report without observables, `RISE`
-        merely fills in.
-        """
+        """Return the kind of data (`Observable.data`) from which the test `alarm` was computed."""
         if self.leak is None and self.tested_observable is not None:
             return self.tested_observable.data
-        if alarm.name == AGAINST or not self.judge.observables:
+        if alarm.name == AGAINST or not self.judge.observables:  # `RISE` merely fills in without observables
             return RISE
-        return self.judge.observables[0].data
+        return self.judge.observables[0].data  # volume balance and pressure response list first their tests for steps
 
     @cached_property
     def tests(self) -> tuple[LeakTest, ...]:
@@ -169,11 +157,7 @@ class Case:
 
     @property
     def alarms(self) -> tuple[LeakTest, ...]:
-        """Tests whose p-value is below their allowed false-alarm probability.
-
-        The test for a leak that begins within the recording (WITHIN) comes first, or last if the leak seems older than
-        the recording, so that the first alarm is the one that fits the leak best.
-        """
+        """Tests whose p-value is below their allowed false-alarm probability, the one that fits the leak best first."""
         alarms = [test for test in self.tests if test.chance < test.probability]
         return tuple(alarms if self.has_onset_within else reversed(alarms))
 
@@ -200,9 +184,8 @@ class Case:
     def leak_flow(self, alarm: LeakTest) -> Estimate | None:
         """Return the mean flow of the leak that raised an `alarm`; None if it is unknown.
 
-        After an alarm by comparison with healthy recordings, this is the flow of the rise over them; after an alarm by
-        the limit in the rig's file, the total leakage. After an alarm by a step within the recording, it is the step's
-        flow.
+        After an alarm by a step within the recording, it is the step's flow; after one by comparison with healthy
+        recordings, that of the rise over them; after one by the limit in the rig's file, the total leakage.
         """
         leak = self.leak
         if leak is None:
@@ -213,9 +196,8 @@ class Case:
     def other_event(self) -> OtherEvent | None:
         """Event other than a leak that explains a rare change with sufficient probability; None if there is none.
 
-        The observables are tried in the order of their p-values, as long as these are below the allowed probability of
-        naming an event by mistake. For each observable, single causes are tried before groups of inseparable causes
-        (`joint_causes`); the first that may be named (`_probability_of_causes`) is returned.
+        The observables are tried in the order of their p-values. For each, single causes are tried before groups of
+        inseparable causes (`joint_causes`); the first that may be named (`_probability_of_causes`) is returned.
         """
         named_events = [event for event in load_events() if event.cause and event.name not in LEAK_EVENTS]
         candidates_of = {
@@ -257,12 +239,9 @@ class Case:
 
     def _describe(self, cause: str, data_kind: str) -> str:
         """Describe in words the most probable event with a given cause that changes a kind of data."""
-
-        def probability(event: Event) -> float:
-            """Compute the probability of the event, given that this kind of data has changed."""
-            return probability_of(self.explanations, event.name, data_kind=data_kind)
-
-        return max(self._events_of(cause, data_kind), key=probability).description
+        events = self._events_of(cause, data_kind)
+        probabilities = [probability_of(self.explanations, event.name, data_kind=data_kind) for event in events]
+        return events[int(np.argmax(probabilities))].description
 
     def _events_of(self, cause: str, data_kind: str) -> list[Event]:
         """List the events with a given cause that change an observable of a kind of data (`Observable.data`)."""
@@ -317,12 +296,10 @@ def step_key(provider: str) -> str:
 
 
 def _change_tests(case: Case) -> tuple[LeakTest, ...]:
-    """Make the test for a leak from the report of a detector that does not measure leakage.
+    """Make the test for a leak, if any, from the report of a detector that does not measure leakage.
 
-    `Case.tested_observable` gives the score and the calibrated p-value (`HealthyNull.chance`). If a leak affects none,
-    the result is empty. The detector states no threshold. The threshold is therefore computed as the score with a
-    calibrated p-value equal to the allowed false-alarm probability, assuming that scores are proportional to the
-    logarithm of the detector's p-value.
+    The detector states no threshold. It is computed as the score with a calibrated p-value equal to the allowed
+    false-alarm probability, assuming that scores are proportional to the logarithm of the detector's p-value.
     """
     rarest = case.tested_observable
     if rarest is None:

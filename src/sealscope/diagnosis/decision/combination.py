@@ -27,10 +27,7 @@ ORDER = (VOLUME_BALANCE, PRESSURE_RESPONSE)
 
 
 def rank(detector: str) -> int:
-    """Return the rank of a detector by its name; of the detectors that decide, the lowest rank gives the verdict.
-
-    Detectors in `ORDER` come first, then plug-ins, which share a rank, and last the change of RMS.
-    """
+    """Return the rank of a detector by its name; of the detectors that decide, the lowest rank gives the verdict."""
     if detector == RMS_CHANGE:
         return len(ORDER) + 1
     return ORDER.index(detector) if detector in ORDER else len(ORDER)
@@ -75,15 +72,13 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:
     """Make the verdict `cannot tell` with a reason, for a recording on which no detector decides.
 
-    `ranked`: decisions of all detectors, by rank; `usable`: those of detectors that could use the recording. The first
-    usable detector gives the reason. If that is `RMS_CHANGE`, the last by rank, no other detector could use the
-    recording; the reason of the volume balance is then put first. If no detector is usable, the last built-in one by
-    rank gives the reason, because it needs the fewest channels.
+    The first `usable` detector gives the reason; without one, the last built-in detector by rank, because it needs the
+    fewest channels.
     """
     if usable:
         undecided = usable[0]
         balance_reason = next((decision.reason for decision in ranked if decision.detector == VOLUME_BALANCE), "")
-        if undecided.detector == RMS_CHANGE and balance_reason:
+        if undecided.detector == RMS_CHANGE and balance_reason:  # no other detector could use the recording
             # the balance may name a missing channel, RMS_CHANGE a higher sampling rate: the channel would help more
             undecided = replace(undecided, reason=f"the {VOLUME_BALANCE} {balance_reason}; {undecided.reason}")
     else:

@@ -33,7 +33,7 @@ import numpy as np
 from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.decision.reasons import reason_of
+from sealscope.diagnosis.decision.reasons import leak_text, no_leak_text, text_of
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
 from sealscope.diagnosis.priors.decision import DECISION
@@ -67,8 +67,7 @@ def decide(
     """Decide on a recording by the report `judge` of one detector: leak, no leak, or cannot tell.
 
     The test results (observables) in `reports`, which may contain `judge`, may show other causes, which compete with a
-    leak unless `weigh_rivals` is False. `null` is the distribution of the test results in healthy recordings of the
-    machine, and `false_alarm_probability` the allowed probability of `leak` on a leak-free recording.
+    leak unless `weigh_rivals` is False. For the other arguments see `Case`.
     """
     if judge.lack:
         return Evidence(CANNOT_TELL, judge.lack, detector=judge.provider, usable=False)
@@ -79,40 +78,37 @@ def decide(
         observables += [observable for report in rivals for observable in report.observables]
     case = Case(judge, observables, null, false_alarm_probability, weigh_rivals)
     alarm = next((alarm for alarm in case.alarms if case.shows_leak(alarm)), None)
-    return _decide_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+    evidence = _decide_without_leak(case) if alarm is None else _leak_evidence(case, alarm)
+    remarks = [] if case.leak is None else [text_of("remark", note.key, **note.values) for note in case.leak.remarks]
+    return replace(evidence, reason="".join([evidence.reason, *remarks]))
 
 
 def _decide_without_leak(case: Case) -> Evidence:
     """Decide between `no leak` and `cannot tell`, given that no test has found a leak.
 
-    The verdict is `no leak` if an undetected leak can only be small (`_bound_and_limit`). If another event explains a
-    rare change, the evidence states the event's cause. If leakage is measured, it also states the total leakage and the
-    upper bound of an undetected leak. Score and threshold are those of the test with an alarm, else of the first one.
+    The verdict is `no leak` if an undetected leak can only be small (`_bound_and_limit`). Score and threshold are those
+    of the test with an alarm, else of the first one.
     """
     alarm = next(iter(case.alarms), None)  # an alarm that has a better explanation than a leak
     leak, other = case.leak, case.other_event
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
-    cause = None if other is None else other.cause
-    evidence = Evidence(verdict, reason="", cause=cause, rarest_chance=case.rarest_chance)
-    evidence = _add_tests(case, evidence, alarm or next(iter(case.tests), None))
+    fields: dict[str, Any] = {"cause": None if other is None else other.cause, "rarest_chance": case.rarest_chance}
     if leak is not None:
-        evidence = replace(
-            evidence,
-            bound_lpm=bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
-            total_leakage=leak.total(detectable_flow=_findable_step(case)),
-            course=leak.history(onset_s=None),
-        )
-    return replace(evidence, reason=reason_of(case, evidence, alarm, bound, other))
+        fields |= {
+            "bound_lpm": bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,
+            "total_leakage": leak.total(detectable_flow=_findable_step(case)),
+            "course": leak.history(onset_s=None),
+        }
+    evidence = _add_tests(case, Evidence(verdict, reason="", **fields), alarm or next(iter(case.tests), None))
+    return replace(evidence, reason=no_leak_text(case, evidence, alarm, bound, other))
 
 
 def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
     """Make the verdict `leak`, detected by the test `alarm`, with cause, onset and, if measured, flow of the leak.
 
-    The onset is that of the step or of the rise over healthy recordings or, without measured leakage, that of the
-    change that a leak makes. No onset is stated after an alarm by the limit in the rig's file, or of a leak that seems
-    older than the recording (`Case.has_onset_within`).
+    No onset is stated after an alarm by the limit in the rig's file, or of a leak that seems older than the recording.
     """
     leak = case.leak
     if leak is None:
@@ -134,15 +130,14 @@ def _leak_evidence(case: Case, alarm: LeakTest) -> Evidence:
     if onset is not None:
         fields |= {"onset_s": onset.value, "onset_interval_s": (onset.low, onset.high)}
     evidence = _add_tests(case, Evidence(LEAK, reason="", **fields), alarm)
-    return replace(evidence, reason=reason_of(case, evidence, alarm, bound=np.inf, other=None))
+    return replace(evidence, reason=leak_text(case, evidence, alarm))
 
 
 def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
     """Return the cause of a leak that the test `alarm` detected, such as "piston or pump leak".
 
     The detector's cause names the parts that its data cannot tell apart. The pump is left out if it was tested by
-    itself, and its leak has a probability below `RAREST`. The outside is added if an external leak has a probability
-    above 1 - `sure` (`priors.toml`), or if the data alone, without priors, cannot tell (`Case.resembles_external`).
+    itself, and its leak has a probability below `RAREST`. The outside is added if an external leak is possible.
     """
     # this observable needs the pressures at the pump's ports (`terms.PUMP_TERM`), which separate pump and piston
     is_pump_observed = any(observable.name == "pump leak" for observable in case.observables)
@@ -154,12 +149,7 @@ def _leak_cause(case: Case, leak: LeakMeasure, alarm: LeakTest) -> Cause:
 
 
 def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:
-    """Compute the fields of `Evidence` on the size of a leak, by their names; none without a `flow`.
-
-    The mean `flow` is stated relative to the machine. If `leak` has a factor to L/min, it is also stated in L/min with
-    a 95 % interval, which is widened by the possible ratios of true to stated flow (`flow_factors`). Otherwise the
-    field `refuses` says that L/min are not stated.
-    """
+    """Compute the fields of `Evidence` on the size of a leak with the mean `flow`; none if it is unknown."""
     if flow is None:
         return {}
     fields: dict[str, Any] = {"relative": leak.relative(flow)}
@@ -175,10 +165,10 @@ def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:
 
 
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
-    """Compute the 95 % upper bound of a leak's mean flow [m^3/s].
+    """Compute the 95 % upper bound of a leak's mean flow [m^3/s], infinite ("any size") if it is of no use.
 
-    If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. The result
-    is infinite ("any size") if leakage was not measured, or if the bound is not below the mean flow of a moving pump.
+    If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. A bound is
+    of no use without measured leakage, or if it is not below the mean flow of a moving pump.
     """
     leak = case.leak
     if leak is None:
@@ -196,10 +186,9 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
-    If leakage is measured, both are flows [m^3/s]: the argument `bound`, and a fraction (`worth.share` in
-    `priors.toml`) of the mean flow while the pump delivers. Otherwise both are changes of the logarithm of the
-    pressures' ringing (RMS of their wavelet details). The bound is then infinite if the ringing was not measured, if a
-    test raised an alarm, or if the sampling rate is too low.
+    If leakage is measured, both are flows [m^3/s], the first being the argument `bound`. Otherwise both are changes of
+    the logarithm of the pressures' ringing (RMS of their wavelet details); the bound is then infinite if the ringing
+    was not measured, if a test raised an alarm, or if the sampling rate is too low.
     """
     if case.leak is not None:
         _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
@@ -213,23 +202,20 @@ def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
 def _findable_step(case: Case) -> float | None:
     """Compute the mean flow [m^3/s] of the smallest leak that the test for a step would detect with a high probability.
 
-    The test may use its part of the false-alarm probability. This part is converted to the uncalibrated p-value that
-    the detector must reach. The result is None if no step is tested.
+    The result is None if no step is tested.
     """
     test = next((test for test in case.tests if test.name == WITHIN), None)
     if test is None or case.leak is None or case.leak.step is None:
         return None
     chance = case.null.uncalibrated_chance(step_key(case.leak.provider), test.probability)
-    conductance = case.leak.step.detectable_step(chance)
-    return conductance * case.leak.flow_per_conductance
+    return case.leak.step.detectable_step(chance) * case.leak.flow_per_conductance
 
 
 def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evidence:
-    """Add to `evidence` fields of the judging detector's report and the results of its tests.
+    """Add to `evidence` fields of the judging detector's report, and the results of its tests, if it made any.
 
-    From the report come the detector's name, the used fraction of the recording and, if measured, the ratio of
-    displacement to area. Score, threshold and p-value are those of the test `judging`; if it is None, no test result is
-    added. If there are several tests, `parts` has an entry for each.
+    Score, threshold and p-value are those of the test `judging`. If there are several tests, `parts` has an entry for
+    each.
     """
     judge = case.judge
     evidence = replace(evidence, detector=judge.provider, share=judge.share, judged_until=judge.judged_until)
@@ -238,21 +224,15 @@ def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evid
         evidence = replace(evidence, ratio=ratio.value, ratio_interval=(ratio.low, ratio.high))
     if judging is None:
         return evidence
-    parts = tuple(
-        Evidence(
-            LEAK if evidence.verdict == LEAK and test.chance < test.probability else NO_LEAK,
-            reason=test.name,
-            score=test.score,
-            threshold=test.threshold,
-            detector=test.name,
-            chance=max(test.chance, RAREST),
-        )
-        for test in case.tests
-    )
-    return replace(
-        evidence,
-        score=judging.score,
-        threshold=judging.threshold,
-        chance=max(judging.chance, RAREST),
-        parts=parts if len(parts) > 1 else (),
-    )
+    parts = []
+    if len(case.tests) > 1:
+        for test in case.tests:
+            has_alarm = evidence.verdict == LEAK and test.chance < test.probability
+            part = Evidence(LEAK if has_alarm else NO_LEAK, reason=test.name, detector=test.name)
+            parts.append(_with_result(part, test))
+    return replace(_with_result(evidence, judging), parts=tuple(parts))
+
+
+def _with_result(evidence: Evidence, test: LeakTest) -> Evidence:
+    """Return the evidence with score, threshold and p-value of a test."""
+    return replace(evidence, score=test.score, threshold=test.threshold, chance=max(test.chance, RAREST))

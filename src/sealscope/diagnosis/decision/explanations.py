@@ -69,11 +69,10 @@ def explain(
 ) -> tuple[Explanation, ...]:
     """Find the sets of events that may explain the tests (`observables`) of a recording, the most probable first.
 
-    `chance` computes the p-value of an observable (`null.HealthyNull.chance`), by default the one that its detector
-    states. `rise` is the leakage above that of healthy recordings, None without such recordings. Returns all single
-    events of `events.toml`, such as a sensor drift, and combinations of up to `MAX_EVENTS` events, each with a log
-    Bayes factor, summed over kinds of data, above `MIN_LOG_FACTOR`. Their probabilities add up to 1, as they are given
-    that some event has happened.
+    `chance` computes the p-value of an observable, by default the one that its detector states. `rise` is the leakage
+    above that of healthy recordings, None without such recordings. Returns all single events of `events.toml`, and
+    combinations of up to `MAX_EVENTS` events, each with a log Bayes factor, summed over kinds of data, above
+    `MIN_LOG_FACTOR`. Their probabilities add up to 1, as they are given that some event has happened.
     """
     events = load_events()
     log_factors = [(observable, _log_factor(observable, chance(observable), rise)) for observable in observables]
@@ -104,35 +103,34 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
         log factor = max(B - (L - l) / (1 + 2 m L), 0).
 
     Healthy recordings show how rare the best description is, but are too few to show which term is the best. Only the
-    judged recording shows this. `log_factors` has each observable with its log Bayes factor, calibrated and corrected
-    for the misfit. Factors of other kinds of data are returned unchanged.
+    judged recording shows this. Factors of other kinds of data are returned unchanged.
     """
-    likelihoods = [log_bayes_factor(observable.chance) for observable, _ in log_factors]
-    volumes = [k for k, (observable, _) in enumerate(log_factors) if observable.data == VOLUMES]
-    if not volumes:
+    terms = [(log_bayes_factor(term.chance), factor) for term, factor in log_factors if term.data == VOLUMES]
+    if not terms:
         return list(log_factors)
-    best = max(volumes, key=likelihoods.__getitem__)
-    _, best_factor = log_factors[best]
-    misfit_divisor = 1.0 + 2.0 * DECISION.explanation.misfit * likelihoods[best]
-    factors = list(log_factors)
-    for k in volumes:
-        observable, _ = log_factors[k]
-        difference = (likelihoods[best] - likelihoods[k]) / misfit_divisor
-        factors[k] = (observable, max(best_factor - difference, 0.0))
+    best_likelihood, best_factor = max(terms, key=lambda term: term[0])
+    divisor = 1.0 + 2.0 * DECISION.explanation.misfit * best_likelihood
+    factors = []
+    for observable, factor in log_factors:
+        deficit = (best_likelihood - log_bayes_factor(observable.chance)) / divisor
+        is_term = observable.data == VOLUMES
+        factors.append((observable, max(best_factor - deficit, 0.0) if is_term else factor))
     return factors
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Divide log Bayes factors by 1 + 2 m B, since a model describes its data only approximately.
-
-    B is the largest log factor, at least 0, of observables with the same `data`, and m is the misfit
-    (`explanation.misfit` in `priors.toml`).
-    """
-    max_factor: dict[str, float] = {}
-    for observable, factor in log_factors:
-        max_factor[observable.data] = max(factor, max_factor.get(observable.data, 0.0))
+    """Divide log Bayes factors by 1 + 2 m B, with the largest factor B of the same data (module's docstring)."""
+    max_factors = _largest_by_data(log_factors)
     slope = 2.0 * DECISION.explanation.misfit
-    return [(observable, factor / (1.0 + slope * max_factor[observable.data])) for observable, factor in log_factors]
+    return [(observable, factor / (1.0 + slope * max_factors[observable.data])) for observable, factor in log_factors]
+
+
+def _largest_by_data(log_factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
+    """Find the largest log Bayes factor, at least 0, of each kind of data."""
+    largest: dict[str, float] = {}
+    for observable, factor in log_factors:
+        largest[observable.data] = max(factor, largest.get(observable.data, 0.0))
+    return largest
 
 
 def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_Gains]]) -> tuple[float, frozenset[str]]:
@@ -141,8 +139,8 @@ def _explain_by_group(group: Sequence[Event], gains_of: Mapping[str, Sequence[_G
         log posterior = sum of log priors of the events + sum over kinds of data of the largest log Bayes factor.
 
     For the leakage's rise over healthy recordings (the kind of data `RISE`), the negative factors of events that
-    contradict the rise are added. `gains_of` has the log Bayes factors of each event by kind of data, in one mapping
-    for each possible onset (`_possible_gains`). The combination of onsets with the largest sum counts.
+    contradict the rise are added. `gains_of` has the result of `_possible_gains` for each event; the combination of
+    onsets with the largest sum counts.
     """
     log_prior = float(sum(np.log(event.probability) for event in group))
     best, explained = -np.inf, frozenset[str]()
@@ -179,16 +177,16 @@ def _possible_gains(
 def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:
     """Compute the log Bayes factors (at least 0) of an event that begins within the recording, by kind of data.
 
-    `factors` are test results (observables) with the log Bayes factors of a change. The result for a kind of data is
-    the largest sum of a log factor and the log odds from the prior on the event's size, over
+    The result for a kind of data is the largest sum of a log factor and the log odds from the prior on the event's
+    size, over
 
     - observables that the event affects, or changes by a common scale of both pressures (`_agree_on_scale`);
     - side effects (`Event.may_disturb`) on kinds of data in which no observable of the first group has a log factor
       above `MIN_LOG_FACTOR`, if one of another kind does. Their log factors are limited to the largest one of the first
       group: a much clearer change has another cause.
 
-    The observable of the first group with the largest log factor, without the odds, gives the time of the event; only
-    changes that may be of that time count (`_coincide`). If the first group is empty, so is the result.
+    The observable of the first group with the largest log factor gives the time of the event; only changes that may be
+    of that time count.
     """
     affected = [(observable, gain) for observable, gain in factors if event.affects(observable)]
     affected += _agree_on_scale([(observable, gain) for observable, gain in factors if event.scales(observable)])
@@ -213,12 +211,11 @@ def _gains_at_onset(event: Event, factors: Sequence[tuple[Observable, float]]) -
 def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Reduce the log Bayes factors of changes that a common scale of both pressures does not explain well.
 
-    `factors` has observables with their log Bayes factors. Each observable states the logarithm v of the scale that
-    would cause its change. If k is the logarithm of the common scale, the log factor is reduced by ((v - k) / s)^2 / 2,
-    but not below 0. The variance s^2 is that of v plus the square of `explanation.scale` of `priors.toml`, the error of
-    the law that relates the change to the scale. For k, each v is tried, and the one with the largest sum over kinds of
-    data of the largest reduced factor is used. Observables without a stated scale are left out. The result is empty if
-    no factor remains above 0.
+    Each observable states the logarithm v of the scale that would cause its change, or is left out. If k is the
+    logarithm of the common scale, the log factor is reduced by ((v - k) / s)^2 / 2, but not below 0. The variance s^2
+    is that of v plus that of the law that relates the change to the scale (`explanation.scale` of `priors.toml`). For
+    k, each v is tried, and the one with the largest sum over kinds of data of the largest reduced factor is used. The
+    result is empty if no factor remains above 0.
     """
     best: list[tuple[Observable, float]] = []
     best_sum, misfit = 0.0, DECISION.explanation.scale
@@ -228,21 +225,17 @@ def _agree_on_scale(factors: Sequence[tuple[Observable, float]]) -> list[tuple[O
             (observable, max(gain - 0.5 * (scale.value - candidate.value) ** 2 / (scale.deviation**2 + misfit**2), 0.0))
             for observable, gain, scale in scales
         ]
-        largest: dict[str, float] = {}
-        for observable, gain in reduced:
-            largest[observable.data] = max(gain, largest.get(observable.data, 0.0))
-        if sum(largest.values()) > best_sum:
-            best, best_sum = reduced, sum(largest.values())
+        if (total := sum(_largest_by_data(reduced).values())) > best_sum:
+            best, best_sum = reduced, total
     return best
 
 
 def _log_factor(observable: Observable, chance: float, rise: LeakRise | None) -> float:
     """Compute the log Bayes factor of a change of an observable from its p-value `chance`.
 
-    A leak also raises the estimates of similar quantities, such as an external leakage. The observable of such a
-    quantity states `log_ratio_to_leak`, the log likelihood ratio of its description of the change to that by a leak.
-    Its log factor is limited to that of the leakage's rise over healthy recordings (`rise`) plus this ratio, but not
-    below 0.
+    A leak also raises the estimates of similar quantities, such as an external leakage, whose observables state
+    `log_ratio_to_leak`. Their log factor is limited to that of the leakage's rise over healthy recordings (`rise`) plus
+    this ratio, but not below 0.
     """
     factor = log_bayes_factor(chance)
     if observable.log_ratio_to_leak is None or rise is None:
@@ -260,12 +253,10 @@ def log_bayes_factor(chance: float) -> float:
 
 
 def _coincide(observable: Observable, anchor: Observable) -> bool:
-    """Return True if two observables may have changed at the same time: an onset is unknown, or the two are near.
-
-    Two onsets are near if they differ by at most half the sum of the widths of their 95 % intervals.
-    """
+    """Return True if two observables may have changed at the same time: an onset is unknown, or the two are near."""
     if observable.onset is None or anchor.onset is None:
         return True
+    # half the sum of the widths of the 95 % intervals
     max_distance = 0.5 * (observable.onset.high - observable.onset.low + anchor.onset.high - anchor.onset.low)
     return abs(observable.onset.value - anchor.onset.value) <= max_distance
 

@@ -45,13 +45,13 @@ class HealthyNull:
         return self.calibrate(null_key(observable), observable.chance)
 
     def calibrate(self, key: str, chance: float) -> float:
-        """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings.
+        """Correct a detector's p-value `chance` by the p-values that it stated for healthy recordings (`key`).
 
-        The result is the sum over k of w_k chance^(1/lambda_k), and at most 1. The lambda_k (`inflations`) are possible
-        means of the surprisals -log(p-value) in healthy recordings. The w_k (`weights`) are the posterior probabilities
-        of these means, given the `surprisals` that are stored under the test's `key`.
+        The result is the predictive chance P(u) of the module's docstring.
         """
-        weights, inflations = self._inflation(key)
+        if key not in self._posteriors:
+            self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
+        weights, inflations = self._posteriors[key]
         log_chance = np.log(max(chance, np.finfo(float).tiny))
         return min(float(weights @ np.exp(log_chance / inflations)), 1.0)
 
@@ -66,20 +66,9 @@ class HealthyNull:
         surprisal = find_root(lambda u: self.calibrate(key, np.exp(-u)) - chance, 0.0, max_surprisal)
         return float(np.exp(-surprisal))
 
-    def _inflation(self, key: str) -> tuple[Array, Array]:
-        """Return posterior weights and values (k,) of lambda for the test with this `key` (`_inflation_posterior`)."""
-        if key not in self._posteriors:
-            self._posteriors[key] = _inflation_posterior(self.surprisals.get(key, ()))
-        return self._posteriors[key]
-
 
 def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
-    """Compute posterior weights and values of lambda, the mean of exponentially distributed surprisals -log(p-value).
-
-    Both arrays have the shape (NODES + 1,); without surprisals both are [1]. The first value of lambda is 1, for
-    correct p-values. The prior density of log lambda for the other values is exponential. The likelihood of n
-    surprisals with the sum s is lambda^-n exp(-s / lambda).
-    """
+    """Compute the posterior weights w_k and the values lambda_k (NODES + 1,); without surprisals both are [1]."""
     priors = DECISION.null
     if not len(surprisals):
         return np.ones(1), np.ones(1)

@@ -17,7 +17,6 @@ from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (
     AGAINST,
     CANNOT_TELL,
-    LEAK,
     NO_LEAK,
     PRESSURE_RESPONSE,
     WITHIN,
@@ -38,19 +37,16 @@ def text_of(table: str, key: str, **values: Any) -> str:
     return _texts()[table][key].format(**values)
 
 
-def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
-    """Compose the reason of a verdict in words.
+def no_leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: float, other: OtherEvent | None) -> str:
+    """Compose the reason why no leak is stated.
 
-    For the verdict `leak`, the text describes the leak that the test `alarm` detected. Otherwise it states the 95 %
-    upper `bound` of an undetected leak [m^3/s] or, if leakage is not measured, that of a change of the ringing
-    (`_bound_text`). The cause of a change follows: the event `other` or, if that is None and there is an alarm against
-    which other causes are weighed, the most probable of these. Remarks on the measured leakage come last.
+    The text states the 95 % upper `bound` of an undetected leak [m^3/s], or of a change of the ringing. The cause of a
+    change follows: the event `other` or else, after an `alarm`, the most probable of the causes that are weighed.
     """
-    if evidence.verdict == LEAK:
-        return _leak_text(case, evidence, alarm) + _remarks(case)
     text = _bound_text(case, evidence, bound)
     if other is not None:
         name = other.observable.name
+        count = float(f"{1.0 / max(other.chance, 1e-4):.2g}")  # rounded to two digits, up to 10 000
         text += text_of(
             "doubt",
             "event",
@@ -59,29 +55,20 @@ def reason_of(case: Case, evidence: Evidence, alarm: LeakTest | None, bound: flo
             # the description may contain the name of the observable already
             shown="" if name in other.description else text_of("doubt", "shown", name=name),
             sure=100.0 * other.probability,
-            rarity=_rarity_text(other.chance),
+            rarity=text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " ")),
         )
     elif alarm is not None and case.weigh_rivals:
         text += _rivals_text(case, alarm)
-    return text + _remarks(case)
+    return text
 
 
-def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
-    """Describe in words a leak that the test `alarm` detected, by the change that it makes if leakage is not measured.
-
-    An alarm by the limit in the rig's file is described by the total leakage and this limit, if both are known in
-    L/min. The text also says if the leak's flow is not stated in L/min.
-    """
+def leak_text(case: Case, evidence: Evidence, alarm: LeakTest) -> str:
+    """Describe in words a leak that the test `alarm` detected, or without measured leakage the change that it makes."""
     if case.leak is None:
-        rarest = case.tested_observable
-        assert rarest is not None  # it raised the alarm
-        if rarest.data == "plug-in":
+        if case.tested_observable is not None and case.tested_observable.data == "plug-in":
             return text_of("leak", "plug_in", provider=case.judge.provider)
-        percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
-        where = _onset_text(rarest) or _against_text(case.judge.ringing)
-        return text_of("leak", "details", what=f"RMS: {rarest.name}", percent=percent, where=where)
-    test_name = alarm.name if alarm else ""  # with the verdict `leak` there always is an alarm
-    key = {WITHIN: "within", AGAINST: "against"}.get(test_name, "level")
+        return text_of("leak", "details", **_change_values(case))
+    key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name, "level")
     if key == "within" and not case.has_onset_within:
         key = "older"
     total = evidence.total_leakage
@@ -96,15 +83,15 @@ def _leak_text(case: Case, evidence: Evidence, alarm: LeakTest | None) -> str:
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
     """State in words the largest leak that may have remained undetected.
 
-    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. If leakage is measured, the text states
-    the bound in L/min, as a percentage of the pump's flow, or as "any size", in this order of preference. With the
-    verdict `cannot tell`, it also says how to record better. If leakage is not measured, the text describes the
-    pressures' ringing: its change if there is an alarm, else the limit of an undetected fall.
+    `bound` is the upper bound of the mean flow [m^3/s], infinite if unknown. With the verdict `cannot tell`, the text
+    also says how to record better. If leakage is not measured, it describes the pressures' ringing: its change if there
+    is an alarm, else the limit of an undetected fall.
     """
     leak, ringing = case.leak, case.judge.ringing
     if leak is None:
         if case.alarms and ringing is not None:
-            return _changed_ringing_text(case, ringing)
+            leak_percent = 100.0 * case.leak_probability(case.alarms[0])
+            return text_of("bound", "ringing_changed", leak=leak_percent, **_change_values(case))
         return _ringing_text(evidence, ringing, case.judge.provider)
     mean_pump_flow, _ = leak.pump_flow
     # a comparison with healthy recordings bounds the mean flow over the recording, and not that since an onset
@@ -124,10 +111,8 @@ def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:
 def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) -> str:
     """State in words the 95 % upper limit [%] of an undetected fall of the ringing (RMS of the pressures' details).
 
-    The fall is relative to healthy recordings or, without these, to the start of the same recording. With the verdict
-    `cannot tell`, the text says that such a fall would not show. If the sampling rate is too low, the text begins with
-    the names of unused columns or, if there are none, with the rate. If the ringing was not measured (None), the text
-    is that the detector `provider` sees no change.
+    If the sampling rate is too low, the text begins with the names of unused columns or, if there are none, with the
+    rate. If the ringing was not measured (None), the text is that the detector `provider` sees no change.
     """
     if ringing is None:
         return text_of("bound", "unseen", provider=provider)
@@ -144,22 +129,17 @@ def _ringing_text(evidence: Evidence, ringing: Ringing | None, provider: str) ->
     return text if ringing.healthy else text + text_of("bound", "start")
 
 
-def _changed_ringing_text(case: Case, ringing: Ringing) -> str:
-    """Describe the rarest change of the pressures' ringing (RMS of wavelet details), and the probability of a leak."""
+def _change_values(case: Case) -> dict[str, Any]:
+    """Compute the values for a text on the change of the ringing that raised an alarm."""
     rarest = case.tested_observable
-    assert rarest is not None  # it raised the alarm
+    assert rarest is not None
     percent = 100.0 * abs(np.expm1(rarest.size))  # `size`: change of the logarithm of the RMS
-    where = _onset_text(rarest) or _against_text(ringing)
-    leak = 100.0 * case.leak_probability(case.alarms[0])
-    return text_of("bound", "ringing_changed", what=rarest.name, percent=percent, where=where, leak=leak)
+    where = _onset_text(rarest) or _against_text(case.judge.ringing)
+    return {"what": rarest.name, "percent": percent, "where": where}
 
 
 def _against_text(ringing: Ringing | None) -> str:
-    """State the number of healthy recordings with which the ringing was compared.
-
-    The text also mentions if their dates are not known. It is "" if the ringing was not measured, or not compared with
-    healthy recordings.
-    """
+    """State the number of healthy recordings with which the ringing was compared; "" if there was no comparison."""
     if ringing is None or not ringing.healthy:
         return ""
     text = text_of("bound", "against", count=ringing.healthy)
@@ -169,10 +149,8 @@ def _against_text(ringing: Ringing | None) -> str:
 def _rivals_text(case: Case, alarm: LeakTest) -> str:
     """Describe the most probable explanation of an `alarm` other than a leak, and the way to tell it from a leak.
 
-    The stated probability is that of all explanations without a leak. If the explanation has several events, only the
-    first one in `events.toml` is described. If this event has no cause to name, such as a start, the text states only
-    its time, the onset of the step that looks like a leak. The text is "" if that time is unknown, or if there is no
-    explanation without a leak.
+    The stated probability is that of all explanations without a leak. Of several events, only the first one in
+    `events.toml` is described; of an event without a cause only its time, if known.
     """
     leak_probability = case.leak_probability(alarm)
     best = next((explanation for explanation in case.explanations if not explanation.has(*LEAK_EVENTS)), None)
@@ -203,15 +181,3 @@ def _rivals_text(case: Case, alarm: LeakTest) -> str:
 def _onset_text(observable: Observable) -> str:
     """State the time [s] at which the change of an observable began; "" for an observable without an onset."""
     return "" if observable.onset is None else text_of("doubt", "onset", seconds=observable.onset.value)
-
-
-def _rarity_text(chance: float) -> str:
-    """State the p-value `chance` of a change in words, as 1 in n healthy recordings, with n up to 10 000."""
-    count = float(f"{1.0 / max(chance, 1e-4):.2g}")  # rounded to two digits
-    return text_of("doubt", "rarity", count=f"{count:,.0f}".replace(",", " "))
-
-
-def _remarks(case: Case) -> str:
-    """Join the texts of all remarks on the measured leakage; "" if there are no remarks or no leakage is measured."""
-    leak = case.leak
-    return "" if leak is None else "".join(text_of("remark", remark.key, **remark.values) for remark in leak.remarks)

@@ -54,8 +54,7 @@ Factory = Callable[["Rig"], Detector]
 def unusable_reason(detector: Detector, recording: Recording) -> str | None:
     """Ask a detector for the reason, in one line, why it cannot use a recording; None if it can.
 
-    Line breaks of the detector's text are replaced by blanks; an empty text is a reason, too. Raises TypeError if
-    `usable` returns neither a text nor None.
+    Raises TypeError if `usable` returns neither a text, which may be empty, nor None.
     """
     reason: Any = detector.usable(recording)
     if reason is None:
@@ -89,11 +88,9 @@ def make_observable(
 
 
 def validate_report(report: Any, name: str) -> Observed:
-    """Check the report that the detector called `name` has returned, and mark it with this name.
+    """Check the report, an `Observed` or a single `Observable`, of the detector called `name`; mark it with this name.
 
-    `report` is an `Observed` or a single observable. Raises TypeError for other types, ArithmeticError for a score that
-    is not finite, and ValueError for a p-value (chance) outside 0 to 1, or if `Observed.lack`, the reason why nothing
-    could be observed, has several lines.
+    Raises TypeError or ValueError if it does not fit, and ArithmeticError for a score that is not finite.
     """
     if isinstance(report, Observable):
         report = Observed(name, (report,))
@@ -114,8 +111,8 @@ def validate_report(report: Any, name: str) -> Observed:
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
     """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
 
-    `distribution` is the package of a plug-in, None for a built-in detector. An arithmetic error of a built-in detector
-    is due to impossible readings, not to a defect. It is logged at the debug level at every call.
+    `distribution` is the package of a plug-in, None for a built-in detector, whose arithmetic errors are due to
+    impossible readings, not to a defect: they are logged at the debug level.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)

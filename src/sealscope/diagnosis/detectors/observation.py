@@ -66,9 +66,7 @@ def _thread_pools(n_modules: int) -> Any:
 def observe_rivals(recording: Recording, baseline: Sequence[Healthy], distrust: str | None = None) -> Observed:
     """Test a recording for changes that no internal leak causes, but that may be mistaken for one.
 
-    Duty, noise, mains hum, sense of p_A - p_B and mean pressures are tested for changes within the recording; friction,
-    drifts and spectra are compared with those of `baseline`. If there is a reason to `distrust` the pressures, nothing
-    is tested, and the report states this reason.
+    If there is a reason to `distrust` the pressures, nothing is tested, and the report states this reason.
     """
     if distrust:
         return Observed(SIGNALS, lack=distrust)
@@ -83,8 +81,7 @@ def run_detector(
     """Run the registered detector called `name` on a recording and return the detector's report.
 
     `baseline` are healthy recordings of the machine, `rig` is the assumed machine, and `distrust` the reason, if any,
-    why the pressures cannot be judged. An error of the detector is logged and stated in the report. Raises KeyError if
-    there is no such detector.
+    why the pressures cannot be judged. An error of the detector is logged and stated in the report.
     """
     factory = detectors()[name]
     try:
@@ -101,9 +98,7 @@ def run_detector(
 def _observe(detector: Detector, recording: Recording, baseline: Sequence[Healthy], distrust: str | None) -> Observed:
     """Run a detector on a recording, compared with the baseline recordings that the detector can use.
 
-    The report is empty and states the reason if the pressures cannot be trusted (`distrust`), if the detector cannot
-    use the recording, or if it can use none of the given baseline recordings. Without a baseline, the reason may also
-    be a chamber pressure that is constant for some time, except for a detector that works at rest (`_AT_REST`).
+    The report only states the reason if the recording, or all of a given baseline, cannot be used.
     """
     lack = unusable_reason(detector, recording) or distrust
     if lack is None and not baseline and detector.name not in _AT_REST:
@@ -129,20 +124,15 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal, -log(p-value), of each change that the detectors test within a healthy recording.
-
-    The detectors assume the machine `rig`. The result maps the key of the change (`null.null_key`) to the surprisal.
-    Keys with the prefix `SHUT` are for a volume balance that assumes that valves cut the pump off at rest. The result
-    is cached.
-    """
+    """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached."""
     return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisals of changes within a recording, as `healthy_surprisals` returns them.
+    """Compute the surprisals of changes of the signals and of the volume balance within a recording, by their keys.
 
-    These are changes of the signals (`observe_signals`) and of the volume balance, once for each assumption on the
-    valves at rest that the recording allows. Without a balance the pressure response, which then judges, is tested.
+    The volume balance is tested once for each assumption on the valves at rest that the recording allows. Without a
+    balance the pressure response, which then judges, is tested.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance = VolumeBalance(rig)
@@ -162,10 +152,7 @@ def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
-    """Collect the largest surprisal, -log(p-value), of each test for a change within a recording, by `null_key`.
-
-    The test for a step of the leak is included, with the key `case.step_key`.
-    """
+    """Collect the largest surprisal of each test for a change within a recording, also for a step of the leak."""
     surprisals: dict[str, float] = {}
     for observable in report.observables:
         if observable.onset is not None:  # otherwise a comparison with other recordings
@@ -177,12 +164,12 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
 
 
 def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
-    """Collect the surprisals -log(chance) of all tests in healthy recordings, as the null distributions of the tests.
+    """Collect the surprisals of all tests in healthy recordings, as the null distributions of the tests.
 
-    `chance` is the p-value that a detector states, assuming `rig`. Each test for a change within a recording has a list
-    (`null_key`) with one value from each recording. Comparisons with other recordings share one list for each kind of
-    data (`comparison_key`): each recording is compared with all others, and the largest surprisal counts. With `shut`,
-    the volume balance assumes that valves cut the pump off at rest.
+    Each test for a change within a recording has a list (`null_key`) with one value from each recording. Comparisons
+    with other recordings share one list for each kind of data (`comparison_key`): each recording is compared with all
+    others, and the largest surprisal counts. With `shut`, the volume balance assumes that valves cut the pump off at
+    rest.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
@@ -204,8 +191,8 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
 def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
     """Compare the ringing of each healthy recording with that of all others, and yield the test results of each.
 
-    The ringing is measured by the RMS of the pressures' wavelet details. Recordings with other chambers or another
-    sampling rate than the first usable one are left out. If fewer than `MIN_COMPARED` remain, nothing is yielded.
+    Recordings with other chambers or another sampling rate than the first usable one are left out. If fewer than
+    `MIN_COMPARED` remain, nothing is yielded.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]

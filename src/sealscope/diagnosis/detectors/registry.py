@@ -46,10 +46,7 @@ class PlugIn:
 
     @property
     def fingerprint(self) -> str:
-        """First 16 digits of the SHA-256 of the file that defines `make`, to tell versions apart.
-
-        It is "unknown" if there is no such file, or if it cannot be read.
-        """
+        """First 16 digits of the SHA-256 of the file that defines `make`, to tell versions apart, or "unknown"."""
         source = getattr(sys.modules.get(getattr(self.make, "__module__", "")), "__file__", None)
         try:
             return sha256(Path(source).read_bytes()).hexdigest()[:16] if source else "unknown"
@@ -79,11 +76,7 @@ def detectors() -> Mapping[str, Factory]:
 
 @cache
 def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
-    """Find the detectors of other installed packages, in the order of their names; the result is cached.
-
-    A detector is left out, with the reason logged, if it cannot be loaded, or if its name is not valid or taken, such
-    as one of `built_in_names`.
-    """
+    """Find the detectors of other installed packages, in the order of their names; the result is cached."""
     plug_in_of: dict[str, PlugIn] = {}
     for point in sorted(entry_points(group=GROUP), key=lambda point: (point.name, point.value)):
         distribution = point.dist.name if point.dist is not None else point.value

@@ -109,8 +109,8 @@ BlockResult = Sequence[BlockConductance] | NotJudged
 def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any) -> None:
     """Fit the coefficients of a volume balance to K blocks together and store them in `model`.
 
-    `grams` (K, m, m) are the products of all m columns in each block, and `rows` (K,) the number of equations of each
-    block. `column_order` (n + 2,): indices of the columns to use, n terms other than the leak, the leak, the left side.
+    `grams` (K, m, m) are the products of all m columns in each block, `column_order` (n + 2,) selects the columns as
+    for `load_block`, and `rows` (K,) are the numbers of equations.
     """
     for k in range(len(grams)):
         load_block(model, grams[k], column_order)
@@ -122,15 +122,7 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
 def _estimate_leak(
     model: Coefficients, gram: Any, column_order: Any, n_equations: float, updates_model: bool
 ) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in one block of a volume balance.
-
-    `gram` (m, m) are the products of all m columns, summed over the `n_equations` equations of the block, and
-    `column_order` (n + 2,) the indices of the columns to use: n terms other than the leak (nuisances), the leak, the
-    left side. With `updates_model`, the block is added to the sums in `model`, from which the nuisances' coefficients
-    are computed. Returns (w, w g, w s, w^2 V): g is the estimate, and w its precision. The shift s, to be subtracted
-    from g, keeps the series of estimates continuous while the nuisances' coefficients still change. V is the variance
-    of g due to errors of the nuisances. Shift and last coefficients in `model` are updated in any case.
-    """
+    """Estimate the leak's coefficient in one block, whose columns have the products `gram`, by `estimate_leak`."""
     load_block(model, gram, column_order)
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
 
@@ -148,10 +140,9 @@ class LiveBalance(SavedAttributes):
     min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, whatever its law
     block_seconds = BLOCK_SECONDS
     has_begun = True
-    SAVED = ("litres", "_precision", "_moving", "_waiting", "_rate", "_signals")
+    SAVED = ("_precision", "_moving", "_waiting", "_rate", "_signals")
 
-    def __init__(self, rig: Rig, names: Sequence[str], litres: bool | None = None) -> None:
-        """Set up the balance; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
+    def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self._balances = live_equations(rig, names, with_tested_terms=True)
         if not self._balances:
             needed = format_ways(rig.circuit.watched_by)
@@ -162,7 +153,6 @@ class LiveBalance(SavedAttributes):
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)
         self.cause: Cause = "piston or pump leak" if rig.circuit.pump_moves_piston else "piston leak"
-        self.litres = self.states_flow(rig) if litres is None else litres
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column
         self._column_orders, self._models = [], list[Coefficients]()
@@ -181,15 +171,15 @@ class LiveBalance(SavedAttributes):
 
     @staticmethod
     def states_flow(rig: Rig) -> bool:
-        """Return True if a rig states the sizes (piston areas or pump displacement) from which L/min are computed."""
+        """Return True if a rig states the sizes, piston areas or pump displacement, for flows in L/min."""
         return rig.states(*rig.circuit.size_parameters)
 
     def take(self, run: SampleRun) -> Iterator[BlockResult]:
         """Process the next samples, and yield the result of each block of the volume balance that they complete.
 
-        The next block is processed only when its result is asked for. The first `LEARNED` blocks are estimated
-        together: the result of the last one has the conductances of all. After a gap, or a change of the sampling rate,
-        the coefficients of the balance are kept, and earlier samples that do not fill a block are dropped.
+        The first `LEARNED` blocks are estimated together: the result of the last one has the conductances of all. After
+        a gap, or a change of the sampling rate, the coefficients of the balance are kept, and earlier samples that do
+        not fill a block are dropped.
         """
         stream = self._stream
         if stream is None or not run.follows:
@@ -223,11 +213,9 @@ class LiveBalance(SavedAttributes):
     def _take_block(self, block: Blocks) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
-        Blocks with at least one complete equation are kept, the last `WINDOW` of them, to fit the coefficients of the
-        balance. Learning begins with the first block that moves: the first `LEARNED` - 1 blocks give a `NotJudged`, and
-        the next one the conductances of all `LEARNED`. Blocks without a complete equation, or before the first motion,
-        give a `NotJudged`, too. After `N_WAKING` successive blocks that move far more than usual, learning begins
-        again.
+        Learning begins with the first block that moves: `LEARNED` - 1 blocks give a `NotJudged`, and the next one the
+        conductances of all `LEARNED`. After `N_WAKING` successive blocks that move far more than usual, learning begins
+        again. The last `WINDOW` blocks with at least one complete equation are stored.
         """
         _, end = self._sample_times(block)
         if not block.rows[0]:  # number of complete equations
@@ -252,17 +240,13 @@ class LiveBalance(SavedAttributes):
         return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the balances to the first blocks together, then estimate the leakage conductance in each block.
-
-        The median of the blocks' precisions is stored as that of a usual block: `_estimate_block` compares the
-        precision at standstill with it. Blocks that are too uncertain are left out, so that the list may be empty.
-        """
+        """Fit the balances to the first blocks together, then estimate the conductance in each that is not at rest."""
         for index, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
             grams = np.ascontiguousarray(blocks.gram[:, index])  # products of one balance in each block
             _fit_to_blocks(model, grams, column_order, blocks.rows)
         # updates_model=False: the fit already contains these blocks
         solutions = [self._solve_block(block, updates_model=False) for block in _split(blocks)]
-        self._precision = float(np.median([precision for precision, *_ in solutions]))
+        self._precision = float(np.median([precision for precision, *_ in solutions]))  # of a usual block
         estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))
         return [estimate for estimate in estimates if not isinstance(estimate, NotJudged)]
 
@@ -276,19 +260,11 @@ class LiveBalance(SavedAttributes):
         return float(block.start[0]) - self._half_stride, float(block.end[0]) + self._half_stride
 
     def _relative_motion(self, block: Blocks) -> float:
-        """Compute the mean square of the volume that the machine moves in a block, relative to earlier blocks.
-
-        The volume, such as that delivered by the pump, is the left side of the first volume balance. The `numbers` of
-        its model contain the mean square in the earlier blocks.
-        """
+        """Compute the mean square of the volume that the machine moves in a block, relative to earlier blocks."""
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
-        """Estimate the leak's coefficient in a block by each volume balance, and sum the weighted results.
-
-        Returns the sums of w, w g, w s and w^2 V, which `_estimate_leak` explains. With `updates_model`, the block also
-        updates the other coefficients of the balances.
-        """
+        """Sum the results (w, w g, w s, w^2 V) of `coefficients.estimate_leak` over the volume balances for a block."""
         n_equations = float(block.rows[0])
         results = [
             _estimate_leak(model, gram, column_order, n_equations, updates_model)
@@ -297,24 +273,28 @@ class LiveBalance(SavedAttributes):
         return tuple(sum(values) for values in zip(*results, strict=True))
 
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
-        """Estimate the leakage conductance in a block from the volume balance.
+        """Estimate the leakage conductance in a block; a `NotJudged` if the estimate is too uncertain at standstill.
 
-        `sd` of the result is the part of the standard error that is due to this block alone. Returns a `NotJudged` if
-        the estimate is too uncertain at standstill. With `updates_model`, the block updates the other coefficients.
+        With `updates_model`, the block updates the other coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
-        # sums over balances: weights w, w total, w shift, w^2 variance due to errors of the other coefficients
         precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, updates_model)
         min_precision = MIN_REST_PRECISION * self._precision if at_standstill else 0.0
         if not precision > min_precision:
             return NotJudged.with_count(end, "at standstill")
         total = weighted_total / precision
-        # errors of the other coefficients, and of the machine's sizes
-        offset = math.hypot(math.sqrt(weighted_variance) / precision, self.size_error * total)
-        g, sd = total - weighted_shift / precision, precision**-0.5
-        pressure, pump_flow = float(block.mean_pressure()[0]), float(block.flow[0])
-        return BlockConductance(begin, end, g, sd, total, offset, pressure, pump_flow)
+        return BlockConductance(
+            begin,
+            end,
+            g=total - weighted_shift / precision,
+            sd=precision**-0.5,
+            total=total,
+            # errors of the other coefficients, and of the machine's sizes
+            offset=math.hypot(math.sqrt(weighted_variance) / precision, self.size_error * total),
+            pressure=float(block.mean_pressure()[0]),
+            pump_flow=float(block.flow[0]),
+        )
 
     def relearn(self, since: float = math.inf) -> None:
         """Drop the coefficients, and learn new ones from stored and later blocks that begin at `since` [s] or later."""
@@ -327,10 +307,8 @@ class LiveBalance(SavedAttributes):
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
         """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.
 
-        A block is used if its first equation is at most half a stride before `since`. The result is None unless the
-        equations of the stored blocks begin by the onset of the leakage's increase, `onset` [s], and the samples of the
-        last block, which extend half a stride beyond its last equation, end within half a stride of `end`. It is empty
-        if too few blocks are used.
+        The result is None unless the stored blocks reach from the onset of the leakage's increase, `onset` [s], to
+        `end`, to half a stride. It is empty if too few blocks begin at `since` or later.
         """
         stored = self._stored
         if stored is None:
@@ -349,7 +327,7 @@ class LiveBalance(SavedAttributes):
         return (*volumes, *self._signals.observables(since - BLOCK_SECONDS))
 
     def state(self) -> dict[str, Any]:
-        """Return the learned coefficients and stored blocks as plain values for JSON, which `load_state` restores."""
+        """Return the learned coefficients and stored blocks as plain values for JSON, for `load_state`."""
         return {
             **super().state(),
             "known": [save_attributes(model, _MODEL) for model in self._models],
@@ -384,7 +362,7 @@ def _split(blocks: Blocks) -> list[Blocks]:
 
 
 def _volume_square(block: Blocks) -> float:
-    """Return the sum of squares of the measured volume, the left side of the first volume balance, in a block."""
+    """Return the sum of squares of the volume, such as the pump's, on the left side of the first volume balance."""
     return float(block.gram[0, 0, -1, -1])  # first block and balance; the left side is the last column
 
 

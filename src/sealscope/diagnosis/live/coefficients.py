@@ -32,42 +32,25 @@ _MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
 _SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)
 TINY = float(np.finfo(float).tiny)
 
-#: Indices of `Coefficients.numbers`, which explains them.
-ROWS, MOTION, NOISE, ENERGY, SHIFT, MISFIT = range(6)
+#: Indices of `Coefficients.numbers`.
+ROWS = 0  # number of equations in the sums
+MOTION = 1  # sum of squares of their left sides
+NOISE = 2  # variance of an equation's residual
+ENERGY = 3  # sum of squares of the leak's column
+SHIFT = 4  # subtracted from the estimates of the leak, so that their series remains continuous
+MISFIT = 5  # residual variance of the last block over the usual variance
 
 
 class Coefficients(NamedTuple):
-    """Coefficients of a volume balance other than the leak's, and the sums over blocks from which they are computed.
+    """Nuisances of a volume balance, n in number, and the sums over blocks from which they are computed."""
 
-    They are called nuisances; n is their number. The left side of the balance is the measured volume.
-
-    Attributes
-    ----------
-    sums : ndarray, shape (n + 2, n + 2)
-        Weighted products of the columns of nuisances, leak and left side.
-    values : ndarray, shape (n,)
-        The coefficients.
-    leak_products : ndarray, shape (n,)
-        Products of the leak's column with the nuisances' columns.
-    numbers : ndarray, shape (6,)
-        By index:
-
-        - `ROWS`: number of equations in the sums,
-        - `MOTION`: sum of squares of their left sides,
-        - `NOISE`: variance of an equation's residual,
-        - `ENERGY`: sum of squares of the leak's column,
-        - `SHIFT`: shift that is subtracted from the estimates of the leak, so that their series remains continuous,
-        - `MISFIT`: residual variance of the last block over the usual variance.
-    block, matrix : ndarray, shape (n + 2, n + 2) and (n, n + 3)
-        Work arrays: the products of one block, and the normal equations.
-    """
-
-    sums: Any
-    values: Any
-    leak_products: Any
-    numbers: Any
-    block: Any
-    matrix: Any
+    sums: Any  # (n + 2, n + 2): weighted products of the columns of nuisances, leak and left side
+    values: Any  # (n,): the nuisances
+    leak_products: Any  # (n,): products of the leak's column with the nuisances' columns
+    numbers: Any  # (6,): by the indices above
+    # work arrays
+    block: Any  # (n + 2, n + 2): products of one block
+    matrix: Any  # (n, n + 3): normal equations
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
@@ -98,9 +81,8 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
         S <- exp(-1/memory) (S - S_l S_l' / (S_ll + B_ll)) + weight B,
 
-    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out of the denominator. The
-    other sums in `model` have the same memory; `leak_products` and `ENERGY`, of which `estimate_leak` uses the ratio,
-    have no weight.
+    where `memory` is a number of blocks (`priors.toml`). If `has_stepped`, B_ll is left out of the denominator.
+    `leak_products` and `ENERGY`, of which `estimate_leak` uses the ratio, need no `weight`.
     """
     sums, block, size = model.sums, model.block, len(model.block)
     leak = size - 2  # index of the leak's column, before the left side
@@ -122,12 +104,10 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
 @large_law
 def _solve(model: Any) -> None:
-    """Solve the normal equations C x = r of a volume balance in place, for three right-hand sides r.
+    """Solve the normal equations C c = m of the nuisances, and C x = r for two further right-hand sides r.
 
-    The unknowns x are the n coefficients other than the leak's. `model` is a `Coefficients`, whose `matrix[:, n:]`
-    (n, 3) holds the right-hand sides; the solutions replace them. C (n, n) and the first right-hand side are computed
-    here from the sums, with the leak's column eliminated. They are the products of the unknowns' columns with each
-    other and with the left side of the balance, so that the first solution is the least-squares estimate.
+    `model` is a `Coefficients`, whose `matrix[:, n:]` (n, 3) receives c, the least-squares estimate, and holds the two
+    r, which are replaced by the solutions. C and m are computed from the sums (module's docstring).
     """
     sums, n = model.sums, len(model.matrix)
     leak, left_side = n, n + 1  # indices of these columns, after those of the n unknowns
@@ -141,10 +121,10 @@ def _solve(model: Any) -> None:
 
 @large_law
 def _sum_residual_squares(sums: Any, solution: Any) -> float:
-    """Compute a volume balance's residual sum of squares for given nuisances (coefficients other than the leak's).
+    """Compute a volume balance's residual sum of squares, with the leak's coefficient that minimises it.
 
-    For the leak's coefficient, the value that minimises the sum is used. `sums` (n + 2, n + 2) are the products of the
-    columns of n nuisances, leak and left side. Column 0 of `solution` (n, k) holds the nuisances.
+    `sums` (n + 2, n + 2) are the products of the columns of n nuisances, leak and left side. Column 0 of `solution`
+    (n, k) holds the nuisances.
     """
     n, square, leak_moment = len(solution), 0.0, 0.0
     # with the left side y, the columns X of the nuisances c and the column l of the leak, the sum is
@@ -164,11 +144,7 @@ def _sum_residual_squares(sums: Any, solution: Any) -> float:
 
 @large_law
 def fit_coefficients(model: Any) -> None:
-    """Compute a volume balance's coefficients other than the leak's, and the variance of its equations, into `model`.
-
-    The coefficients are the least-squares estimate from the sums over blocks in `model`, a `Coefficients`, and the
-    variance is the mean square of the residuals.
-    """
+    """Estimate the nuisances (`values`) by least squares, and the variance of an equation's residual (`NOISE`)."""
     n = len(model.matrix)
     solution = model.matrix[:, n:]
     solution[:] = 0.0  # only column 0, the estimate, is needed
@@ -185,10 +161,9 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
     """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` its leak coefficient. Column n of
-    `model.matrix` holds the n other coefficients (`_solve`). The usual noise is the variance of an equation's residual,
-    with fading memory; `MISFIT` is the variance in this block divided by it. The weight is 1, or `JUMP`^2 / MISFIT if
-    this is less. If g differs from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped,
-    and earlier blocks do not constrain it any more.
+    `model.matrix` holds the nuisances (`_solve`). The weight is 1, or `JUMP`^2 / MISFIT if this is less. If g differs
+    from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and earlier blocks do not
+    constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -255,7 +230,7 @@ def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """Compute the mean square of the measured volume in a block, divided by that in earlier blocks.
 
     `square` is the sum of squares over the block's `rows` equations, and `numbers` is `Coefficients.numbers`. Returns
-    infinity if only this block moved, and 1 if neither this nor an earlier block moved.
+    infinity if only this block moved, and 1 if no block has moved.
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)

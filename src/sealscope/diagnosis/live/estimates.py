@@ -12,7 +12,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
-from sealscope.diagnosis.inference.onset import Interval as Onset
+from sealscope.diagnosis.inference.onset import Interval as EstimatedInterval
 from sealscope.diagnosis.live.rise import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
@@ -20,6 +20,7 @@ from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array
 
 Interval = tuple[float, float]
+#: Load and motion in a block: logarithms of its mean |p_A - p_B| [Pa] and mean pump flow [m^3/s].
 Duty = tuple[float, float]
 #: Blocks per mean that is compared with the baseline.
 GROUP: int = LIVE.watch.group
@@ -100,7 +101,7 @@ class WatchedLeak:
     @property
     def estimate(self) -> LiveRise:
         """Result of the test that detected the leak: score, onset, and increase of the conductance [m^3/(s Pa)]."""
-        onset = Onset(self.onset_s, *self.onset_interval_s)
+        onset = EstimatedInterval(self.onset_s, *self.onset_interval_s)
         return LiveRise(self.test, self.score, onset, self.rise, self.rise_sd)
 
     @property
@@ -147,8 +148,8 @@ class WatchBaseline(HealthyLevel):
         1 for the first baseline, increased by one whenever it is learned anew; operating time of learning [h].
     lpm : float or None
         The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
-    duty_low, duty_high : tuple of float
-        Minimum and maximum of the logarithms of a block's mean pressure difference [Pa] and pump flow [m^3/s].
+    duty_low, duty_high : Duty
+        Minimum and maximum over the blocks, of either quantity.
     """
 
     version: int
@@ -159,17 +160,16 @@ class WatchBaseline(HealthyLevel):
 
 
 def find_level_rise(
-    healthy: HealthyLevel, onset: Onset, g: float, deviation: float, probability: float
+    healthy: HealthyLevel, onset: EstimatedInterval, g: float, deviation: float, probability: float
 ) -> LiveRise | None:
     """Find a rise of the mean conductance above that of the healthy machine; None if it is not significant.
 
-    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)], and `onset` is the time of the
-    rise, which the result repeats. Two tests must both be significant at the false-alarm `probability`:
+    `g` and `deviation` are the mean conductance and its standard error [m^3/(s Pa)]; `onset` is copied to the result.
+    Two tests must both be significant at the false-alarm `probability`:
 
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
-    - g against the average of the healthy means, given their scatter (Student's t with Welch's degrees of freedom).
-
-    The result is also None if there are fewer than two healthy means.
+    - g against the average of the healthy means, at least two, given their scatter (Student's t with Welch's degrees of
+      freedom).
     """
     from scipy.special import ndtr, ndtri
 
@@ -191,43 +191,36 @@ def find_level_rise(
     return LiveRise(LEVEL, score, onset, size, deviation=math.hypot(deviation, healthy_sd))
 
 
-def level_before_leak(leak: WatchedLeak, t: float) -> HealthyLevel:
+def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
     """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
 
-    With the conductance G before the leak, the result's `low` is G/r and its `high` is r max(G, 0), where r =
-    warmest^(tau/shift) and tau is the time since the onset, at most `shift`. By the table `oil` of `priors.toml`,
-    warming of the oil raises a conductance at most by the factor `warmest`, within the time `shift` [h]; cooling lowers
-    it as much. A negative G is an error, as no conductance is below 0; `high` is then 0. The `deviation` is that of the
-    leak's rise.
+    Warming of the oil raises a conductance by the factor `warmest` at most, which takes the time `shift` [h] (table
+    `oil` of `priors.toml`); cooling lowers it as much. A negative conductance is an error: the upper limit is then 0.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
-    low, high = before / max_ratio, max(before, 0.0) * max_ratio
-    return HealthyLevel(before, low, high, deviation=leak.rise_sd, known_s=leak.onset_s, count=1)
+    return EstimatedInterval(before, before / max_ratio, max(before, 0.0) * max_ratio)
 
 
 def mean_flow(flows: Array, errors: Array) -> Estimate:
-    """Average the flows of n blocks (n,) [L/min] with standard `errors` (n,); return the mean and its standard error.
-
-    The standard error is sqrt(sum(errors^2)/n^2 + s^2/n). Here s is the standard deviation of the flows, 0 for a single
-    block.
-    """
+    """Compute the mean of n `flows`, whose standard error is due to their own `errors` and to their scatter."""
     count = len(flows)
     scatter = float(flows.std(ddof=1)) / math.sqrt(count) if count > 1 else 0.0
     return Estimate(float(flows.mean()), math.hypot(math.sqrt(float(np.sum(errors**2))) / count, scatter))
 
 
 def is_known_duty(duty: Duty, low: Duty, high: Duty) -> bool:
-    """Return True if the duty of a block is in the range from `low` to `high`, extended by a margin.
+    """Return True if a `duty` is in the range from `low` to `high`, extended by a margin.
 
-    A duty consists of the logarithms of the mean |p_A - p_B| [Pa] and of the mean pump flow [m^3/s]. The margin towards
-    low pressures is larger, because a leak lowers the pressure difference.
+    The margin towards low pressures is larger, because a leak lowers the pressure difference.
     """
     margin = LIVE.watch.margin
-    min_pressure, min_flow = low
-    min_duty = (min_pressure - LIVE.watch.damped, min_flow - margin)
-    return all(lower <= value <= upper + margin for value, lower, upper in zip(duty, min_duty, high, strict=True))
+    (pressure, flow), (min_pressure, min_flow), (max_pressure, max_flow) = duty, low, high
+    return (
+        min_pressure - LIVE.watch.damped <= pressure <= max_pressure + margin
+        and min_flow - margin <= flow <= max_flow + margin
+    )
 
 
 @dataclass
@@ -237,7 +230,7 @@ class BaselineLearning:
     blocks: int = 0  # number of blocks
     total: float = 0.0  # sum of the blocks' conductances [m^3/(s Pa)]
     flow: float = 0.0  # sum of the blocks' flows at a conductance of 1 [L/min per m^3/(s Pa)]
-    # smallest and largest duty of a block so far: logarithms of mean pressure difference [Pa] and pump flow [m^3/s]
+    # minimum and maximum of either quantity of the duty so far
     duty_low: Duty | None = None
     duty_high: Duty | None = None
     group: list[float] = field(default_factory=list)  # conductances of an incomplete group of `GROUP` blocks
@@ -272,11 +265,7 @@ class BaselineLearning:
             self.squares += difference * (mean - self.mean)
 
     def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from the sums over at least `GROUP` blocks.
-
-        It states its `version`, the `end` of its last block [s], the operating time `hours` of learning and, with
-        `states_lpm`, its level as a flow [L/min].
-        """
+        """Compute the baseline from the sums over at least `GROUP` blocks, the last of which ends at `end` [s]."""
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
         lpm = level * (self.flow / self.blocks) if states_lpm else None

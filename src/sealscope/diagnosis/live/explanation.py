@@ -47,10 +47,9 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     they may have begun in the same interval. `is_settled` is True if enough blocks have followed to distinguish a leak
     to the outside from a sensor fault; until then, only a leak past piston or pump counts as a leak.
 
-    The result is a leak if leaks are more probable than all other events together, else the most probable other events;
-    an event of `ALARMING` is never one of these. It is `UNKNOWN` if no change of the kind `data` is significant
-    (p-value below `_MAX_CHANCE`), if none of the significant changes can be an effect of the leak, or if there are no
-    other events.
+    The result is a leak if leaks are more probable than all other events together, else the most probable explanation
+    without a leak. It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if
+    a leak, although more probable, affects none of the significant changes.
     """
     leak_names = ALARMING if is_settled else LEAK_EVENTS
     leak_events = [event for event in load_events() if event.name in leak_names]

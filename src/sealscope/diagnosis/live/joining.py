@@ -26,6 +26,8 @@ CHANNELS = ("x", "theta", "omega", "q_pump", "p_A", "p_B", "p_1", "p_2", "u", "T
 _PRIORS = LIVE.samples
 #: Limits of the step between successive samples, in sampling intervals.
 _MIN_STEP, _MAX_STEP = _PRIORS.follows
+#: Largest age of a late or repeated sample [s]; an older one means that the clock was set back.
+_MAX_LATE_S = 60.0
 
 
 def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
@@ -45,7 +47,6 @@ def are_successive(steps: Any, rate: float) -> Any:
     """Return True for each sample that directly follows the sample before it; False for a gap and for a copy.
 
     `steps` are the times between neighbouring samples [s], a number or an array, and `rate` is the sampling rate [Hz].
-    A successive sample is 0.5 to 1.5 sampling intervals later (`samples.follows` in `priors.toml`).
     """
     return (steps * rate > _MIN_STEP) & (steps * rate < _MAX_STEP)
 
@@ -72,7 +73,6 @@ class SampleJoiner(SavedAttributes):
     SAVED_TYPES: ClassVar = {"names": tuple[str, ...], "counters": dict[str, int]}
 
     ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
-    late_s: float = 60.0  # greatest age of a late or repeated sample [s]; an older one means a clock set back
     is_final: bool = False  # True if the set of channels must not be replaced any more
     names: tuple[str, ...] = ()  # set of channels in use, empty before the first samples
     rate: float = 0.0  # sampling rate [Hz]
@@ -114,7 +114,7 @@ class SampleJoiner(SavedAttributes):
             self.changed = False
 
     def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels by which to watch: the first of `ways` that is recorded, or () if none is.
+        """Choose the channels by which to watch: those in use, or else the first of `ways` that is recorded, or ().
 
         Channels in use are replaced only by a set that adds the position x, and not if `is_final`.
         """
@@ -125,9 +125,8 @@ class SampleJoiner(SavedAttributes):
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
-        Times that are missing, late or repeated are dropped and counted. A time more than `late_s` before the newest
-        sample shows that the clock was set back, which is counted, too. The caller must set `newest` to the last time
-        of each run before asking for the next run.
+        Times that are missing, late or repeated are dropped and counted, and so are clocks set back. The caller must
+        set `newest` to the last time of each run before asking for the next run.
         """
         with np.errstate(all="ignore"):  # comparisons with NaN are False, which leads to the search below
             is_one_run = t.size > 1 and t[0] > self.newest and bool(are_successive(np.diff(t), self.rate).all())
@@ -139,14 +138,14 @@ class SampleJoiner(SavedAttributes):
             self.count("samples without a time", t.size - indices.size)
         while indices.size:
             first, times = int(indices[0]), t[indices]
-            if self.newest - times[0] > self.late_s:
+            if self.newest - times[0] > _MAX_LATE_S:
                 self.restart("clock set back")
             elif times[0] > self.newest:
                 n_samples = _count_leading(are_successive(np.diff(times), self.rate) & (np.diff(indices) == 1)) + 1
                 yield first, first + n_samples
                 indices = indices[n_samples:]
             else:
-                n_samples = _count_leading((times <= self.newest) & (times >= self.newest - self.late_s))
+                n_samples = _count_leading((times <= self.newest) & (times >= self.newest - _MAX_LATE_S))
                 self.count("late or repeated samples", n_samples)
                 indices = indices[n_samples:]
 
@@ -158,7 +157,7 @@ class SampleJoiner(SavedAttributes):
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why samples do not suffice to watch an actuator by the channels `names`; return "" if they suffice."""
+    """Describe why samples do not suffice to watch an actuator by the channels `names`; "" if they suffice."""
     for name in names:
         if name not in samples:
             return f"samples without {name}"

@@ -35,10 +35,7 @@ class StepNull(SavedAttributes):
         self._highest, self._blocks = 0.0, 0  # largest log M and number of blocks in the present window
 
     def add(self, log_e: float) -> None:
-        """Add log M (`log_e`), the evidence of a step after a block of a healthy machine.
-
-        When `WINDOW` blocks are complete, the largest log M is added as a window (`add_window`).
-        """
+        """Add log M (`log_e`), the evidence of a step after a block of a healthy machine."""
         self._highest = max(self._highest, log_e)
         self._blocks += 1
         if self._blocks == WINDOW:
@@ -51,19 +48,16 @@ class StepNull(SavedAttributes):
         self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
 
     def log_threshold(self, probability: float) -> float:
-        """Compute the threshold of log M, the log e-value of a step, for a false-alarm `probability` per block.
-
-        With `_MIN_WINDOWS` windows or more it follows from their surprisals by `HealthyNull`, for the probability of a
-        window: `WINDOW` times `probability`. It is at least -log(probability), which is the result for fewer windows.
-        """
+        """Compute the threshold of log M, the log e-value of a step, for a false-alarm `probability` per block."""
         return _find_threshold(self._count, self._surprisal, probability)
 
 
 @lru_cache(maxsize=1024)
 def _find_threshold(count: int, surprisal: float, probability: float) -> float:
-    """Compute the threshold of log M for a false-alarm `probability` per block, as `log_threshold` describes.
+    """Compute the threshold of log M for a false-alarm `probability` per block: at least -log(probability).
 
-    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals.
+    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals. With few windows
+    the threshold is the lower limit, else that of a window with the false-alarm probability `WINDOW` * `probability`.
     """
     if count < _MIN_WINDOWS:
         return -math.log(probability)

@@ -39,8 +39,8 @@ _PRIORS = LIVE.response
 #: Numbers of blocks until the simulated states have settled: at the start, and after a gap of at most `_PAUSE` [s].
 _SETTLING, _RESUMING = _PRIORS.settling, _PRIORS.resuming
 _PAUSE: float = LIVE.watch.pause
-#: Channels that are read, and the lowest sampling rate that is judged [Hz].
-_READ = ("p_A", "p_B", "u")
+_READ = ("p_A", "p_B", "u")  # channels
+#: Lowest sampling rate that is judged [Hz].
 _MIN_RATE: float = PRESSURE.blocks.slowest
 #: Rows of the stored samples that are pressures; row 0 is the time.
 _PRESSURES = (1, 2)
@@ -68,12 +68,10 @@ class PressureEstimator(SavedAttributes):
     min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
-    SAVED = ("litres", "_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
+    SAVED = ("_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
 
-    def __init__(self, rig: Rig, litres: bool | None = None) -> None:
-        """Set up the estimator; `litres` tells if L/min can be stated, by default found from the sizes in the rig."""
+    def __init__(self, rig: Rig) -> None:
         self._rig = rig
-        self.litres = states_flow(rig) if litres is None else litres
         self._samples = np.empty((1 + len(_READ), 0))  # times and channels since the last whole block
         self._follower: Follower | None = None
         self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan if not stuck
@@ -94,7 +92,7 @@ class PressureEstimator(SavedAttributes):
         Before the first block, and after a block that leaves no finite parameters, the model is fitted to
         `response.begins` (`priors.toml`) seconds of samples. If these cannot be used, the reason is yielded, and the
         fit is tried again with their second half and as many new samples. Samples before a gap that do not fill a block
-        are dropped. A block is processed only when its result is asked for.
+        are dropped.
         """
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
@@ -163,10 +161,9 @@ class PressureEstimator(SavedAttributes):
     def _reject(self, follower: Follower, end: float, is_settling: bool, restarts: bool) -> NotJudged:
         """Report a block that the model of the pressures does not describe, and restart the fit if it is lost.
 
-        It is lost after `response.lost` (`priors.toml`) such blocks in succession, or if a parameter is not finite. In
-        the latter case nothing of it can be kept: the next samples are fitted as the first ones were (`take`).
-        `end`: end of the block [s]; `is_settling`: True if the fit had not settled before this block; `restarts`: True
-        if this block cannot be compared with earlier ones.
+        It is lost after `response.lost` (`priors.toml`) such blocks in succession, or if a parameter is not finite; in
+        the latter case the next samples are fitted as the first ones were (`take`). `is_settling`: True if the fit had
+        not settled before this block; `restarts`: True if this block cannot be compared with earlier ones.
         """
         self._misfits += 1
         is_finite = np.isfinite(follower.theta).all()
@@ -196,10 +193,9 @@ class PressureEstimator(SavedAttributes):
         return follower, has_other_rate or not is_short
 
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:
-        """Fit the model of the pressures to a block; return True if the model describes the block.
+        """Fit the model of the pressures to a block, and store the block; return True if the model describes it.
 
-        The fit's sums over the block, and features of its signals, are stored. The usual variance of the residuals is
-        updated, faster if the fit is settling (`is_settling`) or the model does not describe the block.
+        The usual variance of the residuals is updated, faster if the fit is settling or does not describe the block.
         """
         sums = follower.update(block)
         self._signals.take(float(block.t[0]), {name: block[name] for name in _READ}, block.rate)
@@ -241,15 +237,12 @@ class PressureEstimator(SavedAttributes):
         return (*response, *self._signals.observables(since))
 
     def relearn(self, since: float = math.inf) -> None:
-        """Make the learned parameters uncertain again, for example after a repair.
-
-        `since` is not used; it is there because `LiveBalance.relearn` has it.
-        """
+        """Make the learned parameters uncertain again; `since`, of use to `LiveBalance.relearn`, is ignored."""
         if self._follower is not None:
             self._follower.interrupt(math.inf)
 
     def state(self) -> dict[str, Any]:
-        """Return the fit and the stored blocks as plain values for JSON, for `load_state`; the rig is not saved."""
+        """Return the fit and the stored blocks as plain values for JSON, for `load_state`."""
         state = super().state()
         if (follower := self._follower) is None:
             return state | {"follower": None}

@@ -1,29 +1,22 @@
-"""An increase of a running machine's leakage conductance, its test, and the verdict on it (`decision.decide`)."""
+"""An increase of a running machine's leakage conductance, with the test that found it."""
 
 from __future__ import annotations
 
 import math
 from typing import NamedTuple
 
-from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.verdict.evidence import Evidence
 
-#: Name of the watch as a detector (`Evidence.detector`).
-WATCH = "watch"
-#: Names of its tests: for a step within the stream, and for a level above that of the healthy machine.
+#: Names of the tests: for a step within the stream, and for a level above that of the healthy machine.
 STEP, LEVEL = "step", "level"
-_UNDATED = Interval(math.nan, math.nan, math.nan)
 
 
 class LiveRise(NamedTuple):
     """An increase of a running machine's leakage conductance, with its test; an `observable.DatedTest`."""
 
-    test: str  # "step" for a step within the stream, "level" for a conductance above that of the healthy machine
+    test: str  # `STEP` or `LEVEL`
     score: float  # score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level
-    interval: Interval = _UNDATED  # onset with its 95 % interval [s]
+    interval: Interval = Interval(math.nan, math.nan, math.nan)  # onset with its 95 % interval [s]
     # the increase and its standard deviation [m^3/(s Pa)]
     size: float = 0.0
     deviation: float = math.inf
@@ -57,13 +50,3 @@ class LiveRise(NamedTuple):
     def detectable_step(self, chance: float) -> float:
         """Return infinity: the smallest step that is detectable depends on the conductance's unknown random walk."""
         return math.inf
-
-
-def decide_on_stream(leak: LeakMeasure | None, false_alarm_probability: float, lack: str = "") -> Evidence:
-    """Decide if a watched machine leaks, from the estimated `leak` or the reason (`lack`) why there is no estimate.
-
-    `false_alarm_probability` is the allowed probability that the test for the leak raises a false alarm.
-    """
-    report = Observed(WATCH, lack=lack, leak=leak)
-    # no other reports or healthy recordings; other causes were weighed before the alarm (module `explanation`)
-    return decide(report, (), HealthyNull(), false_alarm_probability, weigh_rivals=False)

@@ -108,12 +108,7 @@ class StepDetector(SavedAttributes):
     def take(self, begin: float, end: float, g: float, deviation: float) -> None:
         """Update the evidence of a step by the estimate `g` of the coefficient in the block from `begin` to `end` [s].
 
-        `deviation` is the standard error of `g`. The innovation e is g minus its prediction by a random walk's Kalman
-        filter, S its variance, and f the effect of a unit step on e. For each walk and each possible onset,
-
-            a += f e / S,    b += f^2 / S,    T += e^2 / S.
-
-        The first block after `forget` only sets the level of the filters.
+        `deviation` is the standard error of `g`. The first block after `forget` only sets the level of the filters.
         """
         self._unit = self._unit or deviation  # deviation of the first block, the unit of stored estimates
         g, variance = g / self._unit, (deviation / self._unit) ** 2
@@ -124,30 +119,28 @@ class StepDetector(SavedAttributes):
             self._level[:], self._level_variance[:] = g, variance
             return
         level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
-        innovation, innovation_variance = g - self._level, level_variance + variance  # e and S
-        gain = level_variance / innovation_variance
+        e, S = g - self._level, level_variance + variance  # innovation and its variance
+        gain = level_variance / S
         may_begin = self._count >= _N_WARM
         if may_begin:
             self._add_onsets(begin, end)
-        response = 1.0 - self._sums[_FOLLOWED]  # f
+        f = 1.0 - self._sums[_FOLLOWED]
         if may_begin:  # a step that begins in this block (the last onsets) acts in a part of the block
-            response[:, -len(PARTS) :] = PARTS
-        square = innovation**2 / innovation_variance
-        self._sums[_FOLLOWED] += gain * response
-        self._sums[_A] += response / innovation_variance * innovation
-        self._sums[_B] += response / innovation_variance * response
+            f[:, -len(PARTS) :] = PARTS
+        square = e**2 / S
+        self._sums[_FOLLOWED] += gain * f
+        self._sums[_A] += f / S * e
+        self._sums[_B] += f / S * f
         self._sums[_T] += square
         self._onsets[:, _N] += 1.0
-        self._update_walks(innovation_variance, square)
-        self._level = self._level + gain * innovation
+        self._update_walks(S, square)
+        self._level = self._level + gain * e
         self._level_variance = gain * variance
 
     def _update_walks(self, variance: Array, square: Array) -> None:
-        """Update the scale of the noise and the probability of each of the q random walks by the data of a block.
+        """Update the noise (`_squares`, `_count`) and the probability of each random walk by the data of a block.
 
-        The walks have the variances `WALKS`. The scale is `_squares` / `_count`; the sum of the log variances is also
-        updated. `variance` (q, 1) is S, the variance of the innovation e (measured minus predicted estimate) under each
-        walk, and `square` (q, 1) is e^2 / S.
+        `variance` (q, 1) is S, the variance of the innovation e under each walk, and `square` (q, 1) is e^2 / S.
         """
         square = np.maximum(square, _MIN_SQUARE)
         if self._count >= _N_WARM:
@@ -181,13 +174,11 @@ class StepDetector(SavedAttributes):
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute log M, the evidence that the coefficient has risen.
 
-        M is the sum, over the blocks in which the rise may begin, of the likelihood ratio of a step to no step,
-        averaged over `WALKS`, `SIZES` and `PARTS`. In a healthy machine the mean number of blocks until M > A is at
-        least A. The result is -inf if no rise can have begun yet, or if a quick bound of log M is at most `min_log_e`.
+        The result is -inf if no rise can have begun yet, or if a quick bound of log M is at most `min_log_e`.
         """
         if not len(self._onsets):
             return -np.inf
-        a, b, T = self._sums[[_A, _B, _T]]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
@@ -197,50 +188,36 @@ class StepDetector(SavedAttributes):
         return float(np.logaddexp.reduce(self._log_terms().ravel()))
 
     def _log_likelihoods(self) -> Array:
-        """Compute the log likelihood (q, j) of each random walk q, given no step since each onset j.
+        """Compute the log of prior times likelihood (q, j) of each random walk q, given no step since each onset j.
 
-        With the variances S of the n innovations e and T = sum of e^2 / S, the log likelihood of all innovations is
-        -(n log T + sum of log S) / 2, up to a constant equal for all q. The log likelihood of the innovations before
-        the onset is subtracted, and the log prior of the walk is added. `_add_onsets` has stored this correction in the
-        row `_LOG_PRIOR`.
+        All n innovations have the log likelihood -(n log T + sum of log S) / 2, up to a constant equal for all q. The
+        row `_LOG_PRIOR` subtracts that of the innovations before the onset (`_add_onsets`).
         """
         n, log_T = self._onsets[:, _N], np.log(self._sums[_T])
         return np.asarray(self._sums[_LOG_PRIOR] - 0.5 * (n * log_T + self._log_variances))
 
     def _step_log_ratios(self) -> Array:
-        """Compute the log likelihood ratios (v, q, j) of a rise to no step.
-
-        v is the prior variance of the step's size (`SIZES`), q the random walk's variance in a block (`WALKS`), and j
-        the onset. With the sums a, b and T over n innovations (`take`):
-
-            R = (1 + v b)^(-1/2) (1 - max(a, 0)^2 / ((b + 1/v) T))^(-n/2).
-        """
+        """Compute log R (v, q, j), the log likelihood ratio of a rise to no step, for `SIZES`, `WALKS` and onsets."""
         a, b, T = self._sums[_A : _T + 1]
         v = SIZES[:, None, None]
         explained = np.maximum(a, 0.0) ** 2 / ((b + 1.0 / v) * T)
         return np.asarray(-0.5 * (np.log1p(v * b) + self._onsets[:, _N] * np.log1p(-explained)))
 
     def _log_terms(self) -> Array:
-        """Compute the logarithms (v, q, j) of the terms whose sum is the evidence that the coefficient has risen.
+        """Compute the logarithms (v, q, j) of the terms whose sum is M, -inf for a step down.
 
-        A term is a likelihood ratio (`_step_log_ratios`) times the posterior probability of the walk q without a step.
-        It is divided by the numbers of `SIZES` and of `PARTS`, which are equally likely. For a step down the term is 0
-        and its logarithm minus infinity.
+        `SIZES` and `PARTS` are equally likely each.
         """
         likelihoods = self._log_likelihoods()
         total = np.logaddexp.reduce(likelihoods, axis=0) + np.log(len(SIZES) * len(PARTS))
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate the onset [s] and the size of a rise of the coefficient, in the coefficient's unit.
-
-        Both are averages over the sizes v (`SIZES`), walks q (`WALKS`) and onsets j, weighted by their posterior
-        probabilities. The onset has a 95 % interval, and the size a standard deviation.
-        """
+        """Estimate the onset [s] and the size of a rise, as posterior means over `SIZES`, `WALKS` and onsets."""
         terms = self._log_terms()
         log_evidence = float(np.logaddexp.reduce(terms.ravel()))
         weights = np.exp(terms - log_evidence)  # posterior probabilities (v, q, j)
-        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # mean and variance of the size's posterior, Student's t, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -250,26 +227,27 @@ class StepDetector(SavedAttributes):
         deviation = float(np.sqrt((weights * (variances + (sizes - size) ** 2)).sum()))
         onset_probabilities = weights.sum(axis=(0, 1))
         times, block_begins = self._onsets[:, _TIME], self._onsets[:, _BLOCK_BEGIN]
-        mean_time = float(onset_probabilities @ times)
         order = np.argsort(times, kind="stable")
-        low_index, high_index = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975])
-        sorted_times = times[order]
-        earliest, latest = sorted_times[low_index], sorted_times[min(high_index, len(order) - 1)]
+        # an index may be one too high by rounding of the cumulative sum
+        indices = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975]).clip(max=len(order) - 1)
+        earliest, latest = times[order][indices]
         # the last onsets (one for each of `PARTS`) are in one block; the latest of them comes first
         latest_in_block = float((times - block_begins)[-len(PARTS)])  # time after the beginning of the block [s]
         resolution = latest_in_block / len(PARTS)  # about the distance between neighbouring onsets
-        interval = Interval(mean_time, float(earliest) - resolution, float(latest) + resolution)
+        interval = Interval(
+            float(onset_probabilities @ times), float(earliest) - resolution, float(latest) + resolution
+        )
         return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
 
-    def bound(self, probability: float = BOUND_PROBABILITY) -> float:
-        """Compute an upper bound of an undetected rise of the coefficient, in the coefficient's unit.
+    def bound(self) -> float:
+        """Compute the 95 % upper bound of an undetected rise of the coefficient, in the coefficient's unit.
 
-        It is the quantile at `probability` of the posterior of the rise, limited to rises > 0. It is infinite until
-        there have been enough blocks to test for a rise.
+        It is a quantile of the posterior of the rise, limited to rises > 0, and infinite until there have been enough
+        blocks to test for a rise.
         """
         if not len(self._onsets):
             return np.inf
-        a, b, T = self._sums[_A : _T + 1]  # sums of f e / S, f^2 / S and e^2 / S (`take`)
+        a, b, T = self._sums[_A : _T + 1]
         # least-squares size of a step at each onset and for each walk, and its standard error; b > 0, as already
         # the first block after the onset responds to a step
         sizes = a / b
@@ -280,29 +258,28 @@ class StepDetector(SavedAttributes):
         log_walk_probabilities = likelihoods - np.logaddexp.reduce(likelihoods, axis=0)
         log_weights = log_walk_probabilities + np.logaddexp.reduce(self._step_log_ratios(), axis=0)
         weights = np.exp(log_weights - log_weights.max())
-        return self._unit * bound_steps(weights.ravel(), sizes.ravel(), deviations.ravel(), probability)
+        return self._unit * bound_steps(weights.ravel(), sizes.ravel(), deviations.ravel(), BOUND_PROBABILITY)
 
     @property
     def noise(self) -> float:
-        """Ratio of the actual to the predicted variance of the innovations (a Kalman filter's prediction errors).
+        """Ratio of the actual to the predicted variance of the innovations, by the filter with the walk `_NOISE_WALK`.
 
-        The ratio is averaged over the blocks with exponential forgetting and with a prior that is worth `step.stated`
-        (`priors.toml`) blocks of the ratio 1. It is taken from the filter with the walk `_NOISE_WALK`.
+        It is averaged over the blocks with fading memory, and with `step.stated` (`priors.toml`) blocks of the ratio 1.
         """
         return float((self._squares[_NOISE_WALK, 0] + _PRIORS.stated) / (self._count + _PRIORS.stated))
 
     def load_state(self, state: Any) -> None:
-        """Restore the evidence from a result of the method `state`; raise InputError if it does not fit the onsets."""
+        """Restore the evidence that `state` saved; raise InputError if it does not fit."""
         super().load_state(state)
         if self._sums.shape[2] != len(self._onsets):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
 
 
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
-    """Select the possible onsets of a step to keep: all of the last `RECENT` blocks, and fewer of older blocks.
+    """Select the possible onsets of a step to keep, as flags (j,): all of the last `RECENT` blocks, and fewer of older.
 
-    Returns flags (j,). Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser
-    with age, up to the age `HORIZON`. `block` is the present block's number; `onsets` (j, 4) is as in `StepDetector`.
+    Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the age
+    `HORIZON`. `block` is the present block's number; `onsets` (j, 4) is as in `StepDetector`.
     """
     _, onset_block, time, block_begin = onsets.T
     age = block - onset_block

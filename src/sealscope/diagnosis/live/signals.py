@@ -60,10 +60,7 @@ class SignalWindow(SavedAttributes):
 
     @np.errstate(all="ignore")
     def take(self, begin: float, channels: Mapping[str, Array], rate: float) -> None:
-        """Store the features of a block, unless samples are missing.
-
-        `channels` are its samples by name, which begin at the time `begin` [s], and `rate` is the sampling rate [Hz].
-        """
+        """Store the features of a block that begins at `begin` [s], unless samples are missing; `rate` is in Hz."""
         if not all(np.isfinite(values).all() for values in channels.values()):
             return
         if not self._means.size:
@@ -76,7 +73,7 @@ class SignalWindow(SavedAttributes):
         # design matrix of the regression of the mean pressures on the motion
         design = pressure_level_rows(channels, rate, self._means, max_speed)
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block
-        values = {**dict(log_amplitudes(single_block)), **dict(sensor_features(single_block, rate))}
+        values = dict([*log_amplitudes(single_block), *sensor_features(single_block, rate)])
         features = [float(values[name][0]) if name in values else np.nan for name in FEATURES]
         n_samples, gram = len(channels["p_A"]), design.T @ design
         row = np.array([begin, begin + n_samples / rate, n_samples, speed, fraction_moving, *features, *gram.ravel()])
@@ -84,10 +81,10 @@ class SignalWindow(SavedAttributes):
 
     @np.errstate(all="ignore")
     def observables(self, since: float) -> tuple[Observable, ...]:
-        """Test the features for steps in the blocks that begin at `since` [s] or later.
+        """Test the features for steps in the blocks that begin at `since` [s] or later, if these are enough.
 
         Duty (command and motion) and sensors (noise, hum, sense of p_A - p_B) are tested in the blocks in motion only,
-        the mean pressures in all blocks. The result is empty for fewer than `MIN_BLOCKS` blocks.
+        the mean pressures in all blocks.
         """
         rows = self._rows[self._rows[:, _BEGIN] >= since] if self._rows.size else self._rows
         if len(rows) < MIN_BLOCKS:
@@ -104,11 +101,10 @@ class SignalWindow(SavedAttributes):
         )
 
     def _test_levels(self, rows: Array, time: Array) -> tuple[Observable, ...]:
-        """Test the mean pressures in each direction of motion for steps.
+        """Test the mean pressures in each direction of motion for steps, in stored blocks with the centres `time` [s].
 
-        `rows` are the stored features of n blocks, and `time` (n,) their centres [s]. The blocks are averaged in groups
-        of the smallest size in `_GROUP_SIZES` with which the machine moves in both directions in every group. The
-        result is empty if there is no such size, or if it leaves fewer than `MIN_BLOCKS` groups.
+        The blocks are averaged in groups of the smallest size with which the machine moves in both directions in every
+        group. Nothing is tested if that leaves fewer than `MIN_BLOCKS` groups.
         """
         n_columns = round((rows.shape[1] - _GRAM.start) ** 0.5)  # a row ends with a flattened square Gram matrix
         for size in _GROUP_SIZES:
@@ -125,9 +121,6 @@ class SignalWindow(SavedAttributes):
 
 
 def append_row(rows: Array, row: Array) -> Array:
-    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`.
-
-    All `rows` are dropped if their length differs, as at the first block or, in `pressures`, at another sampling rate.
-    """
+    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`, or to none if their length differs."""
     stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
     return np.vstack([stored, row])

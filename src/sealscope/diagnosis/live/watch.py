@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.observable import LeakMeasure
+from sealscope.diagnosis.decision.decide import decide
+from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
 from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.live.balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import (
@@ -34,7 +36,7 @@ from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanati
 from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
 from sealscope.diagnosis.live.null import StepNull
 from sealscope.diagnosis.live.pressures import PressureEstimator
-from sealscope.diagnosis.live.rise import LEVEL, STEP, WATCH, LiveRise, decide_on_stream
+from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveRise
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
@@ -49,6 +51,8 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
+#: Name of the watch as a detector (`Evidence.detector`).
+WATCH = "watch"
 #: Version of the format of the saved state.
 STATE_VERSION = 18
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
@@ -62,9 +66,9 @@ _ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBa
 
 
 def _rate_of_certain_alarms(test: str, seconds: float) -> float:
-    """Compute the rate of false alarms [per 1000 h] at which a test made once in `seconds` always raises one.
+    """Compute the rate of all false alarms [per 1000 h] at which a test made once in `seconds` always raises one.
 
-    The `test`, `STEP` or `LEVEL`, has a fixed part of all false alarms (`priors.toml`).
+    The `test`, `STEP` or `LEVEL`, raises a fixed fraction of all false alarms (`priors.toml`).
     """
     return float(1000.0 / getattr(_PRIORS, test) * 3600.0 / seconds)
 
@@ -135,7 +139,7 @@ class Watch:
             litres = {method: estimator.states_flow(rig) for method, estimator in _ESTIMATORS.items()}
         self._litres = litres
         self._samples = SampleJoiner(ways_to_watch(rig))
-        self._estimator: Estimator | None = None
+        self._estimator: Estimator | None = None  # None until samples have arrived
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
@@ -156,10 +160,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings with which the baseline is learned.
-
-        These are the rig, a flag for each method that is True if it states L/min, and the time to learn [h].
-        """
+        """Settings of the baseline: rig, for each method True if it states L/min, and the time to learn [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
@@ -178,9 +179,14 @@ class Watch:
         return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
 
     @property
+    def _states_litres(self) -> bool:
+        """True if the present method states leaks in L/min."""
+        return self._litres.get(self.method, False)
+
+    @property
     def why_no_litres(self) -> str:
         """Reason why leaks are not stated in L/min, in words; "" if they are, or if no samples have arrived."""
-        if self._estimator is None or self._estimator.litres:
+        if self._estimator is None or self._states_litres:
             return ""
         return "L/min is not stated, as the machine's file does not state its areas and displacement"
 
@@ -191,29 +197,28 @@ class Watch:
         The verdict is "cannot tell" until enough blocks have arrived.
         """
         leak = self.leak
-        if leak is not None:
-            estimator = self._estimator or self._make_estimator()  # a restored watch may have none yet
-            return decide_on_stream(self._measure(estimator, leak), leak.allowed)
-        probability = self._false_alarm_probability(STEP, self.block_seconds)
-        measure = None if self._estimator is None or not len(self._compared) else self._measure(self._estimator, None)
-        if measure is None or not math.isfinite(measure.bound_flow):
-            why = f": {', '.join(self.counters)}" if self.counters else ""
-            return decide_on_stream(None, probability, lack=f"waits for the first blocks{why}")
-        return decide_on_stream(measure, probability)
+        probability = self._false_alarm_probability(STEP, self.block_seconds) if leak is None else leak.allowed
+        measure = None if leak is None and not len(self._compared) else self._measure(probability)
+        report = Observed(WATCH, leak=measure)
+        if measure is None or (leak is None and not math.isfinite(measure.bound_flow)):
+            reasons = f": {', '.join(self.counters)}" if self.counters else ""
+            report = Observed(WATCH, lack=f"waits for the first blocks{reasons}")
+        # other causes were weighed before the alarm (`_explain`)
+        return decide(report, (), HealthyNull(), probability, weigh_rivals=False)
 
-    def _measure(self, estimator: Estimator, leak: WatchedLeak | None) -> LeakMeasure:
-        """Convert the detected `leak` to a LeakMeasure, from which `decide_on_stream` decides the verdict.
+    def _measure(self, probability: float) -> LeakMeasure:
+        """Describe the detected leak or, without one, the present score and the bound of the test for a step.
 
-        If `leak` is None, the result has the present score of the test for a step, limited to below the threshold, and
-        the 95 % upper bound of an undetected leak. Flows are those of a laminar leak, conductance times mean pressure;
-        `flow_factors` are the ratios of the smallest and the largest possible flow to these. `estimator` states the
-        uncertainty of flows.
+        The score is limited to just below the threshold, which a healthy machine exceeds with the `probability`. Flows
+        are those of a laminar leak, conductance times mean pressure; `flow_factors` are the ratios of the smallest and
+        the largest possible flow to these.
         """
+        leak, estimator = self.leak, self._used_estimator
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
             test, cause, pressure, bound, pump_flow = leak.estimate, leak.cause, leak.pressure, math.inf, 0.0
         else:
             # a step may exceed the threshold before it is explained: it must not be reported as a leak yet
-            threshold = -2.0 * math.log(self._false_alarm_probability(STEP, self.block_seconds))
+            threshold = -2.0 * math.log(probability)
             score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
             test, cause = LiveRise(STEP, score), estimator.cause
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
@@ -232,7 +237,7 @@ class Watch:
             flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
             bound_flow=bound,
             pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
-            lpm_per_flow=1.0 / LITRE_PER_MINUTE if estimator.litres else None,
+            lpm_per_flow=1.0 / LITRE_PER_MINUTE if self._states_litres else None,
             size_deviation=estimator.size_error,
         )
 
@@ -256,16 +261,11 @@ class Watch:
         return [estimate for estimate, _ in self.each(samples, follows=follows)]
 
     def each(self, samples: Recording, *, follows: bool = True) -> Iterator[tuple[BlockEstimate, WatchedLeak | None]]:
-        """Process samples as `update` does, and yield the estimate of each block with the leak detected so far.
-
-        The leak is None if none has been detected.
-        """
+        """Process samples as `update` does, and yield the estimate of each block with the leak detected so far."""
         if not follows:
             self._samples.restart("pauses between samples")
         for run in self._samples.runs(remove_dropouts(samples)):
-            if self._estimator is None or self._estimator.method != self.method:  # a position came later
-                self._estimator = self._make_estimator()
-            results = self._estimator.take(run)
+            results = self._used_estimator.take(run)
             while True:
                 with np.errstate(all="ignore"):  # sums of impossible readings may overflow
                     result = next(results, None)
@@ -275,20 +275,20 @@ class Watch:
                     self._samples.count(result.counter)
                 else:
                     yield self.judge(result), self.leak
-            self._samples.is_final = self._estimator.has_begun
+            self._samples.is_final = self._used_estimator.has_begun
 
-    def _make_estimator(self) -> Estimator:
-        """Create the estimator of the conductance for the channels in use, which also tells if L/min can be stated."""
-        states_litres = self._litres.get(self.method, False)
-        if self.method == PressureEstimator.method:
-            return PressureEstimator(self._rig, states_litres)
-        return LiveBalance(self._rig, self._samples.names, states_litres)
+    @property
+    def _used_estimator(self) -> Estimator:
+        """Estimator of the conductance for the channels in use; a new one if a position came later."""
+        if self._estimator is None or self._estimator.method != self.method:
+            if self.method == PressureEstimator.method:
+                self._estimator = PressureEstimator(self._rig)
+            else:
+                self._estimator = LiveBalance(self._rig, self._samples.names)
+        return self._estimator
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
-        """Continue the counts of an earlier watch that had other settings.
-
-        `blocks` is the earlier number of blocks. The next baseline gets the version after `baseline_version`.
-        """
+        """Continue the number of blocks and the version of the baseline of an earlier watch with other settings."""
         self.blocks, self.baseline_version = blocks, baseline_version + 1
 
     def relearn(self) -> None:
@@ -311,16 +311,12 @@ class Watch:
         self._forget()
 
     def _forget(self) -> None:
-        """Restart the tests for a leak, and drop all blocks with which later ones would be compared."""
+        """Restart the tests for a leak, without the blocks so far."""
         self._detector.forget()
         self._compared, self._grouped = self._compared[:0], 0
 
     def judge(self, result: BlockResult) -> BlockEstimate:
-        """Test the conductance in a `result` of the estimator for a leak, and return the estimate of the block.
-
-        The first blocks, to which the volume balance is fitted together, come as one result. All of them are tested,
-        and the estimate of the last one is returned. A `NotJudged` gives an estimate without flows.
-        """
+        """Test the conductance in a `result` of the estimator for a leak, and return the estimate of its last block."""
         self.blocks += 1
         if isinstance(result, NotJudged):
             if result.restarts:
@@ -328,27 +324,25 @@ class Watch:
             if result.counter:
                 self._samples.count(result.counter)
             return BlockEstimate(self.blocks, result.end, result.status)
-        assert self._estimator is not None
         for block in result:
-            estimate = self._judge_block(self._estimator, block)
+            estimate = self._judge_block(block)
         return estimate
 
-    def _judge_block(self, estimator: Estimator, block: BlockConductance) -> BlockEstimate:
+    def _judge_block(self, block: BlockConductance) -> BlockEstimate:
         """Test the conductance of a block against those of earlier blocks, and estimate the leak in this block.
 
         The block is added to the baseline, the healthy state, while that is being learned and no leak has been
         detected. No flows are stated for a duty (pressure difference and pump flow) other than the baseline's. A block
         with numbers that are too large or not finite is not tested.
         """
-        row = np.array([block], _BLOCK)
         is_small = all(abs(number) < _MAX_NUMBER for number in block)  # False for NaN, too
         if not (is_small and self._detector.is_representable(block.g, block.sd)):
             self._samples.count("blocks: beyond floating point")
             return BlockEstimate(self.blocks, block.end, "beyond floating point")
         baseline = self.baseline
         has_known_duty = baseline is None or is_known_duty(block.duty, baseline.duty_low, baseline.duty_high)
-        self._add_to_tests(block, row, has_known_duty=has_known_duty)
-        awaits_explanation = self._test_step(estimator, block)
+        self._add_to_tests(block, has_known_duty=has_known_duty)
+        awaits_explanation = self._test_step(block)
         if not has_known_duty:
             return BlockEstimate(self.blocks, block.end, "another duty" if self.leak is None else "alarm")
         # blocks since a step that may not be a leak must not count in the test of the mean: begin a new group
@@ -356,20 +350,19 @@ class Watch:
         if self._grouped == GROUP:
             self._grouped = 0
             if self.leak is None:
-                self._test_level(estimator, block)
+                self._test_level(block)
         if self.baseline is None and self.leak is None:
-            self._learn(estimator, block)
+            self._learn(block)
         status = "alarm" if self.leak is not None else "learning" if self.baseline is None else "watched"
         estimate = BlockEstimate(self.blocks, block.end, status)
-        blocks = row if self.leak is None else self._blocks_of_leak(self.leak)[-_PRIORS.recent :]
-        return self._add_flows(estimate, estimator, blocks)
+        if self.leak is None:
+            return self._add_flows(estimate, np.array([block], _BLOCK))
+        return self._add_flows(estimate, self._blocks_of_leak(self.leak)[-_PRIORS.recent :])
 
-    def _add_to_tests(self, block: BlockConductance, row: NDArray[Any], *, has_known_duty: bool) -> None:
+    def _add_to_tests(self, block: BlockConductance, *, has_known_duty: bool) -> None:
         """Add a block to the tests for a leak, which restart after a pause or a change of duty.
 
-        `has_known_duty` is True if the duty (mean pressure difference and pump flow) is in the baseline's range. To
-        leave this range or to return to it is a change of duty. `row` (1,) is the block as an array of the type
-        `_BLOCK`.
+        The duty changes if it leaves the baseline's range, or returns to it (`has_known_duty`).
         """
         if not has_known_duty:
             self._samples.count("blocks: another duty")
@@ -381,21 +374,18 @@ class Watch:
         if not len(self._compared):
             self._since = block.begin
         self._detector.take(block.begin, block.end, block.g, block.sd)
-        self._compared = np.append(self._compared[1 - RECENT :], row)  # the last `RECENT` blocks
+        self._compared = np.append(self._compared[1 - RECENT :], np.array([block], _BLOCK))  # the last `RECENT` blocks
 
-    def _learn(self, estimator: Estimator, block: BlockConductance) -> None:
-        """Add a block to the baseline, the healthy state; freeze the baseline after `learn_hours` of operation.
-
-        The baseline has at least `LEARNED` blocks.
-        """
+    def _learn(self, block: BlockConductance) -> None:
+        """Add a block to the baseline; freeze it after `learn_hours` of operation, but at least `LEARNED` blocks."""
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
-            states_lpm = estimator.litres and estimator.states_level
+            states_lpm = self._states_litres and self._used_estimator.states_level
             self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, states_lpm=states_lpm)
             self._learning = BaselineLearning()
 
-    def _test_step(self, estimator: Estimator, block: BlockConductance) -> bool:
+    def _test_step(self, block: BlockConductance) -> bool:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
         For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. While the
@@ -416,23 +406,23 @@ class Watch:
         rise = self._detector.rise()
         cause = None if leak is None else leak.cause
         if leak is None:
-            explanation = self._explain(estimator, rise, block)
+            explanation = self._explain(rise, block)
             if not explanation.is_leak:
                 if is_learning and explanation == UNKNOWN and len(self._compared):  # the tests did not restart
                     self._null.add(log_e)
                 return True
             cause = OUTSIDE if explanation.is_outside else None
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
-        self._raise_leak(estimator, rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
+        self._raise_leak(rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
         return False
 
-    def _explain(self, estimator: Estimator, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
+    def _explain(self, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
-        The result is `UNKNOWN` if too few blocks have followed the onset. It is also `UNKNOWN` if the machine had
-        started shortly before the onset; then the tests restart. If the blocks around the onset are no longer stored,
-        the rise counts as a leak. Otherwise `explain_rise` finds the cause. If other events explain the rise and enough
-        blocks have followed, the tests restart and the `estimator` learns anew.
+        The result is `UNKNOWN` if too few blocks have followed the onset, or if the machine had started shortly before
+        it; a start restarts the tests. If the blocks around the onset are no longer stored, the rise counts as a leak.
+        If other events explain the rise and enough blocks have followed, the tests restart and the estimator learns
+        anew.
         """
         n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
         if n_since < _EXPLANATION.shows:
@@ -442,33 +432,35 @@ class Watch:
             self._forget()
             return UNKNOWN
         with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
-            observables = estimator.observables(self._since, block.end, rise.interval.value)
+            observables = self._used_estimator.observables(self._since, block.end, rise.interval.value)
         if observables is None:
             return RiseExplanation(is_leak=True)
         is_settled = n_since >= _EXPLANATION.settles
-        explanation = explain_rise(observables, estimator.data, rise.interval, is_settled)
+        explanation = explain_rise(observables, self._used_estimator.data, rise.interval, is_settled)
         if explanation.other_events and is_settled:
             self._samples.count(f"changes that are no leak: {explanation.other_events}")
-            estimator.relearn(rise.interval.high)
+            self._used_estimator.relearn(rise.interval.high)
             self._forget()
         return explanation
 
-    def _test_level(self, estimator: Estimator, block: BlockConductance) -> None:
+    def _test_level(self, block: BlockConductance) -> None:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
         The blocks are weighted by their precisions. The mean is compared with the baseline or, before there is one,
-        with healthy recordings if `estimator` states levels. Without either, nothing is tested.
+        with healthy recordings if the estimator states levels. Without either, nothing is tested.
         """
-        has_baseline = self.baseline is not None
-        healthy: HealthyLevel | None = self.baseline if has_baseline or not estimator.states_level else self.healthy
+        healthy: HealthyLevel | None = self.baseline
+        if healthy is None and self._used_estimator.states_level:
+            healthy = self.healthy
         if healthy is None:
             return
+        has_baseline = healthy is self.baseline
         blocks = self._compared[-GROUP:]
         first_end_s = float(self._compared["end"][0])
         max_ratio = INFERENCE.oil.warmest
-        weights = blocks["sd"] ** -2.0 / np.sum(blocks["sd"] ** -2.0)  # by the precision of each block
+        precisions = blocks["sd"] ** -2.0
+        sd, weights = float(np.sum(precisions)) ** -0.5, precisions / np.sum(precisions)
         g, total, offset = (float(weights @ blocks[name]) for name in ("g", "total", "offset"))
-        sd = float(np.sum(blocks["sd"] ** -2.0)) ** -0.5
         if has_baseline:
             name, mean, onset_s = "baseline", g, float(blocks["end"].mean())
             # the mean is compared with `max_ratio` times the baseline, and both contain the same error `offset`
@@ -488,11 +480,10 @@ class Watch:
                 "more than the warmest oil can cause"
             )
             threshold = rise.threshold(probability)
-            self._raise_leak(estimator, rise, block, threshold=threshold, reason=reason, before=healthy.level)
+            self._raise_leak(rise, block, threshold=threshold, reason=reason, before=healthy.level)
 
     def _raise_leak(
         self,
-        estimator: Estimator,
         rise: LiveRise,
         block: BlockConductance,
         threshold: float,
@@ -502,10 +493,9 @@ class Watch:
     ) -> None:
         """Set the leak alarm, `self.leak`, from a significant increase `rise` of the conductance up to `block`.
 
-        `reason` is the text of the alarm, and `threshold` the test's threshold. `before` is the conductance before the
-        onset: by default its mean over the last blocks before the onset, at most `GROUP`, or that of `block` less the
-        rise if none is stored. `cause` is by default the estimator's. An earlier alarm keeps its time and its
-        conductance before the onset.
+        `before` is the conductance before the onset: by default its mean over the last blocks before the onset, at most
+        `GROUP`, or that of `block` less the rise if none is stored. `cause` is by default the estimator's. An earlier
+        alarm keeps its time and its conductance before the onset.
         """
         raised_s = block.end
         if self.leak is not None:
@@ -513,7 +503,7 @@ class Watch:
         elif before is None:
             earlier_g = self._compared["g"][self._compared["end"] <= rise.interval.low][-GROUP:]
             before = float(np.mean(earlier_g)) if earlier_g.size else block.g - rise.size
-        reason = f"{reason} (score {rise.score:.1f}, threshold {threshold:.1f})"
+        texts = [f"{reason} (score {rise.score:.1f}, threshold {threshold:.1f})", self.why_no_litres]
         self.leak = WatchedLeak(
             raised_s=raised_s,
             onset_s=rise.interval.value,
@@ -525,8 +515,8 @@ class Watch:
             rise_sd=rise.deviation,
             pressure=block.pressure,
             test=rise.test,
-            cause=cause or estimator.cause,
-            reason=reason if estimator.litres else f"{reason}; {self.why_no_litres}",
+            cause=cause or self._used_estimator.cause,
+            reason="; ".join(filter(None, texts)),
             score=rise.score,
             threshold=threshold,
         )
@@ -544,24 +534,23 @@ class Watch:
         These are the blocks, at most `RECENT`, since the tests last restarted or, after an alarm, since the onset of
         the leak. An estimate of a block that was not judged is returned unchanged.
         """
-        estimator = self._estimator
-        if estimator is None or not (estimate.judged and len(self._compared)):
+        if not (estimate.judged and len(self._compared)):
             return estimate
-        blocks = self._compared if self.leak is None else self._blocks_of_leak(self.leak)
-        return self._add_flows(estimate, estimator, blocks)
+        return self._add_flows(estimate, self._compared if self.leak is None else self._blocks_of_leak(self.leak))
 
-    def _add_flows(self, estimate: BlockEstimate, estimator: Estimator, blocks: NDArray[Any]) -> BlockEstimate:
+    def _add_flows(self, estimate: BlockEstimate, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
         `blocks` (n,) have the fields of `BlockConductance`; `offset` includes the errors of the machine's sizes. The
         leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is left out if
-        there is neither a baseline nor an alarm. The total is left out if the `estimator` states only changes, and both
-        flows are left out if it states no L/min. The limits of the leak are those above the highest and the lowest
-        reference level, minus and plus a half-width, times the smallest and the largest ratio of a true to the
-        estimated leak; both at least 0.
+        there is neither a baseline nor an alarm. The total is left out if the estimator states only changes, and both
+        flows are left out without L/min. The limits of the leak are those above the highest and the lowest reference
+        level, minus and plus a half-width, times the smallest and the largest ratio of a true to the estimated leak;
+        both at least 0.
         """
-        if not estimator.litres:
+        if not self._states_litres:
             return estimate
+        estimator = self._used_estimator
         lpm = blocks["pressure"] / LITRE_PER_MINUTE  # flow per unit of conductance
         mean_lpm = float(lpm.mean())
         # `noise`: actual over stated variance of the conductances
@@ -571,22 +560,23 @@ class Watch:
             half_width = WITHIN_95 * math.hypot(total.deviation, float(np.mean(blocks["offset"] * lpm)))
             interval = max(0.0, total.value - half_width), max(0.0, total.value + half_width)
             estimate = replace(estimate, total_lpm=total.value, total_interval_lpm=interval)
-        reference = self.baseline if self.leak is None else level_before_leak(self.leak, estimate.t)
-        if reference is None:
-            return estimate
-        min_fraction, reference_sd = 1.0, 0.0
         if self.leak is not None:
-            min_fraction, reference_sd = estimator.min_internal_fraction, self.leak.rise_sd
-        leak = mean_flow((blocks["g"] - reference.level) * lpm, errors)
+            reference, reference_sd = level_before_leak(self.leak, estimate.t), self.leak.rise_sd
+            min_fraction = estimator.min_internal_fraction  # the rest may flow to the outside
+        elif self.baseline is not None:
+            reference = Interval(self.baseline.level, self.baseline.low, self.baseline.high)
+            reference_sd, min_fraction = 0.0, 1.0
+        else:
+            return estimate
+        leak = mean_flow((blocks["g"] - reference.value) * lpm, errors)
         half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
-        # flow to the outside lowers `low` (after an alarm), flow through an orifice raises `high`
-        low = min_fraction * (leak.value + (reference.level - reference.high) * mean_lpm - half_width)
-        high = estimator.orifice_factor * (leak.value + (reference.level - reference.low) * mean_lpm + half_width)
+        low = min_fraction * (leak.value + (reference.value - reference.high) * mean_lpm - half_width)
+        high = estimator.orifice_factor * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:
-        """Return the state of the watch as plain values for JSON, which `from_state` restores."""
-        # an estimator for channels other than those in use is not saved, as the next samples would replace it
+        """Return the state of the watch as plain values for JSON, for `from_state`."""
+        # an estimator for other channels than those in use is not saved, as the next samples would replace it
         estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
@@ -606,8 +596,7 @@ class Watch:
         watch = cls(_parse_rig(require_part(state, "rig", str)), rate, hours, litres=litres)
         restore_attributes(watch, _SAVED, state, _SAVED_TYPES)
         if (estimator := require_part(state, "estimator", (Mapping, type(None)))) is not None:
-            watch._estimator = watch._make_estimator()
-            watch._estimator.load_state(estimator)
+            watch._used_estimator.load_state(estimator)
         return watch
 
 

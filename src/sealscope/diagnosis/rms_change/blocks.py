@@ -43,7 +43,6 @@ class RmsBlocks:
     # (n, 4), see `DUTY`: log RMS of the command, of its rate and of the pressure difference dp, and mean(dp)/RMS(dp)
     duty: Array
     chambers: tuple[str, ...]  # names of the chamber pressures
-    phases: int  # number of blocks per cycle of the duty; 1 if a block is a whole cycle or longer, or without one
     cycle: float | None  # period of the duty [s], None if nothing repeats
     frozen: str | None = None  # description of the first block with a stuck pressure reading, if any
     n_left_out: int = 0  # number of blocks that were left out because samples are missing
@@ -54,22 +53,13 @@ class RmsBlocks:
         return len(self.log_rms) / max(len(self.log_rms) + self.n_left_out, 1)
 
     @property
-    def names(self) -> list[str]:
-        """Names of the columns of `log_rms` (`column_names`)."""
-        return column_names(self.chambers)
-
-    @property
     def seconds(self) -> float:
         """Length of a block [s]; 0 if there are no blocks."""
         # the smallest difference, since a block that was left out makes the difference of two starts larger
         return float(np.diff(self.edges).min()) if len(self.log_rms) else 0.0
 
     def without_start(self) -> RmsBlocks:
-        """Return a copy without the first blocks, in which pressures and speed settle.
-
-        The blocks that are left out span `blocks.settling` seconds or `blocks.settling_cycles` cycles (`priors.toml`),
-        whichever is longer, but at most an eighth of the blocks.
-        """
+        """Return a copy without the first blocks, at most an eighth, in which pressures and speed settle."""
         n_blocks, prior = len(self.log_rms), RMS_PRIORS.blocks
         start_s = max(prior.settling, prior.settling_cycles * (self.cycle or 0.0))
         first = min(n_blocks // 8, int(np.ceil(start_s / self.seconds))) if n_blocks else 0
@@ -88,10 +78,9 @@ def judged_chambers(recording: Recording) -> tuple[str, ...]:
 
 
 def measure_levels(recording: Recording) -> tuple[Array, Array]:
-    """Compute the log RMS of wavelet details (5 per judged chamber,) and features of the duty (4,) of a recording.
+    """Compute a row of `RmsBlocks.log_rms` and of `RmsBlocks.duty` for a whole recording as one block.
 
-    They are a row of `RmsBlocks.log_rms` and of `RmsBlocks.duty`, for the whole recording as one block. Its ends are
-    left out, as the wavelet transform depends on padding there.
+    Its ends are left out, as the wavelet transform depends on padding there.
     """
     transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
     inside = transformed[0].inside()
@@ -100,11 +89,11 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 
 
 def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
-    """Compute the log RMS of wavelet details (n, 5 per chamber) and features of the duty (n, 4) of n blocks.
+    """Compute `RmsBlocks.log_rms` and `RmsBlocks.duty` of n blocks.
 
-    `RmsBlocks` describes both. `transformed` are the wavelet details of each judged chamber, and `bounds` (n + 1,) the
-    sample indices of the blocks' ends. The load is p_A - p_B, even if one of them is clipped, or the pressure of the
-    only recorded chamber minus its mean. The log RMS is -inf for a detail that is 0, such as that of a stuck reading.
+    `transformed` are the wavelet details of each judged chamber, and `bounds` (n + 1,) the sample indices of the
+    blocks' ends. The load is p_A - p_B, even if one of them is clipped, or the pressure of the only recorded chamber
+    minus its mean. The log RMS is -inf for a detail that is 0, such as that of a stuck reading.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -124,12 +113,11 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
 
 
 def cut_blocks(recording: Recording) -> RmsBlocks:
-    """Cut a recording into blocks, and compute for each the log RMS of wavelet details and features of the duty.
+    """Cut a uniformly sampled recording without gaps into blocks, and measure each.
 
-    The recording must be uniformly sampled and its gaps filled in. Blocks in which too many samples were missing are
-    left out, and so are the ends, where the wavelet transform depends on padding. If the duty repeats, the mean
-    differences between the phases of its cycle (blocks at the same place in the cycle) are removed, unless a reading is
-    stuck, whose log RMS has no mean. For a recording that is too short for a block, the result has no blocks.
+    Blocks in which too many samples were missing are left out, and so are the ends, where the wavelet transform depends
+    on padding. If the duty repeats, the mean differences between the phases of its cycle are removed, unless a reading
+    is stuck, whose log RMS has no mean.
     """
     chambers = judged_chambers(recording)
     transformed = [details(recording[chamber]) for chamber in chambers]
@@ -137,7 +125,7 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     bounds, phases = _block_bounds(transformed[0].inside(), recording.rate, cycle)
     if len(bounds) == 1:  # too short for a block
         no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
-        return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, phases, cycle)
+        return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, cycle)
     log_rms, duty = _measure_blocks(recording, transformed, bounds)
     times = recording.t[0] + bounds / recording.rate
     is_complete = ~flag_bridged(recording, bounds)
@@ -152,27 +140,23 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     # starts of the complete blocks, and the end of the last one
     end = times[1:][is_complete][-1:] if is_complete.any() else times[:1]
     edges = np.append(times[:-1][is_complete], end)
-    n_left_out = int(np.count_nonzero(~is_complete))
-    return RmsBlocks(edges, log_rms, duty, chambers, phases, cycle, frozen, n_left_out)
+    return RmsBlocks(edges, log_rms, duty, chambers, cycle, frozen, n_left_out=int(np.count_nonzero(~is_complete)))
 
 
 def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntArray, int]:
     """Choose the sample indices at which blocks begin and end (n + 1,), and the number of blocks per duty cycle.
 
     `inside` are the samples at which the wavelet details do not depend on padding, `rate` is the sampling rate [Hz],
-    and `cycle` the period of the duty [s], or None. Without a cycle, a block has the length L of `priors.toml`, the
-    longer of `blocks.seconds` and `blocks.samples`. With one, it is cycle / n with n = cycle / L, rounded, or n cycles
-    with n = L / cycle, rounded, if a cycle is shorter than L. If there would be too many blocks, they become longer and
-    span whole cycles.
+    and `cycle` the period of the duty [s], or None.
     """
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = prior_s = max(prior.seconds, prior.samples / rate)
     phases = 1
-    if cycle is not None:
+    if cycle is not None:  # a whole fraction of the cycle, or a multiple if it is shorter than `prior_s`
         phases = max(1, round(cycle / prior_s))
         phase_s = cycle / phases
         block_s = phase_s * max(1, round(prior_s / phase_s))
-    if n_samples > prior.most * block_s * rate:
+    if n_samples > prior.most * block_s * rate:  # too many blocks: make them longer, in whole cycles
         block_s *= phases * math.ceil(n_samples / (prior.most * phases * block_s * rate))
         phases = 1
     n_blocks = int(n_samples / (block_s * rate))
@@ -184,10 +168,8 @@ def _find_frozen(
 ) -> str | None:
     """Describe the first block in which a pressure reading is stuck; None if no reading is stuck.
 
-    A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. `log_rms` (n, 5 per chamber)
-    is that of n blocks, and `times` (n + 1,) are the bounds of the blocks [s]. Only blocks in which few samples are
-    missing, as marked in `is_complete` (n,), are searched. If several readings are stuck, the first chamber is
-    described.
+    A reading is stuck if one of its details d1 to d4 is only rounding error or not finite. Only complete blocks are
+    searched; `times` (n + 1,) are the bounds of all [s]. If several readings are stuck, the first chamber is described.
     """
     floor = np.log([ROUNDING * np.abs(recording[name]).max() for name in chambers])[:, None]
     levels = log_rms.reshape(len(log_rms), len(chambers), -1)[:, :, :-1]  # without d3d4

@@ -55,28 +55,19 @@ class RmsChange:
         return None if frozen is None else f"{frozen} is constant"
 
     def learn(self, recording: Recording) -> Summary:
-        """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings.
-
-        The summary's `levels` (5 per chamber,) and `duty` (4,) are those of `measure_levels`. `chambers` are the
-        pressures that are not mostly clipped, to which `levels` belong, and `recorded` all chamber pressures; `rate` is
-        the sampling rate [Hz], and `start_s` the start time [s since 1970], None if unknown.
-        """
+        """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings."""
         levels, duty = measure_levels(recording)
         return {
-            "chambers": list(judged_chambers(recording)),
+            "chambers": list(judged_chambers(recording)),  # those of `levels`
             "recorded": list(chambers_of(recording)),
             "rate": recording.rate,
-            "start_s": start_seconds(recording),
+            "start_s": start_seconds(recording),  # [s since 1970], None if unknown
             "levels": levels,
             "duty": duty,
         }
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
-        """Test the RMS of the wavelet details against `baseline` or, without one, for a change within the recording.
-
-        The report only gives a reason if the sampling rate is too low, or if nothing can be compared: no recording of
-        `baseline` is comparable (`observe_against`) or, without one, a reading is stuck or there are too few blocks.
-        """
+        """Test the RMS of the wavelet details against `baseline` or, without one, for a change within the recording."""
         min_rate: float = RMS_PRIORS.rate.slowest
         if recording.rate < min_rate:
             rule = f"needs {min_rate:g} Hz or more to see the ringing that a leak damps"
@@ -95,17 +86,15 @@ class RmsChange:
 def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ()) -> Observed:
     """Test the wavelet details of every chamber pressure for a step of their RMS within one recording.
 
-    The more significant of a step up and a step down is reported for each detail. Their common onset is estimated from
-    the sum of the log likelihoods of the judged details (d2 to d4) whose step has a p-value below 0.5. The bound of an
-    undetected change of the ringing is the smallest by a judged detail, as the ringing changes in all of them. `rate`
-    is the sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels. If most
-    blocks give no information about a detail, the report only says so.
+    The more significant of a step up and a step down is reported for each detail, with their common onset. The bound of
+    an undetected change of the ringing is the smallest by a judged detail, as the ringing changes in all of them.
+    `rate` is the sampling rate [Hz]; `unused`, for the report, are the names of columns that are not used as channels.
     """
     changes = dict[str, tuple[StepTest, float]]()  # by detail: the more significant test, and the change of the log RMS
     judged_steps, bounds = list[StepTest](), list[float]()
     # of the change g of the ringing, i.e. of the log RMS without noise; fractions of energy that is not noise
     likelihoods, weights = change_information(blocks)
-    for name, likelihood, weight in zip(blocks.names, likelihoods, weights, strict=True):
+    for name, likelihood, weight in zip(column_names(blocks.chambers), likelihoods, weights, strict=True):
         steps = step_tests(likelihood, signs=(1.0, -1.0))
         if not steps:
             return Observed(RmsChange.name, lack=f"{name} gives no information in most blocks")
@@ -136,9 +125,8 @@ def observe_within(blocks: RmsBlocks, rate: float, unused: tuple[str, ...] = ())
 def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observed:
     """Test the RMS of a recording's wavelet details for changes against leak-free recordings.
 
-    The pressures that are not mostly clipped are judged; if all are, all count (`judged_chambers`). Only recordings in
-    `baseline` with the same chamber pressures and sampling rate are used, in which none of the judged pressures is
-    mostly clipped, by the same rule. If there are none, the report only says so.
+    Of `baseline`, only recordings with the same chamber pressures and sampling rate are used, in which none of the
+    judged pressures (`judged_chambers`) is mostly clipped.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
     # the duty is computed from all recorded chambers, which must therefore be the same; older summaries lack `recorded`
@@ -161,7 +149,7 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
 
 
 def has_same_rate(rate: float, other: float) -> bool:
-    """Tell whether two sampling rates [Hz] are equal within the error of a logger's clock (0.1 %)."""
+    """Return True if two sampling rates [Hz] are equal within the error of a logger's clock (0.1 %)."""
     return abs(rate / other - 1.0) < 1e-3
 
 
@@ -202,16 +190,15 @@ def _make_observable(
 ) -> Observable:
     """Make the observable for the change of one wavelet detail, named by its `column`, such as "d3 of p_A".
 
-    `size` is the change of the log RMS, `score` twice its log likelihood ratio, and `onset` its time [s], None for a
-    comparison with other recordings. The p-value `chance` is multiplied by the number of tests, which is two (rise and
-    fall) for each judged detail of each chamber in `chambers`. d1 and d3d4, which are not judged, have a kind of data
-    of their own, "noise of details": a leak may change it, but is not detected by it (`decision/events.toml`).
+    `size` is the change of the log RMS, and `chance` the p-value of this test alone. d1 and d3d4, which are not judged,
+    have a kind of data of their own: a leak may change it, but is not detected by it (`decision/events.toml`).
     """
+    n_tests = 2 * len(JUDGED) * len(chambers)  # for a rise and a fall of each judged detail
     return Observable(
         name=f"{'rise' if size > 0.0 else 'fall'} of {column}",
         data=DETAILS if _is_judged(column) else "noise of details",
         score=score,
-        chance=min(1.0, 2.0 * len(JUDGED) * len(chambers) * chance),
+        chance=min(1.0, n_tests * chance),
         onset=onset,
         size=size,
     )

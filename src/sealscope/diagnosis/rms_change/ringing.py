@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.comparison.population import Population, numb
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks
+from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks, column_names
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 
@@ -29,9 +29,8 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
     """Compute the change of the log RMS of wavelet details relative to healthy values, with the noise removed.
 
     `log_rms` (n, 5 per chamber) are values of n blocks or recordings, for the details d1 to d4 and the product d3d4.
-    From `healthy` (k, 5 per chamber), the machine's mean energy S_j in each detail d_j is estimated as the energy of
-    d_j minus that of d1. The noise E_1 is the energy of d1 in the same row of `log_rms`. Returns the changes y and the
-    fractions w of the energy that is not noise, both (n, 5 per chamber):
+    S_j is estimated from `healthy` (k, 5 per chamber), as the mean energy of d_j minus that of d1. Returns the changes
+    y and the fractions w of the energy that is not noise, both (n, 5 per chamber):
 
         d2, d3, d4:   y = log RMS - log sqrt(S_j + E_1),    w = S_j / (S_j + E_1)
         d1:           y = log RMS,    w = 1
@@ -55,9 +54,7 @@ def subtract_noise(log_rms: Array, healthy: Array) -> tuple[Array, Array]:
 def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     """Compute the likelihood of the relative change g of the ringing in each block of a recording.
 
-    The log RMS y of a wavelet detail without its noise (`subtract_noise`) is w g + error, up to a constant and the
-    effect of the duty, which is eliminated; w is the fraction of energy that is not noise. Returns for each column of
-    `blocks.log_rms` a normal likelihood of g over the blocks (`Information`), and the means of w (columns,).
+    Returns for each column of `blocks.log_rms` a normal likelihood of g over the blocks, and the means of w (columns,).
     """
     changes, weight = subtract_noise(blocks.log_rms, blocks.log_rms)
     variances = np.mean(np.diff(changes, axis=0) ** 2, axis=0) / 2.0  # a difference has twice the variance
@@ -71,7 +68,7 @@ def change_information(blocks: RmsBlocks) -> tuple[list[Information], Array]:
     walk_scale = float(np.sqrt(len(time) * blocks.seconds / walks.time))
     machine_walk = walks.duty if blocks.cycle is None else walks.machine
     results = list[Information]()
-    for name, y, w, variance in zip(blocks.names, changes.T, weight.T, variances, strict=True):
+    for name, y, w, variance in zip(column_names(blocks.chambers), changes.T, weight.T, variances, strict=True):
         drift_scale = (walks.noise if name.startswith("d1 ") else machine_walk) * walk_scale
         precision, vector = w**2 / variance, w * y / variance
         # eliminate the exponents of the duty D, which have normal priors: P - P D (D'P D + 1/sd^2)^-1 D'P
@@ -94,8 +91,8 @@ def estimate_rises(
     noise (`subtract_noise`) over this fraction.
 
     The model is the sum of a common mean, an effect of the duty, independent scatter, and an Ornstein-Uhlenbeck process
-    over time, independent between sessions, which are separated by pauses. The standard deviation of this process is
-    `recordings.session` of `priors.toml`; the likelihood is averaged over a prior on the rate of the process (`walk`).
+    over time, independent between sessions, which are separated by pauses. The likelihood is averaged over a prior on
+    the rate of this process.
     """
     prior, walk, n = RMS_PRIORS.recordings, RMS_PRIORS.walk, len(healthy)
     exponent_sd = np.array([getattr(RMS_PRIORS.duty, name) for name in DUTY])

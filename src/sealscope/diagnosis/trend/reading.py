@@ -49,73 +49,39 @@ BASES: tuple[Basis, ...] = get_args(Basis)
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LeakReading:
-    """Leakage of a machine in one recording.
+    """Leakage of a machine in one recording."""
 
-    Attributes
-    ----------
-    file, start, duration : str, float or None, float
-        Name of the recording, time of its first sample [s since 1970], if known, and duration [s].
-    basis : Basis or None
-        Method by which the level was estimated. None if no level can be stated; `problem` then tells why.
-    level, error : float
-        Leakage conductance of pump and piston together and its standard error [m^3/(s Pa)], or minus the mean log RMS
-        of the pressures' wavelet details ("ringing"); relative to the assumed machine unless `states_flow`.
-    states_flow : bool
-        True if the level can be stated in L/min.
-    area : float or None
-        Piston area [m^2] that converts a creep speed to a flow on the level's scale, None if there is no such area.
-    pressure : float
-        Mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing.
-    temperature : float or None
-        Temperature of the oil [deg C], None if neither measured nor stated.
-    scale : float or None
-        Measured ratio of displacement to area, relative to the assumed ratio.
-    machine : AssumedMachine or None
-        What was assumed of the machine.
-    digest : str
-        Hash of the chamber pressures, equal for copies.
-    problem : str
-        Reason why there is no level, else "".
-    pump : float
-        Mean flow of the pump [m^3/s], by the volume balance only while the machine moves; nan for the basis "ringing".
-    size_error : float
-        Relative standard error of flows due to the machine's sizes (displacement, piston area).
-    sums, terms : RecordingSums or None, tuple of ColumnRoles
-        Sums of the volume balance, None without a balance, and the roles of its columns, one entry for each equation.
-    ringing : Summary or None
-        Summary of the pressures' ringing (RMS of their wavelet details); None if the channels do not allow it.
-    """
-
-    file: str
-    start: float | None
-    duration: float
-    basis: Basis | None = None
+    file: str  # name of the recording
+    start: float | None  # time of its first sample [s since 1970]
+    duration: float  # [s]
+    basis: Basis | None = None  # method by which the level was estimated, None if there is no level
+    problem: str = ""  # reason why there is no level
+    # leakage conductance of pump and piston together [m^3/(s Pa)], or minus the mean log RMS of the pressures' wavelet
+    # details ("ringing"), and its standard error; relative to the assumed machine unless `states_flow`
     level: float = np.nan
     error: float = np.nan
-    states_flow: bool = False
-    area: float | None = None
-    pressure: float
-    temperature: float | None
-    scale: float | None = None
-    machine: AssumedMachine | None
-    digest: str
-    problem: str = ""
-    pump: float = np.nan
-    size_error: float = 0.0
-    sums: RecordingSums | None = None
-    terms: tuple[ColumnRoles, ...] = ()
-    ringing: Summary | None = None
+    states_flow: bool = False  # True if the level can be stated in L/min
+    area: float | None = None  # piston area [m^2] that converts a creep speed to a flow on the level's scale
+    pressure: float  # mean of abs(p_A - p_B) [Pa], nan if a chamber pressure is missing
+    temperature: float | None  # temperature of the oil [deg C]
+    scale: float | None = None  # measured ratio of displacement to area, relative to the assumed ratio
+    machine: AssumedMachine | None  # what was assumed of the machine
+    digest: str  # hash of the chamber pressures, equal for copies
+    pump: float = np.nan  # mean flow of the pump [m^3/s]; by the volume balance only while the machine moves
+    size_error: float = 0.0  # relative standard error of flows due to the machine's sizes (displacement, piston area)
+    sums: RecordingSums | None = None  # sums of the volume balance
+    terms: tuple[ColumnRoles, ...] = ()  # roles of its columns, one entry for each equation
+    ringing: Summary | None = None  # summary of the pressures' ringing (RMS of their wavelet details)
 
 
 def estimate_reading(
     recording: Recording, rig: Rig | str | os.PathLike[str] | None = None, file: str = ""
 ) -> LeakReading:
-    """Estimate the leakage of a recording.
+    """Estimate the leakage of a recording; if that is impossible, `problem` of the result states the reason.
 
     `rig` states the sizes of the machine, as for `diagnose`. If it is None, the thesis's rig is assumed, and L/min can
     be stated only for a simulation with these sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
-    recording's name, by default that of its file. If no estimate is possible, `problem` of the result states the
-    reason.
+    recording's name, by default that of its file.
     """
     used_rig, machine = assumed_rig(rig, recording)
     inspection = inspect_recording(recording)
@@ -138,12 +104,10 @@ def estimate_reading(
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:
-    """Estimate the leakage of a recording by the most specific of three methods that its channels allow.
+    """Estimate the leakage by the most specific of `BASES` that the channels of a recording's usable `part` allow.
 
-    These are the volume balance, the pressure response and the damping of the pressures' ringing, in this order.
-    `part`: corrected samples of the recording that can be used; `rig`: a rig with the sizes of the machine; `machine`:
-    these sizes, and who stated them. Returns the fields of `LeakReading` that depend on the method; only `problem` if
-    no method is possible.
+    `rig` has the sizes of the `machine`. Returns the fields of `LeakReading` that depend on the method; only `problem`
+    if no method is possible.
     """
     balance, response, details = VolumeBalance(rig), PressureResponse(rig), RmsChange()
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
@@ -164,9 +128,8 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
             "size_error": conductance_scale_error(),
         }
     log_rms, _ = measure_levels(part)
-    judged_columns = [QUANTITIES.index(name) for name in JUDGED]
     log_rms_by_chamber = log_rms.reshape(-1, len(QUANTITIES))  # a row for each chamber
-    damping = float(-np.mean(log_rms_by_chamber[:, judged_columns]))
+    damping = float(-np.mean(log_rms_by_chamber[:, [QUANTITIES.index(name) for name in JUDGED]]))
     if np.isfinite(damping):
         return fields | {"basis": "ringing", "level": damping, "error": TREND.reading.ringing}
     reasons = dict.fromkeys(lack for lack in (balance_lack, response_lack) if lack is not None)  # each once
@@ -199,8 +162,7 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     """Make the prior on the standard deviation of a healthy machine's leakage level between recordings.
 
-    The level (`LeakReading.level`) is estimated by the method `basis`. The scale of the prior, in the level's unit, is
-    proportional to the typical level `usual` for the volume balance, and constant for other methods.
+    For the volume balance its scale is proportional to the typical level `usual`, for other methods constant.
     """
     between = TREND.between
     if basis == "pressure response":
@@ -245,12 +207,11 @@ def build_timeline(
 ) -> tuple[list[TrendPoint], tuple[str, ...]]:
     """Sort leakage readings by time and group those that can be compared with each other.
 
-    Only readings of the most frequent method are used. The readings of a group have nearly the same measured ratio of
-    pump displacement to piston area (`_group_scales`). This ratio changes if a sensor is replaced by one with another
-    scale, and from machine to machine. `every` is the time between readings [s], by which they are dated in the order
-    of their file names; None if their times are known. Returns the readings with their groups, and for each group a
-    text on its difference from the first group, "" for the first. Raises InputError if the time of a reading is
-    unknown.
+    Only readings of the most frequent method are used. Those of a group have nearly the same measured ratio of pump
+    displacement to piston area, which differs between sensors and machines. `every` is the time between readings [s],
+    by which they are dated in the order of their file names; None if their times are known. Returns the readings with
+    their groups, and for each group a text on its difference from the first group, "" for the first. Raises InputError
+    if the time of a reading is unknown.
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
@@ -267,47 +228,37 @@ def build_timeline(
             scales.append(point.scale)
         elif point.group >= 0 and scales[point.group] is None:
             scales[point.group] = point.scale  # the first that is known
-    differences = [
-        f"position or angle is scaled by {100.0 * _relative_change(scale, scales[0]):+.2g} %: a sensor exchanged, or "
-        "another machine"
-        for scale in scales
-    ]
-    return points, ("", *differences[1:]) if scales else ()
+    differences = [""] * len(scales)
+    for number, scale in enumerate(scales[1:], 1):
+        percent = 0.0 if scale is None or scales[0] is None else 100.0 * (scale / scales[0] - 1.0)
+        cause = "a sensor exchanged, or another machine"
+        differences[number] = f"position or angle is scaled by {percent:+.2g} %: {cause}"
+    return points, tuple(differences)
 
 
 def _group_scales(scales: Sequence[float | None]) -> list[int]:
     """Group readings with nearly the same ratio of displacement to area, and return the group number of each reading.
 
     `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; a reading whose
-    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group if their
-    logarithms differ by at most
-
-        log(1 + `reading.scale`) + `reading.scatter` * median difference of neighbours    (`priors.toml`).
-
-    The second term is for a machine whose recordings do not determine the ratio well, so that it scatters. It counts if
-    there are at least `reading.fewest` differences.
+    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group unless
+    their logarithms differ by more than a limit.
     """
     known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
     gaps = np.diff(np.log(known))
     prior = TREND.reading
     limit = math.log1p(prior.scale)
-    if len(gaps) >= prior.fewest:
+    if (
+        len(gaps) >= prior.fewest
+    ):  # the recordings of some machines do not determine the ratio well, so that it scatters
         limit += prior.scatter * float(np.median(gaps))
     # by ratio, the number of its cluster, counted from the smallest ratio
-    clusters = dict(zip(known, np.concatenate([[0], np.cumsum(gaps > limit)]).tolist(), strict=True)) if known else {}
-    numbers: dict[int | None, int] = {}  # number of the group of each cluster
-    groups = []
-    for scale in scales:
-        cluster = clusters.get(scale) if scale is not None else None
-        groups.append(numbers.setdefault(cluster, len(numbers)) if cluster is not None else 0)
-    return groups
+    clusters: dict[float | None, int] = dict(zip(known, np.cumsum([0, *(gaps > limit)]).tolist(), strict=False))
+    numbers: dict[int, int] = {}  # number of the group of each cluster
+    return [numbers.setdefault(clusters[scale], len(numbers)) if scale in clusters else 0 for scale in scales]
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time; raise InputError if a time is unknown.
-
-    With `every`, the time between readings [s], they are dated in the order of their file names.
-    """
+    """Sort readings by time, with the start times that follow from `every`; raise InputError if a time is unknown."""
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]
@@ -344,8 +295,8 @@ def _note_problems(readings: Sequence[LeakReading]) -> list[str]:
 def list_findings(points: Sequence[TrendPoint], differences: Sequence[str]) -> list[Finding]:
     """List the findings on a trend: wrong times, recordings left out, and groups that cannot be compared.
 
-    `points` are in the order of time; `differences` has a text for each group on its difference from the first.
-    Recordings left out for reasons that differ only in numbers share one finding.
+    `points` and `differences` are those of `build_timeline`. Recordings left out for reasons that differ only in
+    numbers share one finding.
     """
     findings, count = _find_clock_errors(points), len(points)
     points_by_reason: dict[str, list[TrendPoint]] = {}
@@ -368,20 +319,12 @@ def _join_files(readings: Iterable[LeakReading]) -> str:
     return join_names((reading.file for reading in readings), 3)
 
 
-def _relative_change(scale: float | None, other: float | None) -> float:
-    """Compute the relative difference of the measured ratio `scale` of displacement to area from the ratio `other`.
-
-    The result is 0 if one of them is unknown.
-    """
-    return 0.0 if scale is None or other is None else scale / other - 1.0
-
-
 def _find_clock_errors(ordered: Sequence[TrendPoint]) -> list[Finding]:
     """Find signs that a logger's clock was set back; return one finding, or an empty list.
 
-    The recordings are `ordered` by time. The first sign is recordings that overlap. If none do, the second sign is
-    times that fall while the numbers in the file names rise, provided that the names seem to be numbered in the order
-    of time. Recordings dated without a time of day have the same start and do not count as overlapping.
+    The recordings are `ordered` by time. The first sign is recordings that overlap; those dated without a time of day
+    have the same start and do not count. The second sign is times that fall while the numbers in the file names rise,
+    if the names seem to be numbered in the order of time.
     """
     overlaps = [
         f"{early.file} was still recording when {late.file} began: a clock was set back, or they are of two machines"

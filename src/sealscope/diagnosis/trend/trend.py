@@ -131,10 +131,7 @@ class Trend:
 
     @property
     def leak(self) -> Interval | None:
-        """Increase of the flow past pump and piston over that of the healthy machine, in the trend's unit.
-
-        None if the decision states no flow of a leak and the test has found no change.
-        """
+        """Increase of the flow past pump and piston over that of the healthy machine; None if nothing changed."""
         value, interval = self.decision.leak_lpm, self.decision.leak_interval_lpm
         if value is not None and interval is not None:
             return Interval(value, *interval)
@@ -304,10 +301,9 @@ def trend(
     states_flow = bool(compared) and all(point.states_flow for point in compared)
     notes = [point.note for point in points if point.note]
     lack = f"no recording states a level: {notes[0]}" if notes else "no recording states a level"
-    # the decision for lack of comparable recordings; `_add_episodes` replaces it if there are any
-    no_decision = decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0)
     result = Trend(
-        decision=no_decision,
+        # replaced by `_add_episodes` if there are comparable recordings
+        decision=decide(Observed("", lack=lack), (), HealthyNull(), false_alarm_probability=0.0),
         basis=compared[0].basis if compared else None,
         unit="L/min" if states_flow else "%",
         pressure=float(np.median([point.pressure for point in compared])) if states_flow else None,
@@ -326,14 +322,10 @@ def trend(
 
 
 def _add_episodes(trend: Trend) -> Trend:
-    """Add to a trend the leakage in each comparable recording, the episodes between repairs, and the decision.
-
-    If there are very many recordings, averages of neighbours are compared instead, and `rows` of the result has the
-    recordings nearest to these averages.
-    """
+    """Add to a trend the leakage in each comparable recording, the episodes between repairs, and the decision."""
     levels, trend_units_per_level = _convert_levels(trend)
     points, findings = _add_values(trend, levels)
-    averages, rows = levels.average_neighbours(), trend.rows
+    averages, rows = levels.average_neighbours(), trend.rows  # very many recordings are averaged
     n_healthy = max(1, _count_healthy(trend) * len(averages) // len(levels))  # number of healthy averages
     allowed_rise = _allowed_rise(trend, trend_units_per_level)
     episodes = tuple(find_episodes(averages, years=trend.years, n_healthy=n_healthy, allowed_rise=allowed_rise))
@@ -351,15 +343,9 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Add values with 95 % intervals from `levels` to a trend's points, and outliers to its findings.
-
-    `levels`: those of `_convert_levels`, in the trend's unit and, if known, at one oil temperature, in the order of
-    `trend.rows`. Returns the new points and findings.
-    """
+    """Make a trend's points with values and 95 % intervals from `levels`, and its findings with outliers."""
     points, findings = [*trend.points], [*trend.findings]
-    # part of each level beyond the limit of outliers; of two results, that for the whole series, which is known here: a
-    # level that the next one confirms is a change of the machine and no outlier
-    _, excess = outlier_excess(levels)
+    _, excess = outlier_excess(levels)  # a level that the next one confirms is a change of the machine and no outlier
     outliers = np.flatnonzero(excess)
     remark = "far from the recordings before and after, and counted as if nearer"
     for k, row in enumerate(trend.rows):
@@ -384,8 +370,7 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
     """Convert the leakage levels of the compared recordings to the trend's unit and to one oil temperature.
 
     Conductances [m^3/(s Pa)] become L/min at the trend's pressure, or % of the healthy recordings' mean. If the oil
-    temperature of every recording is known, they are converted to that of the first. A level of the ringing, a
-    negative log RMS, becomes 100 times its difference from the healthy mean, i.e. %. Returns the converted levels, and
+    temperature of every recording is known, they are converted to that of the first. Returns the converted levels, and
     the factor from `LeakReading.level` to the trend's unit.
     """
     compared = [trend.points[k] for k in trend.rows]
@@ -401,7 +386,7 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
         slope_sd = INFERENCE.oil.per_kelvin_deviation * abs(usual)
         correction = np.exp(-INFERENCE.oil.per_kelvin * warming)
         value, error = value * correction, error * correction
-    if trend.basis == "ringing":
+    if trend.basis == "ringing":  # a negative log RMS: its difference from the healthy mean, in %
         factor, value = 100.0, value - usual
     elif trend.pressure is not None:
         factor = trend.pressure / LITRE_PER_MINUTE
@@ -415,16 +400,12 @@ def _convert_levels(trend: Trend) -> tuple[Levels, float]:
 
 
 def _allowed_rise(trend: Trend, trend_units_per_level: float) -> float | None:
-    """Compute the rise of the trend from which a repair is due, in the trend's unit; None if it is unknown.
-
-    It is the repair limit of the trend, a flow or a creep speed. A flow needs a trend in L/min, i.e. one with a
-    reference pressure. A creep speed corresponds to the conductance (speed times piston area) / (median pressure
-    difference), which `trend_units_per_level` converts from m^3/(s Pa) to the trend's unit.
-    """
+    """Convert the repair limit of a trend, a flow or a creep speed, to its unit; None if that is impossible."""
     compared = [trend.points[k] for k in trend.rows]
-    if trend.repair.kind == "flow" and trend.pressure is not None:
+    if trend.repair.kind == "flow" and trend.pressure is not None:  # a trend in L/min
         return trend.repair.value / LITRE_PER_MINUTE
     if trend.repair.kind == "creep" and compared[0].area is not None:
         pressure = float(np.median([point.pressure for point in compared]))
-        return trend.repair.value * compared[0].area / pressure * trend_units_per_level
+        conductance = trend.repair.value * compared[0].area / pressure
+        return conductance * trend_units_per_level
     return None

@@ -45,35 +45,33 @@ def decide_trend(
 
     `points` are in the order of time; `episode` is what `find_episodes` found for them. `trend_units_per_level` is
     the factor from `LeakReading.level` to the unit of the trend; `pressure` [Pa] is the pressure difference for which a
-    trend in L/min is stated, None for a trend in %; `interval` [days] is the median time between two recordings. Points
-    of the basis `ringing` are judged by the change of the ringing, without an estimate of the leakage. The allowed
-    probability of a false alarm is `interval` divided by `years`, the mean time between false alarms. With fewer than
-    three recordings the verdict is `cannot tell`.
+    trend in L/min is stated, None for a trend in %; `interval` [days] is the median time between two recordings. The
+    allowed probability of a false alarm is `interval` divided by `years`, the mean time between false alarms.
     """
     wear = episode.wear
+    before, since = _split_at_onset(points, wear)
     # `interval` over the mean time until a healthy machine scores as high, exp(log_days); > 0 even if that underflows
     chance = float(np.clip(np.exp(np.log(interval) - episode.log_days), np.finfo(float).tiny, 1.0))
     if points[0].basis == "ringing":
-        report = _report_ringing(points, wear, chance)
+        report = _report_ringing(before, wear, chance)
     else:
         leak = _measure_leak(points, wear, chance, trend_units_per_level, pressure)
-        report = Observed(leak.provider, _rival_changes(points, wear), leak)
+        report = Observed(leak.provider, _rival_changes(points[-1], before, since), leak)
     if len(points) < MIN_RECORDINGS:
         lack = f"{len(points)} comparable recordings are too few, {MIN_RECORDINGS} are needed"
         report = Observed(report.provider, lack=lack)
     probability = interval / (years * DAYS_PER_YEAR)
-    return decide(report, [_report_rms_change(points, wear)], HealthyNull(), probability)
+    return decide(report, [_report_rms_change(points[-1], before)], HealthyNull(), probability)
 
 
 def _measure_leak(
     points: Sequence[TrendPoint], wear: Wear, chance: float, trend_units_per_level: float, pressure: float | None
 ) -> LeakMeasure:
-    """Describe the increase of the leakage since the last repair, from the recordings (`points`) since then.
+    """Describe the increase of the leakage since the last repair; flows are in the unit of the trend.
 
-    `chance` is the probability of such an increase in a healthy machine. `trend_units_per_level` is the factor from a
-    level (`LeakReading.level`) to the unit of the trend, in which the result states flows. `pressure` is the pressure
-    difference at which they are stated [Pa], None if that unit is %. The flow of the leak is proportional to p^k, with
-    k from `EXPONENTS` for a laminar leak, an orifice and laws between; the stated flow is the mean over these laws.
+    `chance` is the probability of such an increase in a healthy machine; for the other arguments see `decide_trend`.
+    The flow of the leak is proportional to p^k, with k from `EXPONENTS` for a laminar leak, an orifice and laws
+    between; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
@@ -116,38 +114,28 @@ def _normal_rise(wear: Wear, chance: float) -> Rise | None:
 
 
 def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> TotalLeakage:
-    """Compute the present leakage at `pressure` [Pa], with an interval that includes the error of the machine's sizes.
-
-    `total` is the estimate with its own interval [L/min], and `size_deviation` the relative standard error of the
-    machine's sizes.
-    """
+    """Add the error of the machine's sizes to the interval of the present leakage `total` [L/min]."""
     half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
     return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
 
 
-def _report_ringing(points: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
+def _report_ringing(before: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing (RMS of their wavelet details) since the last repair.
 
-    `chance` is the probability of such a decrease in a healthy machine. With an onset, the report states the number of
-    recordings before it (`ringing`); it states no upper bound of a leak.
+    `chance` is the probability of such a decrease in a healthy machine; `before` are the recordings before its onset.
     """
     size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
     # a score is twice the logarithm of a likelihood ratio, here of 1 / chance
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
-    ringing = None
-    if wear.onset is not None:
-        before, _ = _split_at_onset(points, wear)
-        ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated
-    return Observed(RMS_CHANGE, (fall,), ringing=ringing)
+    ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated
+    return Observed(RMS_CHANGE, (fall,), ringing=None if wear.onset is None else ringing)
 
 
 def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[TrendPoint], list[TrendPoint]]:
-    """Split recordings into those before the onset of the leak and those since the onset.
+    """Split the recordings that can be compared with the last one into those before the leak's onset and those since.
 
-    `points` are in the order of time. Recordings of another group than the last one are left out, as they cannot be
-    compared with it. Without an onset, the second list has the recordings at the time of the last one, usually only
-    this one.
+    Without an onset, the second list has the recordings at the time of the last one, usually only this one.
     """
     onset = points[-1].day if wear.onset is None else wear.onset.value
     comparable = [point for point in points if point.group == points[-1].group]
@@ -155,17 +143,18 @@ def _split_at_onset(points: Sequence[TrendPoint], wear: Wear) -> tuple[list[Tren
     return before, comparable[len(before) :]
 
 
-def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable, ...]:
+def _rival_changes(
+    last: TrendPoint, before: Sequence[TrendPoint], since: Sequence[TrendPoint]
+) -> tuple[Observable, ...]:
     """Test the other terms of the volume balance for a change at the onset of the leak, which may explain the increase.
 
-    The recordings since the onset are compared with those before. Only recordings whose balance has the same terms as
-    that of the last one are used. The result is empty if there are none from before or none since the onset, or if the
-    last recording has no balance or several.
+    Recordings `before` and `since` the onset are compared, if their balance has the same terms as that of the `last`
+    one. The result is empty if there are none, or if the last recording has no balance or several.
     """
-    names = [roles.names for roles in points[-1].terms]  # names of the terms of each balance
+    names = [roles.names for roles in last.terms]  # names of the terms of each balance
     sums_before, sums_since = (
         [point.sums for point in part if point.sums is not None and [roles.names for roles in point.terms] == names]
-        for part in _split_at_onset(points, wear)
+        for part in (before, since)
     )
     if not sums_before or not sums_since or len(names) != 1:
         return ()
@@ -174,27 +163,25 @@ def _rival_changes(points: Sequence[TrendPoint], wear: Wear) -> tuple[Observable
     # all recordings since the onset as one; leaks in holds (`held`) are not compared
     judged = RecordingSums(np.sum([sums.sums for sums in sums_since], axis=0), flow, pressure, held=None)
     healthy = [sums._replace(held=None) for sums in sums_before]
-    return rival_rises(judged, healthy, points[-1].terms)
+    return rival_rises(judged, healthy, last.terms)
 
 
-def _report_rms_change(points: Sequence[TrendPoint], wear: Wear) -> Observed:
-    """Test the ringing (RMS of the pressures' wavelet details) of the last recording for a change since the onset.
+def _report_rms_change(last: TrendPoint, before: Sequence[TrendPoint]) -> Observed:
+    """Test the ringing (RMS of the pressures' wavelet details) of the `last` recording for a change since the onset.
 
-    The ringing is compared with that of the recordings before the onset that have the same channels and sampling rate.
-    The result has no observables if there are no such recordings, or if the trend is based on the ringing itself.
+    It is compared with that of the recordings `before` the onset that have the same channels and sampling rate. Nothing
+    is tested without them, or in a trend of the ringing itself.
     """
-    judged = points[-1].ringing
-    if judged is None or points[-1].basis == "ringing":
-        return Observed(RMS_CHANGE)
-    before, _ = _split_at_onset(points, wear)
-    healthy = [
-        point.ringing
-        for point in before
-        if point.ringing is not None
-        and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded"))
-        and has_same_rate(point.ringing["rate"], judged["rate"])
-    ]
-    if not healthy:
-        return Observed(RMS_CHANGE)
-    observables, _ = compare_summaries(judged, healthy, judged["chambers"])
+    judged = last.ringing
+    observables: tuple[Observable, ...] = ()
+    if judged is not None and last.basis != "ringing":
+        healthy = [
+            point.ringing
+            for point in before
+            if point.ringing is not None
+            and all(point.ringing[name] == judged[name] for name in ("chambers", "recorded"))
+            and has_same_rate(point.ringing["rate"], judged["rate"])
+        ]
+        if healthy:
+            observables, _ = compare_summaries(judged, healthy, judged["chambers"])
     return Observed(RMS_CHANGE, observables)

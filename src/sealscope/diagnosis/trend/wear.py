@@ -78,8 +78,8 @@ class Levels:
 
     def select(self, rows: slice) -> Levels:
         """Return the leakage levels of a slice of the recordings, with the same prior."""
-        t, value, error, covariate = (values[rows] for values in (self.t, self.value, self.error, self.covariate))
-        return replace(self, t=t, value=value, error=error, group=self.group[rows], covariate=covariate)
+        names = ("t", "value", "error", "group", "covariate")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
     @property
     def interval(self) -> float:
@@ -91,14 +91,11 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        From the prior's `scale` and `freedom` f, and the n changes between neighbours in a group, it is
-
-            sqrt((f v_prior + n v_changes) / (f + n)),    v_prior = scale^2 + mean of error^2,
-            v_changes = (1.4826 median of abs(change) / sqrt(2))^2.
-
-        For independent normal levels v_changes is the variance of a level, as a change has twice that variance.
+        Its square is the mean of two variances: that of the prior, weighted by its degrees of freedom, and that of the
+        changes between neighbours in a group, weighted by their number.
         """
         prior = self.prior
+        # a change between neighbours has twice the variance of a level
         changes = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
         measured_variance = (_SD_PER_MEDIAN * float(np.median(changes))) ** 2 if changes.size else 0.0
@@ -106,10 +103,7 @@ class Levels:
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 
     def average_neighbours(self, max_count: int = 240) -> Levels:
-        """Average levels of successive recordings of a group, so that about `max_count` levels remain, to save time.
-
-        The standard error of an average is sqrt(sum of error^2) / number. Up to `max_count` levels are not averaged.
-        """
+        """Average levels of successive recordings of a group, so that about `max_count` levels remain, to save time."""
         size = math.ceil(len(self) / max_count)
         if size <= 1:
             return self
@@ -126,15 +120,11 @@ class Levels:
 def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     """Compute the part of each leakage level beyond the limit of outliers, which the fit of the wear subtracts.
 
-    The limit L is `outlier` (`priors.toml`) times the scatter of all earlier levels (`Levels.scatter`). With the
-    distance d of a level from the median of up to three levels before it in its group, the excess is
-
-        sign(d) max(abs(d) - L, 0).
-
-    Two successive levels beyond the limit on the same side are a change of the machine: the excess is 0 if the level
-    before is also beyond the limit, and for the first level of a group. Returns two variants, each (n,). The first
-    treats each level as the latest level. The second is for the whole series: the excess is also 0 if the next level is
-    beyond the limit on the same side, and for the last level of a group, whose next is not known.
+    The limit is `outlier` (`priors.toml`) times the scatter of all earlier levels (`Levels.scatter`), as a distance
+    from the median of up to three levels before it in its group. Two successive levels beyond the limit on the same
+    side are a change of the machine, whose excess is 0. Returns two variants, each (n,). The first treats each level as
+    the latest level. The second is for the whole series, in which the next level may show a change; it is 0 for the
+    last level of a group, whose next is not known.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -166,9 +156,9 @@ class _Changes(NamedTuple):
     def enumerate(cls, levels: Levels, n_healthy: int, *, steps_only: bool = False) -> _Changes:
         """Build the hypotheses of all steps and growths that may begin after the first `n_healthy` recordings.
 
-        Each step or growth is combined with several prior scales of its size. Those of a step are multiples of the
-        scatter tau (`change.steps` in `priors.toml`). The size of a growth is its rise per month. Its scales are tau
-        divided by several times, which are multiples of the median interval of recordings (`change.intervals`).
+        Each is combined with several prior scales of its size: for a step, multiples of the scatter tau (`change.steps`
+        in `priors.toml`); for a growth per month, tau over multiples of the median interval of recordings
+        (`change.intervals`).
         """
         scales = TREND.change
         begin = np.arange(max(n_healthy, 1), len(levels))  # first recording after each change
@@ -190,11 +180,7 @@ class _Changes(NamedTuple):
 
     @classmethod
     def from_profile(cls, profile: Array, scale: float) -> _Changes:
-        """Build the single hypothesis of a change since the first recording, which counts as a growth.
-
-        `profile` (n,) is its effect on each recording for unit size, and `scale` the prior scale of the size, in units
-        of tau.
-        """
+        """Build the single hypothesis of a change with the effect `profile` (n,), which counts as a growth."""
         first = np.zeros(1, dtype=np.int64)
         return cls(
             profile[:, None], first, np.array([scale]), first, grows=np.ones(1, dtype=bool), log_weight=np.zeros(1)
@@ -202,10 +188,7 @@ class _Changes(NamedTuple):
 
 
 class _Node(NamedTuple):
-    """Likelihoods at one point of the grid of tau and r, for n recordings and m profiles of a change over time.
-
-    r is the fraction of tau^2 that is correlated over time.
-    """
+    """Likelihoods at one point of the grid of tau and r, for n recordings and m profiles of a change over time."""
 
     tau: float  # standard deviation between recordings
     log_null: Array  # (n,): logarithm of prior times likelihood without a change, after each recording
@@ -221,7 +204,6 @@ class _Node(NamedTuple):
 def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -> list[_Node]:
     """Compute the likelihoods of leakage levels with and without a change, at each point of a grid of tau and r.
 
-    tau is the standard deviation between recordings, and r the fraction of its variance that is correlated over time.
     `profiles` (n, m) are the effects of m changes of unit size on each of n recordings. With `may_grow`, the level may
     have grown evenly since the first recording even without a change. The covariance of the levels is
 
@@ -278,7 +260,7 @@ def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
 
     A change has the likelihood ratio exp(b delta - a delta^2/2). For a prior with the `scale` k, the mean over
     delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)`` and the normal
-    distribution function Phi. The arguments are broadcast together.
+    distribution function Phi.
     """
     from scipy.special import log_ndtr
 
@@ -302,11 +284,8 @@ class ChangeScores(NamedTuple):
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
     """Compute the statistic R of the sequential test for a rise of the leakage level, either a step or a growth.
 
-    R [days] is a sum over all possible changes after the first `n_healthy` recordings. Each term is the likelihood
-    ratio of the change to no change, times the time between the recordings before and after its beginning [days], at
-    most `wait` (`priors.toml`). With `falls` the test is for a downward step instead. With `may_grow`, an even growth
-    since the first recording does not count as a change. Returns log R of the recordings up to each recording, and
-    where the most probable change begins.
+    A change may begin after the first `n_healthy` recordings. With `falls` the test is for a downward step instead.
+    With `may_grow`, an even growth since the first recording does not count as a change.
     """
     if falls:
         levels = replace(levels, value=-levels.value)
@@ -336,10 +315,9 @@ class _Draws(NamedTuple):
 
     @classmethod
     def sample(cls, levels: Levels, changes: _Changes, *, signed: bool = False) -> _Draws:
-        """Draw random samples of the model's parameters from their posterior, given the leakage `levels`.
+        """Draw random samples from the posterior of scatter, change (one of `changes`), its size and mean level before.
 
-        A draw has the scatter, a change (one of `changes`), the size of the change and the mean level before it. The
-        size has a half-normal prior or, with `signed`, a normal prior. The seed is fixed.
+        The size has a half-normal prior or, with `signed`, a normal prior. The seed is fixed.
         """
         from scipy.special import ndtr, ndtri
 
@@ -368,10 +346,7 @@ class _Draws(NamedTuple):
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
-        """Compute for each draw the rise (d,) of the last recording's level over the mean before the change.
-
-        `changes` are the hypotheses from which the draws were made.
-        """
+        """Compute for each draw from `changes` the rise (d,) of the last recording's level over the mean before it."""
         return np.asarray(self.amplitude * changes.profiles[-1, changes.profile_index[self.change]])
 
 
@@ -422,11 +397,10 @@ def _interval_of_draws(draws: Array) -> Interval:
 def estimate_wear(levels: Levels, n_healthy: int, allowed_rise: float | None, change_begin: int | None) -> Wear:
     """Estimate leakage level, growth and time to the repair limit after the last recording.
 
-    A change begins after the first `n_healthy` recordings, or with the last one if all are healthy. `allowed_rise` is
-    the rise above the healthy level at which a repair is due, None if there is no limit. `change_begin` is the index of
-    the first recording after the change that the test has found. If it is None, an even growth or decrease over all
-    recordings is estimated, with a wide prior. If the recordings span less than a day, growth and time are NaN with
-    unlimited intervals. For a single recording the rise (`leak`) is 0 with an infinite interval.
+    A change begins after the first `n_healthy` recordings, or with the last one if all are healthy. `change_begin` is
+    the index of the first recording after the change that the test has found. If it is None, an even growth or decrease
+    over all recordings is estimated, with a wide prior. If the recordings span less than a day, growth and time are NaN
+    with unlimited intervals. For a single recording the rise (`leak`) is 0 with an infinite interval.
     """
     is_changed = change_begin is not None
     is_long = levels.t[-1] - levels.t[0] >= 1.0  # [days]
@@ -473,11 +447,9 @@ def estimate_wear(levels: Levels, n_healthy: int, allowed_rise: float | None, ch
 
 
 def _estimate_healthy_range(levels: Levels) -> tuple[Interval, float]:
-    """Estimate the mean leakage level of recordings without a change, and their scatter tau.
+    """Estimate the mean level of recordings without a change, with the range of 95 % of them, and their scatter tau.
 
-    The interval with the mean is a prediction interval: it contains 95 % of the levels of single recordings, with their
-    scatter tau and standard errors. These errors are those of the last group of comparable recordings, to which the
-    mean belongs. tau is the standard deviation between recordings, without their errors.
+    Mean and errors are those of the last group of comparable recordings.
     """
     no_change = _Changes.from_profile(np.zeros(len(levels)), scale=1.0)  # a change without effect on any recording
     draws = _Draws.sample(levels, no_change)
@@ -504,10 +476,9 @@ def find_episodes(
 ) -> list[Episode]:
     """Divide a series of recordings at repairs, and test and estimate the leakage in each period between them.
 
-    `years` is the mean time to a false alarm [machine-years]. The first `n_healthy` recordings are known to be healthy.
-    `allowed_rise`, in the unit of the levels, is the rise at which a repair is due, None if there is no limit. A repair
-    shows as a fall of the level (`_find_repair`). A new period begins after it, whose first recording is taken as
-    healthy. Only the scatter of the earlier periods is kept, as the prior for the next one.
+    `years` is the mean time to a false alarm [machine-years]. The first `n_healthy` recordings are known to be healthy;
+    after a repair it is the first one. `allowed_rise`, in the unit of the levels, is the rise at which a repair is due,
+    None if there is no limit. Of the earlier periods only the scatter is kept, as the prior for the next one.
     """
     days = years * DAYS_PER_YEAR
     begin, episodes = 0, list[Episode]()
@@ -520,8 +491,6 @@ def find_episodes(
         change_begin = None if alarm is None else int(rise.begin[end - 1])  # by all recordings of the period
         wear = estimate_wear(remaining.select(slice(0, end)), n_healthy, allowed_rise, change_begin)
         alarm_row, log_days = None if alarm is None else begin + alarm, float(rise.log_R[:end].max())
-        # `log_R`: logarithm of the mean time [days] until a healthy machine scores as high; each period but the first
-        # begins with a repair, a fall of the level
         episodes.append(Episode(begin, begin + end, alarm_row, log_days, wear, fell=bool(episodes)))
         # n recordings (`end`) add n - 1 degrees of freedom to the knowledge of the scatter
         prior = ScatterPrior(wear.scatter, levels.prior.freedom + min(end - 1, _MAX_FREEDOM))
@@ -533,10 +502,9 @@ def find_episodes(
 def _find_repair(levels: Levels, rise: ChangeScores, n_healthy: int, days: float) -> int:
     """Find the index of the first recording after the first repair; the number of recordings if there is no repair.
 
-    A repair is a fall of the leakage level, found by the test for a rise with the sign reversed. `rise` is the result
-    of the test for a rise, `days` the mean time to a false alarm [days], and `n_healthy` the number of first recordings
-    that are known to be healthy. If a rise is detected first, the search for a fall begins with the recordings that
-    show the rise, at the worn level.
+    A repair is a fall of the leakage level. `rise` is the result of the test for a rise, and `days` the mean time to a
+    false alarm [days]. If a rise is detected first, the search for a fall begins with the recordings that show the
+    rise, at the worn level.
     """
     first = 0  # index of the first recording that is tested for a fall
     fall = score_changes(levels, n_healthy, falls=True)

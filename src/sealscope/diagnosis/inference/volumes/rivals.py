@@ -52,23 +52,32 @@ def rival_rises(
     entry is assumed to be driven by the mean of abs(p_A - p_B) in the judged recording.
     """
     names, hold_rivals = columns[0].names, held_rivals(judged, healthy, unit_flows)
+    laws = compare_laws(judged, healthy, columns)
+    # if an orifice fits better than a laminar leak, a rival is compared with the orifice
+    orifice_log_ratio = 0.0 if laws is None else max(laws.log_ratio, 0.0)
     observables = list[Observable | None]()
     for k, name in enumerate(names):
         # a balance without a speed loss has a flow meter downstream of the pump, which does not show the pump's leakage
         if name == TURNING and SPEED_LOSS in names:
             observables.append(_turning_rise(judged, healthy, columns, k))
-        elif name == AIR:
-            prior_change = INFERENCE.free_air.size * volume_ratio
-            values, error, _ = _compare_changes(judged, healthy, columns, k)
-            *healthy_values, value = values
-            air = compare_with_healthy(AIR, RISE, value, healthy_values, error, prior_change=prior_change)
-            observables.append(_with_log_ratio(air, judged, healthy, columns))
-        elif name.startswith("external leak") and hold_rivals is None:
-            values, error, _ = _compare_changes(judged, healthy, columns, k)
-            *healthy_values, value = values
-            leak = compare_with_healthy(name, RISE, value, healthy_values, error, above=True)
-            leak = None if leak is None else _penalise_size(leak, judged, unit_flows)
-            observables.append(_with_log_ratio(leak, judged, healthy, columns))
+            continue
+        is_outside = name.startswith("external leak") and hold_rivals is None
+        if name != AIR and not is_outside:
+            continue
+        (*healthy_values, value), error, _ = _compare_changes(judged, healthy, columns, k)
+        prior_change = np.inf if is_outside else INFERENCE.free_air.size * volume_ratio
+        rival = compare_with_healthy(
+            name, RISE, value, healthy_values, error, above=is_outside, prior_change=prior_change
+        )  # free air may also decrease
+        if rival is None:
+            continue
+        if is_outside:
+            rival = _penalise_size(rival, judged, unit_flows)
+        # likelihood ratio of the rival to a leak past the piston, for one independent residual
+        log_ratio = compare_with_leak(judged, healthy, columns, name)
+        if log_ratio is not None:
+            rival = replace(rival, log_ratio_to_leak=INFERENCE.size.readings * (log_ratio - orifice_log_ratio))
+        observables.append(rival)
     return (*filter(None, observables), *(hold_rivals or ()))
 
 
@@ -117,19 +126,6 @@ def _turning_rise(
         return None
     # a rise that warmer oil explains does not count
     return replace(observable, chance=max(observable.chance, rise(judged, healthy, turning_columns).chance))
-
-
-def _with_log_ratio(
-    rival: Observable | None, judged: RecordingSums, healthy: Sequence[RecordingSums], columns: Sequence[ColumnRoles]
-) -> Observable | None:
-    """Add the log likelihood ratio of a rival to a leak past the piston, laminar or through an orifice, if known."""
-    log_ratio = None if rival is None else compare_with_leak(judged, healthy, columns, rival.name)
-    if rival is None or log_ratio is None:
-        return rival
-    laws = compare_laws(judged, healthy, columns)
-    if laws is not None:
-        log_ratio -= max(laws.log_ratio, 0.0)  # if an orifice fits better, the rival is compared with this leak
-    return replace(rival, log_ratio_to_leak=INFERENCE.size.readings * log_ratio)  # ratios for one independent residual
 
 
 def _without_oil(coefficients: Array, thinning: Array) -> Array:
