@@ -11,12 +11,8 @@ from sealscope.errors import InputError
 class HydraulicCircuit(NamedTuple):
     """Connection of pump and cylinder chambers: one of `CIRCUITS`, chosen by a parameter of the rig (`Rig.circuit`).
 
-    Other modules read the properties below instead of comparing circuits. `valve_controlled` (`valved` in `physics`)
-    chooses the laws of `physics/rig.py` and `physics/standstill.py`, the longest step of `physics/solvers/limits.py`,
-    and the drawing of `reporting/schematic.py`; `pump_feeds_chambers` the volume balance (`equations` of
-    `diagnosis/inference/equations/balances.py`) and the controller's model of the drive (`control/drive.py`:
-    `drive_of`). A circuit that is only diagnosed needs no more than an entry in `CIRCUITS`, and its `value` among those
-    of the parameter.
+    Other modules read the properties below instead of comparing circuits. `CONTRIBUTING.md` says what a further circuit
+    needs.
 
     Attributes
     ----------
@@ -107,8 +103,7 @@ CIRCUITS = (PUMP_CIRCUIT, VALVE_CIRCUIT)
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:
     """Raise InputError unless a rig's `circuit` has the property `flag`, a bool attribute such as "pump_is_measured".
 
-    The message names `subject`, which needs this property (such as "a simulation"), the rig by its name `rig`, and the
-    circuits that have the property.
+    `subject`: what needs the property, such as "a simulation"; `rig`: the rig's name, for the message.
     """
     if not getattr(circuit, flag):
         suitable = " or ".join(str(candidate) for candidate in CIRCUITS if getattr(candidate, flag))

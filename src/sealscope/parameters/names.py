@@ -39,15 +39,6 @@ def resolve_name(name: str, dotted: Sequence[str]) -> str:
     raise InputError(f"{name!r} is not a parameter{suggestion(name, dotted if '.' in name else symbols)}")
 
 
-def parse_override(text: str) -> tuple[str, str]:
-    """Split an override `NAME=VALUE[unit]` into the texts `NAME` and `VALUE[unit]`; InputError if one is missing."""
-    name, equals, value = text.partition("=")
-    name, value = name.strip(), value.strip()
-    if not (name and equals and value):
-        raise InputError(f"an override must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
-    return name, value
-
-
 def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
     """Parse overrides `NAME=VALUE[unit]` to a mapping from `NAME` to the text `VALUE[unit]`.
 
@@ -55,7 +46,9 @@ def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
     """
     overrides: dict[str, str] = {}
     for text in texts:
-        name, value = parse_override(text)
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise InputError(f"an override must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
         if overrides.setdefault(name, value) != value:
             raise InputError(f"{name} must be set once, got {overrides[name]} and {value}")
     return overrides

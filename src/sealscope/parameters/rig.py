@@ -307,10 +307,9 @@ class Rig(Part):
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
         """Return the same rig with other piston areas [m^2] from `source`, and with volumes that suit these areas.
 
-        If the chambers' volumes depend on the position, they are computed anew, with a dead volume that is scaled with
-        the larger area. The gas of an accumulator, if the rig has one, is scaled likewise, and is at least
-        `GAS_OVER_ROD` times the oil that the rod displaces in a stroke. These values are marked as assumed. All other
-        parameters stay the same.
+        Chamber volumes that depend on the position are computed anew, with a dead volume that is scaled with the larger
+        area. The gas of an accumulator is scaled likewise, and is at least `GAS_OVER_ROD` times the oil that the rod
+        displaces in a stroke. These values are marked as assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -323,10 +322,10 @@ class Rig(Part):
             min_gas = GAS_OVER_ROD * abs(A_A - A_B) * cylinder.L
             scaled_values["makeup.V_gas"] = max(scale * self.makeup.V_gas, min_gas)
         assumed = f"{ASSUMED} that of {self._name}, scaled with the area"
-        stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
-        sources = dict.fromkeys(scaled_values, assumed) | dict.fromkeys(stated_values, source)
-        for full_name, value in {**scaled_values, **stated_values}.items():
-            entries[full_name] = _make_entry(full_name, value, sources[full_name], source)
+        for full_name, value in scaled_values.items():
+            entries[full_name] = _make_entry(full_name, value, assumed, source)
+        for full_name, value in (("cylinder.A_A", A_A), ("cylinder.A_B", A_B)):
+            entries[full_name] = _make_entry(full_name, value, source, source)
         return self._with_entries(entries, source)
 
     def table(self) -> list[ParameterRow]:
@@ -381,19 +380,19 @@ class Rig(Part):
         """Build a rig from the entries of its parameters by dotted name; `place`: where they come from, for messages.
 
         A parameter without an entry gets its `absent` value. Raises InputError if it has no such value, or if an entry
-        has an unknown name or a wrong value.
+        has a wrong value.
         """
-        entries = {**_absent_entries(place), **entries}
-        names = declared_names()
-        for full_name in entries:
-            if full_name not in declared_fields():
-                raise _unknown_name_error(full_name, entries[full_name].place)
-        for full_name in names:
-            if full_name not in entries:
-                raise InputError(f"{full_name} is missing ({place})")
-        rig = _build_part(cls, "", entries, place)
-        rig._name, rig._title = name, title
-        rig._entries = tuple((full_name, entries[full_name]) for full_name in names)
+        complete_entries: dict[str, ParameterEntry] = {}
+        for full_name, field in declared_fields().items():
+            entry = entries.get(full_name)
+            if entry is None:
+                value = absent_of(field)
+                if value is None:
+                    raise InputError(f"{full_name} is missing ({place})")
+                entry = ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
+            complete_entries[full_name] = entry
+        rig = _build_part(cls, "", complete_entries, place)
+        rig._name, rig._title, rig._entries = name, title, tuple(complete_entries.items())
         return rig
 
 
@@ -403,24 +402,10 @@ def declared_fields() -> dict[str, FieldInfo]:
     return dict(iter_fields(Rig))
 
 
-def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Build the entries that a rig's file `place` may omit, with the values for an absent part or effect."""
-    return {
-        full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
-        for full_name, field in declared_fields().items()
-        if (value := absent_of(field)) is not None
-    }
-
-
 @cache
 def declared_names() -> tuple[str, ...]:
     """List the dotted names of all parameters, in the order of declaration."""
     return tuple(declared_fields())
-
-
-def _unknown_name_error(full_name: str, place: str) -> InputError:
-    """Build the InputError for a dotted name, stated in `place`, that no parameter has."""
-    return InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
 
 
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
@@ -514,19 +499,17 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full_name = prefix + key
-        if full_name in declared_fields() or (isinstance(item, dict) and "value" in item):
+        if full_name in declared_fields():
             entries[full_name] = _parse_entry(full_name, item, place)
-        elif isinstance(item, dict):
+        elif isinstance(item, dict) and "value" not in item:
             entries |= flatten_entries(item.items(), place, full_name + ".")
         else:
-            raise _unknown_name_error(full_name, place)
+            raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
     return entries
 
 
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
     """Check the table of a parameter with value, unit and source, and convert it; raise InputError if it is wrong."""
-    if full_name not in declared_fields():
-        raise _unknown_name_error(full_name, place)
     short_name = _short_name(full_name)
     if not isinstance(item, dict):
         raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")
