@@ -12,7 +12,7 @@ import numpy as np
 from sealscope.compiled import address_of, call_at, entry, make_record, record_dtype, record_view
 from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, measured_at, start_law
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
-from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, make_observer, update_observer
+from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, make_observer, update_observer
 from sealscope.control.position import PositionPI
 from sealscope.parameters.circuit import check_circuit_property
 
@@ -61,10 +61,9 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
     if m.is_known == 0.0:  # the leak's conductance is estimated
         observer = m.observer
         update_observer(observer, measured.theta, measured.x, measured.p_A, measured.p_B)
-        G, sd, n_blocks = conductance(observer)
-        excess_G = G - m.G_assumed
+        excess_G, sd = observer.state[0] - m.G_assumed, math.sqrt(observer.P[0, 0])
         target_G = 0.0
-        if n_blocks >= _MIN_BLOCKS:
+        if observer.n_blocks >= _MIN_BLOCKS:
             # the largest leak whose motion of the piston the encoder does not resolve; 1 Pa: no division by 0
             unresolved_flow = _RESOLVED_COUNTS * observer.x_step * min(observer.area_A, observer.area_B)
             unresolved_G = unresolved_flow / max(abs(mean_dp), 1.0)

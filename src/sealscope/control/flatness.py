@@ -98,7 +98,7 @@ class Flatness:
         """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         pressure, of_difference = drive.mean_pressure(rig), friction.coulomb_pressure == "difference"
-        max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
+        max_speed = drive.flow_per_volt * rig.daq.u_max / min(cylinder.A_A, cylinder.A_B)
         return cls(
             feedback=PositionPI.from_rig(rig),
             drive=drive,

@@ -32,7 +32,8 @@ _LAG = 0.01
 #: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
 #: rotation within the block in either direction [rad]; `outlier_G`: change of conductance that the last tested block
 #: implies if it is an outlier, else 0; `means`: averages of angle, position, p_A and p_B up to now; `begin`: these
-#: averages when the block began; `state`: conductance, relative errors of 1/K and of the area; `P`: its covariance.
+#: averages when the block began; `state`: conductance [m^3/(s Pa)], relative errors of 1/K and of the area; `P`: its
+#: covariance; `n_blocks`: number of blocks used.
 OBSERVER = record_dtype(
     *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "lag_gain"),
     *("count", "sum_dp", "min_dp", "max_dp", "turned_forward", "turned_back", "outlier_G", "n_blocks"),
@@ -140,15 +141,6 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     m.n_blocks += 1.0
 
 
-@law
-def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the estimated conductance and its standard error [m^3/(s Pa)], and the number of blocks used.
-
-    `m`: record `OBSERVER`, the memory of the observer.
-    """
-    return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
-
-
 @dataclass(frozen=True)
 class Balance:
     """The leak observer's model of the machine, from which it computes the volume balance of a chamber.
@@ -171,10 +163,7 @@ class Balance:
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the memory of a leak observer before its first sample, a record (1,) of the type `OBSERVER`.
-
-    `balance`: model of the machine, whose parameters the memory contains; `rate` [Hz]: sampling rate.
-    """
+    """Make the memory of a leak observer that samples at `rate` [Hz], a record (1,) `OBSERVER`."""
     return make_record(
         OBSERVER,
         balance,

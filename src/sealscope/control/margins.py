@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from sealscope.control.controller import Controller, Measured
 from sealscope.control.drive import drive_of
 from sealscope.errors import InputError
+from sealscope.recordings.channels import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-Array = NDArray[np.float64]
 #: Duration [s] of a controller's impulse response.
 _RESPONSE_DURATION = 60.0
 #: Sizes of the impulses of position [m] (above the built-in controllers' default dead bands), pressure [Pa] and angle
@@ -142,7 +142,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
-        next_u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)  # a first guess
+        next_u = speed * rig.cylinder.A_A / drive_of(rig).flow_per_volt  # a first guess
         for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
             u = min(max(next_u, -limit), limit)
             state, mean_speed = find_moving_state(u)
