@@ -190,8 +190,7 @@ def write_netcdf(
 ) -> None:
     """Write the content of `Recording.series` as a NetCDF-4 file without loss of precision.
 
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history. The file is made in memory first, because libhdf5 aborts the process if the disk is full.
+    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
     """
     import h5netcdf
 
