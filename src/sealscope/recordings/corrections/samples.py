@@ -63,8 +63,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     the rows stays as it is, and is named as unusable.
     """
     part = remove_unsupplied(remove_dropouts(remove_impossible(recording)))
-    is_frozen = flag_frozen_rows(part)
-    part = set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
+    part = set_missing(part, dict.fromkeys(part.channels, flag_frozen_rows(part)))
     chambers = chambers_of(part)
     # empty channels are left out, except chamber pressures
     names = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
@@ -107,8 +106,7 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 def remove_holes(recording: Recording) -> Recording:
     """Replace the filled samples of long gaps by NaN, for detectors that cannot give filled samples a lower weight.
 
-    All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, but are no longer marked as `bridged`.
-    A recording without long gaps is returned unchanged, with its marks.
+    Short gaps stay filled, but are no longer marked as `bridged`. A recording without long gaps keeps these marks.
     """
     is_hole = flag_holes(recording)
     if not is_hole.any():

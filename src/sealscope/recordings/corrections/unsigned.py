@@ -45,10 +45,10 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     for name, quantity in _NAMES.items():
         if name not in recording or not _has_one_sign(recording[name]):
             continue
-        sign, source = _find_sign(recording, np.abs(recording[name]))
+        values = recording[name]
+        sign, source = _find_sign(recording, np.abs(values))
         if sign is None:
             continue
-        values = recording[name]
         # sign of the side of zero on which the channel stays
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
@@ -103,15 +103,15 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     "") if neither is recorded, or if the one used does not move in both directions or hardly correlates with the
     `magnitude` (n,) of the speed or flow.
     """
-    if "x" in recording:
-        speed = _piston_speed(recording["x"], recording.rate)
-        if _moves_both_ways(speed) and _correlation(np.abs(speed), magnitude) >= _PRIORS.correlation:
-            return _fit_signs(recording, speed, magnitude), "the position's rate and the pressures"
+    has_position = "x" in recording
+    if not has_position and "u" not in recording:
         return None, ""
-    if "u" not in recording or not _moves_both_ways(recording["u"]):
+    motion = _piston_speed(recording["x"], recording.rate) if has_position else recording["u"]
+    if not _moves_both_ways(motion) or _correlation(np.abs(motion), magnitude) < _PRIORS.correlation:
         return None, ""
-    is_correlated = _correlation(np.abs(recording["u"]), magnitude) >= _PRIORS.correlation
-    return (np.where(recording["u"] < 0.0, -1.0, 1.0), "the command") if is_correlated else (None, "")
+    if has_position:
+        return _fit_signs(recording, motion, magnitude), "the position's rate and the pressures"
+    return np.where(motion < 0.0, -1.0, 1.0), "the command"
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
@@ -224,8 +224,8 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
 
     The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Where the ratio
     of the local mean of `values` (n,) to their local standard deviation, from second differences, is at most 1.32 plus
-    three standard errors, they are taken for noise and get random signs. Elsewhere they stay. The signs are the same in
-    every call. `rate`: sampling rate [Hz].
+    three standard errors, they are taken for noise and get random signs. Elsewhere they stay. `rate`: sampling rate
+    [Hz].
     """
     if values.size < 3:
         return values
