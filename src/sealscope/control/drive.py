@@ -85,17 +85,13 @@ class Drive:
     (omega_d - omega) dt = C_e omega + R_c i. Here omega_d is the commanded speed, omega the speed, and i = D dp/C_m the
     current, whose torque balances the pressure difference dp = p_A - p_B. Solved for the commanded speed: omega_d =
     omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
-
-    `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p, by
-    which the speed falls short of a quickly changing command, relative to the speed; `corner` [1/s]: K_i/k_p, above
-    which a change is quick; `droop` [rad/(s Pa)]: R_c D/(C_m C_e), speed lost per dp at a constant motor voltage.
     """
 
-    displacement: float
-    omega_per_volt: float
-    shortfall: float
-    corner: float
-    droop: float
+    displacement: float  # [m^3/rad] D
+    omega_per_volt: float  # [rad/(s V)] commanded speed over voltage
+    shortfall: float  # C_e/k_p, by which the speed falls short of a quickly changing command, relative to the speed
+    corner: float  # [1/s] K_i/k_p, above which a change is quick
+    droop: float  # [rad/(s Pa)] R_c D/(C_m C_e), speed lost per dp at a constant motor voltage
 
     def __post_init__(self) -> None:
         not_negative = ("shortfall", "corner", "droop")
@@ -156,14 +152,13 @@ class ValveDrive:
 
     The flow is Q = Q_N (u/u_N) sqrt((p_s - sign(Q) dp)/(2 dp_N)): the two open edges are equal, and half of the
     pressure drops across each (Merritt, Hydraulic Control Systems, 1967, section 5.2). The spool follows the command
-    without delay. `Q_N` [m^3/s]: flow at the voltage `u_N` [V] and the pressure drop `dp_N` [Pa] across each edge;
-    `p_s` [Pa]: supply pressure above that of the return.
+    without delay.
     """
 
-    Q_N: float
-    dp_N: float
-    u_N: float
-    p_s: float
+    Q_N: float  # [m^3/s] flow at the voltage u_N and the pressure drop dp_N
+    dp_N: float  # [Pa] across each edge
+    u_N: float  # [V]
+    p_s: float  # [Pa] supply pressure above that of the return
 
     def __post_init__(self) -> None:
         check_numbers("the valve", self, positive=("Q_N", "dp_N", "u_N", "p_s"))

@@ -143,22 +143,18 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
 
 @dataclass(frozen=True)
 class Balance:
-    """The leak observer's model of the machine, from which it computes the volume balance of a chamber.
+    """The leak observer's model of the machine, from which it computes the volume balance of a chamber."""
 
-    `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of the
-    chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
-    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: |p_A - p_B| above which the pilot-operated check
-    valve of the chamber with the higher pressure is shut, 0 without such valves.
-    """
-
-    D: float
-    area_A: float
+    D: float  # [m^3/rad] displacement of the pump
+    area_A: float  # [m^2] piston areas
     area_B: float
-    V_A: float
+    V_A: float  # [m^3] volumes of the chambers at mid-stroke
     V_B: float
-    K: float
-    x_step: float
-    noise: float
+    K: float  # [Pa] bulk modulus of the oil
+    x_step: float  # [m] position change of one encoder count
+    noise: float  # [Pa] standard deviation of a pressure sample
+    #: |p_A - p_B| [Pa] above which the pilot-operated check valve of the chamber with the higher pressure is shut; 0
+    #: without such valves.
     shut: float = 0.0
 
 

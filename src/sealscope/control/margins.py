@@ -36,21 +36,17 @@ _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e
 class Margins:
     """Stability margins of a control loop with the open-loop response L, at one speed of the piston.
 
-    `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
-    [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
-    `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
-    `damped`: True if the rig without controller is stable. If |L| is never 1, phase and delay are inf, and crossover is
-    0. The rig may be unstable in slow strokes, where friction falls with speed; the margins then do not prove that the
+    The rig may be unstable in slow strokes, where friction falls with speed; the margins then do not prove that the
     loop is stable.
     """
 
-    speed: float
-    gain: float
-    phase: float
-    crossover: float
-    delay: float
-    peak: float
-    damped: bool
+    speed: float  # [m/s] of the piston
+    gain: float  # factor by which the loop's gain may grow, inf if unlimited
+    phase: float  # [rad] smallest distance of arg L from -pi where |L| = 1; inf if |L| is never 1
+    crossover: float  # [Hz] highest frequency at which |L| = 1; 0 if there is none
+    delay: float  # [s] smallest additional delay at which the loop becomes unstable; inf if |L| is never 1
+    peak: float  # largest sensitivity 1/|1 + L|
+    damped: bool  # True if the rig without controller is stable
 
 
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:

@@ -45,17 +45,14 @@ class ParameterEntry(NamedTuple):
 
 
 class ParameterRow(NamedTuple):
-    """A row of the table of a rig's parameters.
-
-    `value` is in the SI unit `unit`; `given`: value and unit as text, as the rig's file or an override states them.
-    """
+    """A row of the table of a rig's parameters."""
 
     symbol: str
     name: str
     meaning: str
-    value: Value
+    value: Value  # in the SI unit `unit`
     unit: str
-    given: str
+    given: str  # value and unit, as the rig's file or an override states them
     source: str
 
 

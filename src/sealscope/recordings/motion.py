@@ -40,13 +40,10 @@ def is_moving(values: Array) -> bool:
 
 
 class Holds(NamedTuple):
-    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading.
+    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading."""
 
-    `flags` (n,): True for held samples. `pending`: index of the first flag that later samples may still change.
-    """
-
-    flags: NDArray[np.bool_]
-    pending: int
+    flags: NDArray[np.bool_]  # (n,), True for held samples
+    pending: int  # index of the first flag that later samples may still change
 
 
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:

@@ -34,19 +34,16 @@ _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
 @dataclass(frozen=True)
 class Finding:
-    """One defect of a recording.
+    """One defect of a recording."""
 
-    `code`: kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning`` (check the
-    time or the channel before relying on a verdict) or ``note``; `channel`: None for the time; `count`: number of
-    samples or intervals; `first_t`: time of the first [s], None if it has none; `text`: description in words.
-    """
-
-    code: str
+    code: str  # kind of defect
+    #: ``fatal``: the recording cannot be analysed as it is; ``warning``: check the time or the channel before you rely
+    #: on a verdict; or ``note``.
     severity: Severity
-    channel: str | None
-    count: int
-    first_t: float | None
-    text: str
+    channel: str | None  # None for the time
+    count: int  # number of samples or intervals
+    first_t: float | None  # time of the first [s], None if it has none
+    text: str  # description in words
 
 
 @checked_call
@@ -296,15 +293,12 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 class Rail(NamedTuple):
-    """An end of a channel's range, "low" or "high" (`side`), at which it is clipped.
+    """An end of a channel's range at which it is clipped."""
 
-    `samples`: number of samples with this `value`; `first`: index of the first of them.
-    """
-
-    side: str
+    side: str  # "low" or "high"
     value: float
-    samples: int
-    first: int
+    samples: int  # number of samples with this value
+    first: int  # index of the first of them
 
 
 def is_mostly_clipped(values: Array) -> bool:

@@ -34,18 +34,12 @@ from sealscope.recordings.recording import Recording
 
 
 class CorrectedSamples(NamedTuple):
-    """A recording after the correction of its samples.
+    """A recording after the correction of its samples."""
 
-    - `recording`: evenly spaced samples, from the first to the last row with all chamber pressures and the command.
-    - `findings`: the corrections that `correct_samples` reports.
-    - `stuck`: names of chamber pressures that repeat one value for too long to be used.
-    - `used_fraction`: fraction of the original samples within the time span of `recording`.
-    """
-
-    recording: Recording
-    findings: tuple[Finding, ...]
-    stuck: tuple[str, ...]
-    used_fraction: float
+    recording: Recording  # evenly spaced, from the first to the last row with all chamber pressures and the command
+    findings: tuple[Finding, ...]  # the corrections that `correct_samples` reports
+    stuck: tuple[str, ...]  # names of chamber pressures that repeat one value for too long to be used
+    used_fraction: float  # fraction of the original samples within the time span of `recording`
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:

@@ -73,8 +73,7 @@ def is_value(cell: str, decimal: str) -> bool:
 def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[int], str]) -> tuple[Array, list[int]]:
     """Parse a column's cells to doubles (n,), NaN for words and missing samples; also return the indices of words.
 
-    `decimal`: decimal separator, "." or ","; `format_place`: index of a cell -> its place, for messages. Raises
-    InputError for an infinite number.
+    `format_place`: index of a cell -> its place, for messages. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -182,10 +181,9 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 
 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Callable[[int], str]) -> list[str]:
-    """Remove the unit after the number from each cell of a column.
+    """Remove the unit after the number from each cell of a column; words, and zeros without a unit, stay as they are.
 
-    Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
-    it does not end in `unit`; `format_place`: index of a cell -> its place, for messages. Raises InputError for a
+    `is_cut`: the last cell may be incomplete, and becomes empty if it does not end in `unit`. Raises InputError for a
     number with another unit, and for a number other than zero without a unit.
     """
     result = [cell.strip() for cell in cells]

@@ -105,10 +105,7 @@ def _check_channel(channel: str) -> None:
 
 
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
-    """Raise InputError for an invalid map from channels to columns, and for a sampling rate that is not positive.
-
-    A map is invalid if it names an unknown channel, or if the map or its entry `REST` is a text other than "auto".
-    """
+    """Raise InputError for an unknown channel or a wrong word in a map, and for a rate that is not positive."""
     if isinstance(channel_map, str) and channel_map != "auto":
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     for channel in explicit_columns(channel_map):
@@ -135,7 +132,6 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
     """Reconstruct the map that "auto" has chosen for a recording, channel -> column, from its provenance.
 
     A unit at the end of a column's name is added, as in `PA_bar[bar]`; units in a user's map are not in the provenance.
-    Without an entry `columns` in the provenance, the map is empty.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
@@ -235,10 +231,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add to `choice` the channels and the time column that a user has mapped.
-
-    `columns`: for each channel, or "t" for the time, the text of a column or of a formula of several columns.
-    """
+    """Add to `choice` the channels and the time column that a user has mapped: channel or "t" -> text of the map."""
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole
@@ -256,10 +249,7 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Complete `choice` with the channels and the time column that the names of columns show.
-
-    Channels, columns and a time column that are already chosen stay as they are.
-    """
+    """Add to `choice` the channels and the time column that the names of columns show, beside those already chosen."""
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:

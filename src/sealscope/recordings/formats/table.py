@@ -133,14 +133,12 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    If no columns can be chosen but the series form a long table, in which each row is one sample of a named channel,
-    each of these names is read as a column.
+    If no columns can be chosen, the series may form a long table, in which each row is one sample of a named channel.
 
     - `kind`: format of the file in words; `remarks`: entries in its header.
     - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
-    - `prepare`: function that reads all used columns together, before their values are needed, and returns lines for
-      the history.
+    - `prepare`: function that reads all used columns together before their values are needed.
     - `size` [bytes]: size of a file that may be compressed, from which `check_size` limits the number of values.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
@@ -189,9 +187,8 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns that were read from a table to the fields of a recording.
 
-    - `choice`: the columns and their meaning; `columns`: column -> values (n,), doubles or, for the time, datetime64.
-    - `kind`: format of the file in words; `remarks`: entries in its header; `notes`: lines for the history.
-    - `description`: rate, provenance and history in a file that Sealscope has written; None for other files.
+    - `columns`: column -> values (n,), doubles or, for the time, datetime64; `notes`: lines for the history.
+    - `kind`, `remarks`, `description`: as for `build_fields`.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
     Rows that begin with the last sample are reversed. Raises InputError if there are no rows, or only dates in place of
@@ -527,9 +524,8 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit" and "valid"; `prepare`: as for
-    `build_fields`. Values with a 0 in the column "valid" become NaN. Also returns lines for the history. Raises
-    InputError without a time, or for too many names.
+    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`. Values with a 0 in the column
+    "valid" become NaN. Also returns lines for the history. Raises InputError without a time, or for too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]

@@ -156,10 +156,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         time_of_column = {column: max(time for time in time_columns if time < column) for column in columns}
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-        """Read the requested columns and their times, and return lines for the history.
-
-        `kinds`: index in `columns` -> kind of its values, such as "numbers"; `date`: column of the date, or None.
-        """
+        """Read the columns with the indices `kinds` in `columns`, and their times; return lines for the history."""
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
         log = _Log(path, layout, kinds_by_column | time_kinds, None if time_columns else date)
@@ -404,10 +401,9 @@ class _Log:
         return rows
 
     def _split_lines(self, lines: list[str], line_numbers: Sequence[int], is_cut: bool) -> list[list[str]]:
-        """Split lines of the log into cells; `line_numbers` are those in the file.
+        """Split lines of the log into cells; raise InputError for a quotation mark that is not closed on its line.
 
-        Raises InputError for a quotation mark that is not closed on its line, unless the file ends within this line
-        (`is_cut`): such a cell becomes empty.
+        In a last line within which the file ends (`is_cut`), such a cell becomes empty instead.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -538,10 +534,9 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
     def _detect_day_first(self) -> bool:
-        """Detect if the day precedes the month in the log's dates.
+        """Detect if the day precedes the month, from the log's beginning to the first date with a number over 12.
 
-        The log is read from its beginning to the first date with a number over 12. Without such a date, the order is
-        guessed (`is_day_first`), and `order_note` says so.
+        Without such a date, the order is guessed (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]

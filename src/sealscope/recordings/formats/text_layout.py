@@ -107,10 +107,9 @@ def split_at_blanks(line: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells at the `delimiter`, but not within quotation marks.
+    """Split a line into cells at the `delimiter`, or at blanks and tabs if this is a blank.
 
-    A blank as the delimiter stands for any blanks and tabs. Quotation marks are removed; if the delimiter is a blank,
-    they have no meaning and stay.
+    Other delimiters do not count within quotation marks, which are removed.
     """
     if delimiter == " ":
         return split_at_blanks(line)
