@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from operator import attrgetter
 from typing import Any, NamedTuple, Self, TypeVar
@@ -19,7 +19,6 @@ from sealscope.parameters.circuit import CIRCUITS, HydraulicCircuit
 from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.names import resolve_name
 from sealscope.parameters.valve import ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
@@ -29,6 +28,15 @@ P = TypeVar("P", bound=Part)
 ASSUMED = "assumed:"
 #: Volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke.
 GAS_OVER_ROD = 5.0
+#: Names of parameters in textbooks and other programs, in lower case and without underscores.
+_OTHER_NAMES = {
+    **dict.fromkeys(("beta", "betae", "bulkmodulus"), "fluid.K_oil"),
+    **dict.fromkeys(("ap", "area", "pistonarea"), "cylinder.A_A"),
+    **dict.fromkeys(("m", "mass"), "cylinder.M_eq"),
+    **dict.fromkeys(("dp", "displacement"), "pump.q_b"),
+    **dict.fromkeys(("kt", "torqueconstant"), "motor.C_m"),
+    **dict.fromkeys(("stroke", "strokelength"), "cylinder.L"),
+}
 
 
 class ParameterEntry(NamedTuple):
@@ -252,13 +260,13 @@ class Rig(Part):
     def __getitem__(self, name: str) -> Value:
         """Return the SI value of a parameter; `name`: its symbol, if that is unique, or its dotted name."""
         value: Any = self
-        for symbol in resolve_name(name, declared_names()).split("."):
+        for symbol in resolve_name(name).split("."):
             value = getattr(value, symbol)
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
         """Return the value, unit and source stated for a parameter; `name`: its symbol or its dotted name."""
-        return self._stated_entries()[resolve_name(name, declared_names())]
+        return self._stated_entries()[resolve_name(name)]
 
     def states(self, *names: str) -> bool:
         """Test whether all the named parameters are stated for this machine, i.e. have no source `assumed: ...`."""
@@ -293,7 +301,7 @@ class Rig(Part):
         entries = self._stated_entries()
         names_by_parameter: dict[str, str] = {}  # dotted name -> name that the caller wrote
         for name, value in overrides.items():
-            full_name = resolve_name(name, declared_names())
+            full_name = resolve_name(name)
             if full_name in names_by_parameter:
                 raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
             names_by_parameter[full_name] = name
@@ -403,6 +411,42 @@ def declared_fields() -> dict[str, FieldInfo]:
 def declared_names() -> tuple[str, ...]:
     """List the dotted names of all parameters, in the order of declaration."""
     return tuple(declared_fields())
+
+
+def resolve_name(name: str) -> str:
+    """Find the dotted name of a parameter from its end, such as `V_1` or `p_A.noise`, or from the dotted name itself.
+
+    Raises InputError if no parameter has the name, or if several have it. The error for a name that is usual in other
+    programs (`_OTHER_NAMES`) suggests the parameter.
+    """
+    names = declared_names()
+    if name in names:
+        return name
+    matches = [full_name for full_name in names if full_name.endswith("." + name)] if name else []
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        listed_names = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
+        raise InputError(f"parameter {name} is not unique, give one of {listed_names}")
+    if synonym := _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", "")):
+        raise InputError(f"{name!r} is not a parameter; did you mean {synonym}?")
+    symbols = dict.fromkeys(full_name.rpartition(".")[2] for full_name in names)
+    raise InputError(f"{name!r} is not a parameter{suggestion(name, names if '.' in name else symbols)}")
+
+
+def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
+    """Parse overrides `NAME=VALUE[unit]`, as typed on a command line, to a mapping from `NAME` to `VALUE[unit]`.
+
+    Raises InputError for a text of another form, or for a name with two different values.
+    """
+    overrides: dict[str, str] = {}
+    for text in texts:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise InputError(f"an override must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
+        if overrides.setdefault(name, value) != value:
+            raise InputError(f"{name} must be set once, got {overrides[name]} and {value}")
+    return overrides
 
 
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
