@@ -35,10 +35,9 @@ _memory_at = record_view(_MEMORY)
 def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
-    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against the pressure
-    difference dp that the load and the target's speed v and acceleration a require. At the first sample a and d(dp)/dt
-    are 0. A target that is faster than `v_max` jumps; v is then taken as 0. `memory`, `sample`: addresses of a record
-    `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The feed-forward is the voltage for the flow G dp + C d(dp)/dt against the pressure difference dp that the load and
+    the target's speed v and acceleration a require. `memory`, `sample`: addresses of a record `_MEMORY`, which is
+    updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0

@@ -31,10 +31,7 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    At this voltage the drive delivers the flow A v_c. A is the piston area of the chamber with the higher pressure. The
-    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the target's speed v_target and the error
-    e = target - x. `m`: a record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a
-    `Measured`.
+    `m`: a record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x

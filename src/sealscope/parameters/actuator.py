@@ -54,8 +54,7 @@ class Cylinder(Part):
 class Friction(Part):
     """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22) of the thesis.
 
-    `law` may instead select the law of Karnopp or of LuGre near standstill, which use the same Coulomb, Stribeck and
-    viscous forces while the piston slides.
+    `law` may select another law near standstill, which uses the same forces while the piston slides.
     """
 
     F_pr: float = quantity("preload force of the seals", "N", ge=0, le=1e7)

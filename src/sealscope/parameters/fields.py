@@ -63,10 +63,9 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format a validation error of pydantic as a line "SYMBOL must be ..., got ...".
+    """Format a validation error of pydantic about the parameters of a class as a line "SYMBOL must be ..., got ...".
 
-    Of several errors, one about an unknown name is formatted if there is any, otherwise the first. `model`: the class,
-    such as `Pump`, whose parameters are invalid. If a bound is broken, the parameter's unit follows the bound.
+    Of several errors, one about an unknown name is formatted if there is any, otherwise the first.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))

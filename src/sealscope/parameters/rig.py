@@ -162,11 +162,7 @@ class Rig(Part):
         return self
 
     def _check_circuit(self) -> None:
-        """Raise ValueError unless parameters have the values that the rig's circuit and a servo valve's supply require.
-
-        If the rig has a supply, the speed loop of its motor must have an integral gain > 0, and the precharge of its
-        accumulator, if any, must be below the supply's pressure.
-        """
+        """Raise ValueError unless parameters have the values that the circuit and a servo valve's supply require."""
         supply, circuit = self.supply, self.circuit
         for name, required in circuit.required.items():
             value = attrgetter(name)(self)
@@ -185,11 +181,7 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Raise ValueError for a valve or filter without the part that it needs, or for conflicting viscosities.
-
-        Shut-off valves and filters need a line (`line.orifices`), clogging and a bypass valve need a filter. The
-        viscosity must be lower at 100 deg C than at 40 deg C.
-        """
+        """Raise ValueError for a valve or filter without the part that it needs, or for conflicting viscosities."""
         line, oil = self.line, self.fluid
         # `absent`: the value of a rig without such a valve or filter
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
@@ -534,8 +526,7 @@ def _make_entry(full_name: str, value: Any, source: str, place: str) -> Paramete
 def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
 
-    `tree`: pairs of key and table; `place`: their file, for messages; `prefix`: beginning of the dotted names. Raises
-    InputError for an unknown name or an invalid entry.
+    `tree`: pairs of key and table. Raises InputError for an unknown name or an invalid entry.
     """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:

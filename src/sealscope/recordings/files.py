@@ -82,12 +82,14 @@ def _detect_format(path: Path) -> str:
 
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
     """Find the text or binary format whose `recognise` function accepts a file's first bytes; None if none does."""
-    candidates = {
-        kind: entry["recognise"]
-        for kind, entry in _FORMATS.items()
-        if "recognise" in entry and bool(entry.get("text")) == is_text
-    }
-    return next((kind for kind, name in candidates.items() if _format_function(kind, name)(head)), None)
+    for kind, entry in _FORMATS.items():
+        if (
+            "recognise" in entry
+            and bool(entry.get("text")) == is_text
+            and _format_function(kind, entry["recognise"])(head)
+        ):
+            return kind
+    return None
 
 
 def _format_function(kind: str, name: str) -> Callable[..., Any]:

@@ -70,12 +70,10 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array, is_zero_known: bool) -> bool:
-    """Test whether a signal (n,) is mostly white noise, or has missing samples.
+    """Test whether a signal (n,) is mostly white noise (`readings.noise` of `priors.toml`), or has missing samples.
 
-    The noise variance is estimated as a twentieth of the mean square of the third difference. The signal is noise if
-    this variance exceeds the fraction `readings.noise` (`priors.toml`) of the signal's variance. With `is_zero_known`,
-    i.e. for p_A - p_B, zero means no load, and the signal's mean square is taken instead of its variance, so that a
-    constant load is a signal; a single pressure has the charge pressure as an offset.
+    With `is_zero_known`, i.e. for p_A - p_B, zero means no load, and the mean square is taken instead of the variance:
+    then a constant load is a signal. A single pressure has the charge pressure as an offset.
     """
     power = np.mean(values**2) if is_zero_known else np.var(values)
     # the third difference of white noise has 20 times its variance; `not <=`: missing samples count as noise

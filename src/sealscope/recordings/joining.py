@@ -46,8 +46,7 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 def file_seconds(recording: Recording, path: Path) -> float:
     """Find the time of a file's first sample [s since 1970].
 
-    If neither the recording nor the file's name states it (`start_seconds`), it is estimated as the time of the file's
-    last change minus the duration of the recording.
+    If it is not known (`start_seconds`), it is the time of the file's last change minus the duration of the recording.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -73,10 +72,7 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the provenance; None if it is not there.
-
-    It is the entry `start_epoch_s`, if this counts from 1970 and not from another origin, or else the entry `start`.
-    """
+    """Find the time of t = 0 [s since 1970] in the entry `start_epoch_s` or else `start` of the provenance, or None."""
     epoch = recording.provenance.get("start_epoch_s")
     if isinstance(epoch, Real) and counts_from_1970(float(epoch)):
         return float(epoch)

@@ -51,8 +51,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
     A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; `rate`: sampling rate [Hz]. The
     first sample of a hold is a reading and not flagged. `before`: value of a hold just before these samples, NaN if
-    there is none. If the first run has this value, it continues that hold: all its samples are flagged, even if it is
-    short.
+    there is none; a first run of this value continues the hold, and is flagged from its first sample on.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -102,10 +101,7 @@ def smallest_step(values: Array) -> float:
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
-
-    The result is 0 for a constant channel. A long channel is thinned evenly (`_QUANTUM_SAMPLES`).
-    """
+    """Estimate the quantisation step of a channel (n,), thinned if it is long; 0 for a constant channel."""
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
@@ -135,10 +131,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of samples that equal the previous one in each range `begin` to `end` (k,).
-
-        The rule of succession is used, so that the result is never 0 or 1.
-        """
+        """Estimate the fraction of samples that equal the previous one in each range (k,) by the rule of succession."""
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

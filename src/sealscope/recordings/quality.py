@@ -147,8 +147,7 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of (p_A + p_B)/2 over a whole recording, which a sealed circuit does not show.
 
     The recording is divided into equal parts. The steps of the mean from part to part must be alike, and the drift fast
-    enough (`creep` in `priors.toml`). Returns one finding or none; also none if the recording is short, or p_A or p_B
-    is absent or not in Pa.
+    enough (`creep` in `priors.toml`). Returns one finding or none.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -232,8 +231,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] | None:
     """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none.
 
-    The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing". `rate`: sampling rate
-    [Hz].
+    The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing".
     """
     is_missing = np.isnan(values)
     if not is_missing.any():

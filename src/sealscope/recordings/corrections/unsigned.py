@@ -193,11 +193,10 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz]; 0 for a short recording.
 
-    It is half the median of the locally averaged squared differences of samples that are just over twice
-    `unsigned.half` (`priors.toml`) apart, whose speeds share no position. Motion changes only some of these averages,
-    and hardly their median. The result is 0 for a recording that is shorter than this distance.
+    It is half the median of the locally averaged squared differences of samples just over twice `unsigned.half` apart,
+    whose speeds share no position. Motion changes only some of these averages, and hardly their median.
     """
     n_lag = 2 * _half_span(rate) + 1
     steps = speed[n_lag:] - speed[:-n_lag]

@@ -164,10 +164,7 @@ def remove_units(line: str, units: Iterable[str]) -> str:
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units in cells, column -> unit, to headings that state none.
-
-    Raises InputError if a heading states another unit, or one that is not known. `place`: the file, for messages.
-    """
+    """Add the units in cells, column -> unit, to headings that state none; raise InputError if one states another."""
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)

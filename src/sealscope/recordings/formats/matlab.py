@@ -94,7 +94,6 @@ def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
     Each signal has `CompressedTime` (first time, step, number of samples) and `DataR2` (the number of its stream).
-    Signals of another form are left out.
     """
     import h5py
 

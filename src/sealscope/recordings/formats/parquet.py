@@ -87,10 +87,7 @@ def _is_text(field: Any) -> bool:
 
 
 def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDArray[Any]:
-    """Read the column `field` as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types.
-
-    `read_column`: reads its cells, as a pyarrow ChunkedArray.
-    """
+    """Read the column `field` as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types."""
     import pyarrow
     from pyarrow import compute, types
 

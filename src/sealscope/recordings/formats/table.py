@@ -144,9 +144,7 @@ def build_fields(
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
     # sampling times of series count as one more column, unless a series is called t
-    uses_clock = any(member.clock is not None for member in candidates) and not any(
-        label.name == "t" for label in labels
-    )
+    uses_clock = any(member.clock is not None for member in candidates) and all(label.name != "t" for label in labels)
     try:
         choice = choose_columns([*labels, _CLOCK_LABEL] if uses_clock else labels, request, rate)
     except InputError:
@@ -589,10 +587,7 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError if the texts of the column `name` are too many, too long or too large in all.
-
-    `count`: number of texts; `width` [bytes]: length of the longest one.
-    """
+    """Raise InputError if `count` texts of up to `width` [bytes] in the column `name` are too many or too long."""
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "

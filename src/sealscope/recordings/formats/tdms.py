@@ -20,10 +20,7 @@ _UNITS = ("unit_string", "NI_UnitDescription", "units", "unit", "Unit")
 
 
 def read_tdms(path: Path, request: Request) -> RecordingFields:
-    """Read the requested channels of a TDMS file; raise MissingExtra without npTDMS.
-
-    Channels that state a waveform interval (``wf_increment``) have sampling times of their own.
-    """
+    """Read the requested channels of a TDMS file, each with its waveform interval, if stated, as its clock."""
     nptdms = import_library("nptdms", "TDMS", "npTDMS")
     # no warnings on a truncated last segment
     import_library("nptdms.log", "TDMS", "npTDMS").log_manager.set_level(logging.ERROR)

@@ -594,10 +594,7 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe, for the history, the lines of text and repeated headings that were left out.
-
-        Raises InputError if there are too many lines of text.
-        """
+        """Describe the text and repeated headings that were left out; raise InputError for too many lines of text."""
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
         notes = []

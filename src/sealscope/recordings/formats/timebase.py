@@ -143,7 +143,7 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
     try:
         return np.array(iso_stamps, dtype="datetime64[ns]")
     except ValueError:  # such as the 30th of February
-        raise ValueError(next(index for index, text in enumerate(iso_stamps) if not _is_datetime(text))) from None
+        raise ValueError([text == "NaT" or parse_epoch(text) is not None for text in iso_stamps].index(False)) from None
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
@@ -152,10 +152,7 @@ def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide from dates such as 05/06/2024 if the day precedes the month; None if they do not show it.
-
-    The first date with exactly one number over 12 decides: True if this is its first number, as in 31/12/2024.
-    """
+    """Decide from dates such as 31/12/2024 if the day comes first; None if none has exactly one number over 12."""
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((is_first_over for is_first_over, is_second_over in over_12 if is_first_over != is_second_over), None)
 
@@ -198,15 +195,6 @@ def _date_numbers(text: str) -> tuple[int, int, int]:
     return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
 
 
-def _is_datetime(text: str) -> bool:
-    """Test whether a text in ISO form is a valid datetime64, which the 30th of February is not."""
-    try:
-        np.datetime64(text, "ns")
-    except ValueError:
-        return False
-    return True
-
-
 def counts_from_1970(clock: float) -> bool:
     """Test whether a clock reading [s] counts from 1970, i.e. would then be a time from March 1973 to the year 5138."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
@@ -235,10 +223,7 @@ def parse_epoch(stamp: str) -> float | None:
 
 
 def _format_clock(text: str) -> str:
-    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`.
-
-    `12:00` and other times in this form stay as they are, except that a decimal comma becomes a point.
-    """
+    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`."""
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -251,10 +236,7 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date in the `parts` of a time stamp in ISO form, or 1970-01-01 if they contain no date.
-
-    `day_first`: the day precedes the month, as in 31/12/2024.
-    """
+    """Format the date in the `parts` of a time stamp in ISO form, or 1970-01-01 if they contain no date."""
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -315,8 +297,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 
     Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
     hour are removed. In dated stamps a single jump by an hour in the night, due to daylight saving time, is removed.
-    Returns the times (n,) [s], the provenance of the start, and lines for the history. Raises InputError if all stamps
-    are missing.
+    Raises InputError if all stamps are missing.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -367,12 +348,10 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 
 
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
-    """Convert a time column of numbers (n,) to seconds.
+    """Convert a time column of numbers (n,) to seconds, those with an origin or since 1970 relative to the first.
 
-    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only the
-    guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log. Returns
-    the times (n,) [s], the provenance of the start, and lines for the history. Times with an origin, or since 1970,
-    become relative to the first. Raises InputError if no number is finite.
+    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed, by `state`, too, from
+    earlier parts of the log. Raises InputError if no number is finite.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -400,8 +379,7 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     """Convert a time column of numbers (n,) without a unit to seconds; `finite` (m,) are the finite ones of `values`.
 
     A long log is read in parts. The finite values of the first part, which `state` keeps, tell for all parts whether
-    the numbers are days or seconds, and from which date they count. Returns the times (n,) [s], the provenance of the
-    start, and lines for the history, which call the column `name`. Raises InputError if the numbers only count rows.
+    the numbers are days or seconds, and from which date they count. Raises InputError if the numbers only count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None

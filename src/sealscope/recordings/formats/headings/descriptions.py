@@ -56,10 +56,7 @@ def _column_key(label: Label) -> str:
 
 
 def _rename_label(label: Label, description: str) -> Label:
-    """Replace a column's name by a description, and keep the last word of the replaced name in `Label.called`.
-
-    The label stays as it is if the description is empty, too long or equal to that word.
-    """
+    """Replace a column's name by a description, unless this is empty, too long or the last word of the name."""
     if not description or len(description) > _MAX_NAME or _fold(description) == _column_key(label):
         return label
     renamed = Label.parse(description)  # it may end in a unit

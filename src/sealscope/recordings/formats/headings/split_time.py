@@ -51,9 +51,8 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
     """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
-    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only the dates in `base`
-    are used. `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the
-    start.
+    `base` (n,): the time column, datetime64 or doubles in `unit`, of which only dates are used beside a part "hour";
+    `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the start.
     """
     subsecond_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = subsecond_parts[-1] if subsecond_parts else "second"
@@ -83,9 +82,8 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
     """Test whether the parts of a second grow from sample to sample and restart when the next second begins.
 
-    `base` (n,): times without parts of a second, in s or datetime64; `offset` (n,): the parts of a second [ns]. A
-    tenth of the steps may differ. False if fewer than half of the steps are within a second, because the parts then
-    show no order.
+    `base` (n,): whole seconds, numbers or datetime64; `offset` (n,): the parts of a second [ns]. A tenth of the steps
+    may differ. False if fewer than half of the steps are within a second, because the parts then show no order.
     """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)

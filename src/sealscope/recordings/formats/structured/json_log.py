@@ -133,9 +133,8 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
     """Yield the single values in an entry of a JSON record, as (group, name, cell, unit).
 
     `group`, `name`: names of the records around the entry, and of the entry; `depth`: number of records and vectors
-    around the entry; `value`: a text, number or null; or `{"value": ..., "unit": ...}`; or a vector, with members
-    called `name(1)`, `name(2)`, ...; or a record, whose name then belongs to the group. Raises InputError for other
-    values.
+    around it. The `value` is a text, number or null; or `{"value": ..., "unit": ...}`; or a vector, with members called
+    `name(1)`, `name(2)`, ...; or a record, whose name then belongs to the group. Raises InputError for others.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")

@@ -167,10 +167,7 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
-    """Compute the times (count,) [s] of channel `index` from `X0` (by default 0) and `Delta_X` in a packet's header.
-
-    Raises InputError if `Delta_X` is not a positive number.
-    """
+    """Compute the times (count,) [s] of channel `index` from `X0` (by default 0) and `Delta_X` in a packet's header."""
     step = packet.number("delta_x", index)
     if not step > 0:
         raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")

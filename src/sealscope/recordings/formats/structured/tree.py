@@ -118,10 +118,7 @@ def _iter_time_series(place: _Place, by_name: Mapping[str, Any]) -> Iterator[Ser
 
 
 def _iter_group(place: _Place, fields: Mapping[str, Any]) -> Iterator[Series]:
-    """Yield the series of samples in each field of a struct, whose name is part of the group of `place`.
-
-    Names and units may be in fields such as `units`.
-    """
+    """Yield the series of samples in each field of a struct, whose name is part of the group of `place`."""
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
         # catman exports `Channel_3_Data` with `Channel_3_Header`
@@ -200,10 +197,7 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
 
 
 def _iter_columns(place: _Place, name: str, value: NDArray[Any], unit: str | None = None) -> Iterator[Series]:
-    """Yield the series of a vector, or of each column of a matrix, called `name(:,1)` etc.; leave out other arrays.
-
-    Their group and sampling times are those of `place`. `unit`: None or empty if it is not stated.
-    """
+    """Yield the series of a vector, or of each column of a matrix, called `name(:,1)` etc.; leave out other arrays."""
     if value.dtype.kind not in "fiubmMU":
         return
     flat, unit = np.squeeze(value), unit or None
