@@ -99,8 +99,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run; return its control law in the form that compiled code can call.
 
-    This is the controller's machine code or, if its method `compiled` is missing or returns None, a law that calls the
-    Python function of its method `start`.
+    This is the controller's machine code (`compiled`), or else a law that calls the Python function of `start`.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law

@@ -58,8 +58,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
     """Filter `values` (n,), which are constant between samples, by a first-order lag; write the result to `out` (n,).
 
-    out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-T/tau), with the sample
-    interval T and the lag's time constant tau.
+    out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-interval/time constant).
     """
     for sample in range(values.size):
         out[sample] = state
@@ -67,10 +66,7 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that the named attributes of `source` are finite and > 0 (`positive`) or >= 0 (`not_negative`).
-
-    Raises InputError otherwise, with `what` as the name of `source`.
-    """
+    """Raise InputError unless the named attributes of `source`, called `what`, are finite and > 0 or >= 0."""
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):

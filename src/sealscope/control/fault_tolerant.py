@@ -88,21 +88,20 @@ class FaultTolerant:
 
     The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp.
     Here dp is p_A - p_B, averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
-    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed
-    leakage conductance of the pump. G stays 0 until this difference exceeds 4 standard errors and the leak would move
-    the piston by half an encoder count a second. Without a leak the voltages are therefore exactly those of `inner`.
-    The voltage is limited to +-`u_max` [V] while a leak is compensated.
-
-    `known` >= 0 [m^3/(s Pa)], if not None, is taken as G instead of an estimate: an ideal controller that knows the
-    leak. The compensated flow [m^3/s] is reported as `compensated`.
+    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`. G stays 0 until
+    this difference exceeds 4 standard errors and the leak would move the piston by half an encoder count a second.
+    Without a leak the voltages are therefore exactly those of `inner`. The compensated flow [m^3/s] is reported as
+    `compensated`.
     """
 
     inner: Controller
     drive: Drive
     balance: Balance
-    u_max: float
-    G_assumed: float = 0.0
-    known: float | None = None
+    u_max: float  # [V] limit of the voltage while a leak is compensated
+    G_assumed: float = 0.0  # [m^3/(s Pa)] assumed leakage conductance of the pump
+    known: float | None = (
+        None  # [m^3/(s Pa)] taken as G, by an ideal controller that knows the leak; None to estimate G
+    )
 
     def __post_init__(self) -> None:
         not_negative = ("G_assumed",) if self.known is None else ("G_assumed", "known")

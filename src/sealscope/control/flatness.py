@@ -71,22 +71,20 @@ class Flatness:
     the pump's leakage G dp, the compression C d(dp)/dt of the oil, and the speed that the drive loses under dp.
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
-    averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
-    are assumed; V is the volume of a chamber, which takes half of a change of dp, and K the bulk modulus of the oil. A
-    speed of the target above `v_max` [m/s] is taken as a jump, to which only `feedback` responds.
+    averaged over time. A speed of the target above `v_max` is taken as a jump, to which only `feedback` responds.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
 
     feedback: PositionPI
     drive: Drive | ValveDrive
-    M: float
-    F_C: float
-    F_v: float
-    v_th: float
-    G: float
-    C: float
-    v_max: float
+    M: float  # [kg]
+    F_C: float  # [N]
+    F_v: float  # [N s/m]
+    v_th: float  # [m/s]
+    G: float  # [m^3/(s Pa)]
+    C: float  # [m^3/Pa] V/(2 K): the volume V of a chamber takes half of a change of dp; K: bulk modulus of the oil
+    v_max: float  # [m/s]
 
     def __post_init__(self) -> None:
         not_negative = ("M", "F_C", "F_v", "G", "C")

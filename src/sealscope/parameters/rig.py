@@ -350,10 +350,7 @@ class Rig(Part):
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the rig to nested values that JSON can contain: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`.
-
-        The channel map is left out.
-        """
+        """Convert the rig, without channel map, to nested values: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
         for name, entry in self._stated_entries().items():
             *groups, symbol = name.split(".")

@@ -28,8 +28,7 @@ def to_pandas(
 ) -> pandas.DataFrame:
     """Make a data frame of the content of `Recording.series`, with the index `t [s]` and columns such as `p_A [Pa]`.
 
-    Its `attrs` contain the units by column, the rate, the provenance and the history. Raises MissingExtra without
-    pandas.
+    Its `attrs` contain the units by column, the rate, the provenance and the history.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
@@ -92,10 +91,7 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set of the content of `Recording.series`, named and described as in NetCDF files.
-
-    Raises MissingExtra without xarray.
-    """
+    """Make a data set of the content of `Recording.series`, named and described as in NetCDF files."""
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {
         name: ("t", series.copy(), {"units": units[name], "long_name": LONG_NAMES.get(name, name)})

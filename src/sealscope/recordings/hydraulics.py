@@ -25,8 +25,7 @@ def find_implausibility(recording: Recording) -> str | None:
     - Pressures in Pa stay below `readings.pressure` of `priors.toml`, as those in another unit would.
     - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
 
-    Constant and absent channels are ignored, as a chamber may rest at charge pressure. Raw counts may have any offset
-    and range.
+    Constant and absent channels are ignored: a chamber may rest at charge pressure. Raw counts may have any range.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]

@@ -100,8 +100,7 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
     The signs are fitted to the position (`_fit_signs`) or, without a position, are those of the command. Returns (None,
-    "") if neither is recorded, or if the one used does not move in both directions or hardly correlates with the
-    `magnitude` (n,) of the speed or flow.
+    "") if neither is recorded, or moves in both directions and correlates with the `magnitude` (n,) of the flow.
     """
     has_position = "x" in recording
     if not has_position and "u" not in recording:
@@ -134,8 +133,7 @@ def _half_span(rate: float) -> int:
 def _moves_both_ways(values: Array) -> bool:
     """Test whether a speed or command (n,) moves far enough in both directions.
 
-    Of the sum of its positive values and that of its negative values, the smaller must exceed `unsigned.least`
-    (`priors.toml`) times the larger in magnitude.
+    Of the sums of its positive and of its negative values, the smaller must exceed `unsigned.least` times the larger.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -223,8 +221,7 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
 
     The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Where the ratio
     of the local mean of `values` (n,) to their local standard deviation, from second differences, is at most 1.32 plus
-    three standard errors, they are taken for noise and get random signs. Elsewhere they stay. `rate`: sampling rate
-    [Hz].
+    three standard errors, they are taken for noise and get random signs. `rate`: sampling rate [Hz].
     """
     if values.size < 3:
         return values

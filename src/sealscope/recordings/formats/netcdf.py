@@ -60,11 +60,10 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
                 if data.dtype[field].kind in "fiub"
             ]
         description = _read_description(file) if FORMAT_ATTRIBUTE in file.attrs else None
-        file_attributes = (
-            {} if description else {name: value for name, value in file.attrs.items() if not name.startswith("_")}
-        )
         remarks = collect_remarks(
-            (name, format_remark(_decode_text(value) or value)) for name, value in file_attributes.items()
+            (name, format_remark(_decode_text(value) or value))
+            for name, value in file.attrs.items()
+            if description is None and not name.startswith("_")
         )
         kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
         return build_fields(series, request, kind, remarks, stated_rate(remarks), description=description, size=size)

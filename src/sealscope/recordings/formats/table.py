@@ -189,8 +189,7 @@ def convert_columns(
     - `kind`, `remarks`, `description`: as for `build_fields`.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
-    Rows that begin with the last sample are reversed. Raises InputError if there are no rows, or only dates in place of
-    times.
+    Rows that begin with the last sample are reversed. Raises InputError without rows, and for dates in place of times.
     """
     label, start = choice.time_label, dict[str, Any]()
     remarks = remarks or {}
@@ -358,14 +357,11 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
         group = preferred[min(ambiguous)].group  # of one of these channels, as it often has all
         other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
-    unique_names = [
-        member.label.name if preferred[name] is member else member.path
-        for name, member in zip(names, series, strict=True)
-    ]
-    return [
-        replace(member, group="", label=Label(member.path, name, member.label.unit))
-        for name, member in zip(unique_names, series, strict=True)
-    ], notes
+    members = []
+    for name, member in zip(names, series, strict=True):
+        unique_name = member.label.name if preferred[name] is member else member.path
+        members.append(replace(member, group="", label=Label(member.path, unique_name, member.label.unit)))
+    return members, notes
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
@@ -490,8 +486,7 @@ def _read_long_channel(
 
     Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `choice`: the time column, and
     the values as the only channel `u`, in counts (`_count_request`); `table`: column -> cells; `value_column`: column
-    of the values; `label`: heading of the channel. Rows without a time are left out. Raises InputError if too many
-    samples are words.
+    of the values. Rows without a time are left out. Raises InputError for too many words.
     """
     assert choice.time is not None
     times = table[choice.time][rows]

@@ -450,8 +450,7 @@ class _Log:
     def _parse_rows(self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int], is_cut: bool) -> _Block:
         """Parse rows of cells to a block of values; `line_numbers`: line of each row; `is_cut`: the last is incomplete.
 
-        Words become NaN or NaT and are counted in `n_words`; in a column of the kind "any" they become inf and are not
-        counted.
+        Words become NaN or NaT and are counted in `n_words`; in a column of the kind "any" they become inf, uncounted.
         """
         block = _Block()
         for column, kind in self.kinds.items():

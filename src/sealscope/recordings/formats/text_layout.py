@@ -130,8 +130,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 
     Each pair of separators in `_DIALECTS` is tried. Its table consists of the rows of one width, namely the width with
     most values (numbers and time stamps), and must contain at least half of all values. A pair's rank is the number of
-    values in its table over the number of cells, except missing ones, in all rows with a value. The highest rank wins.
-    Rows of a single cell are ignored.
+    values in its table over the number of cells, except missing ones, in all rows with a value.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)

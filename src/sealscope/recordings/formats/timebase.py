@@ -269,8 +269,7 @@ def nominal_rate(t: Array) -> float:
 def interpolate_samples(t: Array, times: Array, values: Array, max_interval: float) -> Array:
     """Interpolate `values` (m,) at increasing `times` (m,) [s] linearly to the times `t` (n,) [s].
 
-    The result is NaN beyond the ends, within intervals over `max_interval` times the median interval, and throughout
-    for fewer than two samples.
+    The result is NaN beyond the ends, within intervals over `max_interval` median intervals, and for under two samples.
     """
     if times.size < 2:
         return np.full(t.size, np.nan)
@@ -468,10 +467,9 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Replace the times of samples that share each reading of a coarse clock by evenly spaced times.
 
-    Returns (clock step [s], new times (n,)) for the times `t` (n,) [s]. Returns None if a time is missing or steps
-    back, if there are fewer than two samples per clock step on average, or if a step's number of samples differs from
-    this average by more than one. A part of a log that is too short to show this gets the clock step and the sampling
-    rate of the earlier parts from `state`.
+    Returns (clock step [s], new times (n,)), or None if a time is missing or steps back, if there are fewer than two
+    samples per clock step on average, or if a step's number of samples differs from this average by more than one. A
+    part of a log too short to show this gets the clock step and the rate of the earlier parts from `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

@@ -25,8 +25,7 @@ def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -
 
     They are in a table of channels above the heading, whose rows begin with the last word of a column's name, or in a
     row of labels, in the order of the columns, with `label` or `labels` in place of the first. The first description of
-    a column counts; it may state the unit. `rows`: cells of all these lines. The last word of a replaced name is kept
-    in `Label.called`.
+    a column counts; it may state the unit. `rows`: cells of all these lines.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
