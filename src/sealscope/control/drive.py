@@ -20,8 +20,7 @@ if TYPE_CHECKING:
 
 #: Smallest pressure drop across a valve over the supply pressure, to keep the voltage finite under any load.
 _MIN_VALVE_FRACTION = 0.1
-#: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
-_OVERLAP_GAIN = 4.0
+_OVERLAP_GAIN = 4.0  # gain by which a small voltage is increased until the overlap of the valve's edges is passed
 #: Parameters and filter state of `drive_voltage`: those of a pump's drive, then those of a servo valve (Q_N > 0).
 DRIVE = record_dtype(
     *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),

@@ -19,16 +19,14 @@ from sealscope.parameters.circuit import check_circuit_property
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of the pressures that drive the leak.
-_PRESSURE_LAG = 0.005
+_PRESSURE_LAG = 0.005  # time constant [s] of the average of the pressures that drive the leak
 #: Time constant [s] by which a changed estimate enters the control law, so that the inner integral can follow.
 _BLEND = 0.5
 #: A leak is compensated once its estimate exceeds this many standard errors, until the estimate is below half of them.
 _SIGNIFICANT_SDS = 4.0
 #: The leak must also move the piston by this many encoder counts a second: a slower motion cannot be measured.
 _RESOLVED_COUNTS = 0.5
-#: Number of blocks that the observer must have used before a leak is compensated.
-_MIN_BLOCKS = 4
+_MIN_BLOCKS = 4  # number of blocks that the observer must have used before a leak is compensated
 #: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
 _NEGLIGIBLE_G = 1e-18
 #: State and parameters of the control law. `inner`, `inner_memory`: addresses of the inner controller's law and memory;

@@ -18,8 +18,7 @@ from sealscope.physics.friction import coulomb_friction
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of the load.
-_LOAD_LAG = 0.1
+_LOAD_LAG = 0.1  # time constant [s] of the average of the load
 #: Change of the target's speed within a sample, relative to `v_max`, from which on it is a jump and no acceleration.
 _MAX_SPEED_CHANGE = 0.1
 #: State and parameters of the control law; `v`, `dp`: values of the last sample; `load`: averaged load [N].

@@ -10,12 +10,9 @@ import numpy as np
 
 from sealscope.compiled import law, make_record, record_dtype
 
-#: Length of a block [s] over which volumes are balanced.
-BLOCK = 0.5
-#: Blocks with a smaller mean pressure difference [Pa] are not used.
-MIN_DP = 20e3
-#: A pilot-operated valve counts as shut above this multiple of the sum of its cracking and opening pressures.
-SHUT = 2.0
+BLOCK = 0.5  # length of a block [s] over which volumes are balanced
+MIN_DP = 20e3  # blocks with a smaller mean pressure difference [Pa] are not used
+SHUT = 2.0  # a pilot-operated valve counts as shut above this multiple of the sum of its cracking and opening pressures
 #: Prior standard deviations: of the compliance and the area (relative), and of the conductance [m^3/(s Pa)].
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
 #: Standard deviations of the model's errors in a block, relative to the compressed and to the swept volume.
@@ -27,8 +24,7 @@ _WALK, _RELATIVE_WALK = 1e-15, 0.03
 #: A block with an innovation above this many standard deviations is left out as an outlier. If the next block is an
 #: outlier with the same sign, a leak has opened suddenly.
 _OUTLIER_SDS = 4.0
-#: Time constant [s] of the average of all four signals.
-_LAG = 0.01
+_LAG = 0.01  # time constant [s] of the average of all four signals
 #: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
 #: rotation within the block in either direction [rad]; `outlier_G`: change of conductance that the last tested block
 #: implies if it is an outlier, else 0; `means`: averages of angle, position, p_A and p_B up to now; `begin`: these

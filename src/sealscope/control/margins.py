@@ -17,16 +17,13 @@ from sealscope.recordings.channels import Array
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Duration [s] of a controller's impulse response.
-_RESPONSE_DURATION = 60.0
+_RESPONSE_DURATION = 60.0  # duration [s] of a controller's impulse response
 #: Sizes of the impulses of position [m] (above the built-in controllers' default dead bands), pressure [Pa] and angle
 #: [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
-#: Time [s] in which a moving piston settles before the rig is linearised.
-_SETTLING = 0.5
+_SETTLING = 0.5  # time [s] in which a moving piston settles before the rig is linearised
 _N_FREQUENCIES = 4000
-#: Samples of an impulse response that are summed at once.
-_BLOCK = 64
+_BLOCK = 64  # samples of an impulse response that are summed at once
 #: Steps of the voltage [V], and of each state [SI] in the order of `STATES`, for the finite differences.
 _VOLTAGE_STEP = 1e-3
 _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)

@@ -16,8 +16,7 @@ from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, dri
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load.
-_PRESSURE_LAG = 0.02
+_PRESSURE_LAG = 0.02  # time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load
 #: State and parameters of the control law: `integral` is k_i times the integral of the error [m/s], `dp` the averaged
 #: p_A - p_B [Pa].
 FOLLOWING = record_dtype(

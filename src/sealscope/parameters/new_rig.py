@@ -11,14 +11,11 @@ from sealscope.parameters.load import load_rig
 from sealscope.parameters.rig import GAS_OVER_ROD, Rig
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
-#: Dead volume of each side, divided by the larger swept volume.
-_DEAD_VOLUME_RATIO = 0.25
-#: Speed of a supply's pump [rev/s].
-_SUPPLY_SPEED = 25.0
+_DEAD_VOLUME_RATIO = 0.25  # dead volume of each side, divided by the larger swept volume
+_SUPPLY_SPEED = 25.0  # speed of a supply's pump [rev/s]
 #: Pressure [Pa] above the setting of a supply's relief valve at which the valve passes the pump's whole flow.
 _RELIEF_RANGE = 2.5e5
-#: Precharge pressure of a supply's accumulator, divided by the setting of the relief valve.
-_PRECHARGE_RATIO = 0.7
+_PRECHARGE_RATIO = 0.7  # precharge pressure of a supply's accumulator, divided by the setting of the relief valve
 _STATED = "stated when this file was written: replace by drawing or data sheet"
 
 

@@ -26,8 +26,7 @@ Value = float | int | str
 P = TypeVar("P", bound=Part)
 #: Prefix of the source of a value that is not stated for this machine.
 ASSUMED = "assumed:"
-#: Volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke.
-GAS_OVER_ROD = 5.0
+GAS_OVER_ROD = 5.0  # volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke
 #: Names of parameters in textbooks and other programs, in lower case and without underscores.
 _OTHER_NAMES = {
     **dict.fromkeys(("beta", "betae", "bulkmodulus"), "fluid.K_oil"),

@@ -43,8 +43,7 @@ _SAFE_FORMATS = tuple(kind for kind, entry in _FORMATS.items() if entry.get("saf
 #: _MEMORY_RATIO * size. The speed [bytes/s] is _MIN_SPEED_SLOW for formats that `formats.toml` calls slow.
 _BASE_TIME, _MIN_SPEED, _MIN_SPEED_SLOW = 10.0, 20e6, 5e5
 _BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
-#: Deepest nesting of archives that is unpacked.
-_MAX_NESTING = 3
+_MAX_NESTING = 3  # deepest nesting of archives that is unpacked
 
 
 def _detect_format(path: Path) -> str:

@@ -11,8 +11,7 @@ from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.readings
-#: Largest difference of a copied channel, by rounding, as a fraction of its standard deviation.
-_COPY_TOLERANCE = 1e-6
+_COPY_TOLERANCE = 1e-6  # largest difference of a copied channel, by rounding, as a fraction of its standard deviation
 
 
 def find_implausibility(recording: Recording) -> str | None:

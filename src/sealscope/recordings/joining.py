@@ -16,8 +16,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.formats.timebase import counts_from_1970, parse_epoch
 from sealscope.recordings.recording import Recording
 
-#: Starts that differ by less [s] are equal: the times then continue from file to file.
-_SAME_START = 1e-6
+_SAME_START = 1e-6  # starts that differ by less [s] are equal: the times then continue from file to file
 _YEAR_FIRST = re.compile(
     r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
     r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"

@@ -21,10 +21,8 @@ ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
 #: Shortest run of equal values that can be stuck, and number of samples on either side with which it is compared.
 _MIN_STUCK, _NEIGHBOURHOOD = 5, 100
-#: A run is stuck if fewer runs of its length than this are expected in the channel.
-_MAX_EXPECTED = 1e-6
-#: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
-_MIN_JUMP = 3.5
+_MAX_EXPECTED = 1e-6  # a run is stuck if fewer runs of its length than this are expected in the channel
+_MIN_JUMP = 3.5  # smallest jump at an end of a stuck run, in quantisation steps: more than three
 #: A longer channel is thinned to this many samples, or up to twice as many, to estimate the quantisation step.
 _QUANTUM_SAMPLES = 2**15
 

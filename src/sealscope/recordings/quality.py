@@ -23,8 +23,7 @@ from sealscope.recordings.recording import Recording
 
 Severity = Literal["note", "warning", "fatal"]
 
-#: Fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1.
-SHORTEST = 226
+SHORTEST = 226  # fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1
 _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS = (
     RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible
 )  # fmt: skip

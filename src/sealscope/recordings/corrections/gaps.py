@@ -29,24 +29,18 @@ from sealscope.units import P_ATM
 
 Flags = NDArray[np.bool_]
 
-#: Longest gap bridged by a spline [samples].
-SPLINE = 3
-#: Longest gap bridged by another cycle, as a fraction of the recording.
-MAX_CYCLE_GAP = 0.1
-#: Largest fraction of impossible samples in a channel with the right unit.
-_MAX_IMPOSSIBLE_FRACTION = 0.1
-#: Number of different positions of a sensor that works; an encoder at rest shows one or two.
-_MIN_POSITIONS = 10
+SPLINE = 3  # longest gap bridged by a spline [samples]
+MAX_CYCLE_GAP = 0.1  # longest gap bridged by another cycle, as a fraction of the recording
+_MAX_IMPOSSIBLE_FRACTION = 0.1  # largest fraction of impossible samples in a channel with the right unit
+_MIN_POSITIONS = 10  # number of different positions of a sensor that works; an encoder at rest shows one or two
 _GAPS = RECORDINGS.gaps
 #: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
 #: Samples on either side of a gap whose means set the offset of a copied cycle. A cycle is compared only if so many
 #: samples beside the gap are in the recording, and so many in total are known; a spline needs more known values.
 _N_END = 8
-#: Largest rms difference of a copied cycle around the gap, relative to its rms about the mean.
-_MAX_MISMATCH = 0.4
-#: Uncertainty of the cycle's length [samples].
-_SLACK = 2
+_MAX_MISMATCH = 0.4  # largest rms difference of a copied cycle around the gap, relative to its rms about the mean
+_SLACK = 2  # uncertainty of the cycle's length [samples]
 
 
 def set_missing(recording: Recording, flags: Mapping[str, Flags]) -> Recording:

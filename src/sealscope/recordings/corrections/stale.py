@@ -22,10 +22,8 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.stale
 #: Largest fraction of stuck samples of a pressure: up to it they are missing, beyond it the channel is not used.
 MAX_STUCK_FRACTION: float = _PRIORS.stuck
-#: Smallest jump, in quantisation steps; a smaller one may be a slow change.
-_MIN_JUMP = 1.5
-#: Samples from the beginning from which the holding period is estimated.
-_N_ESTIMATE = 2**18
+_MIN_JUMP = 1.5  # smallest jump, in quantisation steps; a smaller one may be a slow change
+_N_ESTIMATE = 2**18  # samples from the beginning from which the holding period is estimated
 #: Largest number of equal rows in succession, i.e. a reading and its repeats, for the repeats to be left out; also the
 #: tolerance [rows] of the ends of a long repeat (`flag_frozen_rows`).
 _MAX_REPEAT = 3

@@ -26,8 +26,7 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.unsigned
-#: Most iterations of the fit; each uses the signs of the previous one.
-_MAX_ITERATIONS = 10
+_MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the previous one
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 #: Channel -> its quantity, for messages.

@@ -23,8 +23,7 @@ from sealscope.units import parse_unit
 
 #: Texts that loggers write for a missing sample, in lower case.
 MISSING = frozenset({"", *WORDS["missing"]})
-#: Largest fraction of a column's cells that may be words, as loggers write on overflow.
-MAX_WORD_FRACTION = 0.01
+MAX_WORD_FRACTION = 0.01  # largest fraction of a column's cells that may be words, as loggers write on overflow
 #: Longest number, and longest number with its unit [characters].
 _MAX_NUMBER, _MAX_QUANTITY = 400, 80
 #: Decimal separator -> pattern of a number.
@@ -45,8 +44,7 @@ _QUANTITY = re.compile(
 #: A number with the prefix of a power of ten behind it, `170.3m` or `-3k`, at the end of a cell.
 _PREFIXED = re.compile(r"(?<=\d)(?P<prefix>[pnu\u00b5\u03bcmkKMG])(?=[ ]{0,8}\"?[ ]{0,8}(?:[;,|\t]|$))")
 _POWERS = {"p": -12, "n": -9, "u": -6, "\u00b5": -6, "\u03bc": -6, "m": -3, "k": 3, "K": 3, "M": 6, "G": 9}
-#: Most different units that are looked up for a file.
-_MAX_UNITS = 64
+_MAX_UNITS = 64  # most different units that are looked up for a file
 
 
 def is_missing(cell: str) -> bool:

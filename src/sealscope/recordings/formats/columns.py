@@ -30,8 +30,7 @@ from sealscope.recordings.formats.headings.split_time import find_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension, to_si
 
-#: Most digits of a column's number; no log has as many columns.
-_MAX_DIGITS = 9
+_MAX_DIGITS = 9  # most digits of a column's number; no log has as many columns
 #: Separators of the parts of a path such as `Rig.Cyl.p_A`.
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: Channel (or `t`) -> column, given by a caller; or "auto": choose by the columns' names. The entry `REST` -> "auto" of

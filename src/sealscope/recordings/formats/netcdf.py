@@ -27,8 +27,7 @@ from sealscope.recordings.formats.table import (
     parse_description,
 )
 
-#: Most fill values of a data set: the CF conventions have one, a few tools write two.
-_MAX_FILLS = 16
+_MAX_FILLS = 16  # most fill values of a data set: the CF conventions have one, a few tools write two
 #: Most bytes, and most texts, that are read at a time from a data set of texts.
 _CHUNK_BYTES, _CHUNK_TEXTS = 500_000_000, 4096
 #: Attribute of files written by Sealscope: the version of their format.

@@ -41,8 +41,7 @@ from sealscope.recordings.formats.timebase import (
 )
 from sealscope.units import to_si
 
-#: Most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
-MAX_VALUES = 2**28
+MAX_VALUES = 2**28  # most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz
 #: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
 _MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
 #: Most texts in a column, most bytes of each text, and most bytes of all texts together.
@@ -52,14 +51,11 @@ FORMAT_VERSION = 1
 _CLOCK_LABEL = Label("t [s]", "t", "s")
 #: Channels whose clock all others are brought to, in order of preference.
 _BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
-#: Longest interval of a slower series that is interpolated, in median intervals.
-_MAX_INTERVAL = 3.0
-#: Largest difference of equal clocks, as a fraction of an interval.
-_SAME_CLOCK = 1e-2
+_MAX_INTERVAL = 3.0  # longest interval of a slower series that is interpolated, in median intervals
+_SAME_CLOCK = 1e-2  # largest difference of equal clocks, as a fraction of an interval
 #: Relative difference up to which the written rate of a recording takes precedence over the rate of its time stamps.
 _SAME_RATE = 0.01
-#: Most names in a long table.
-_MAX_NAMES = 4096
+_MAX_NAMES = 4096  # most names in a long table
 #: Function that reads columns before their values are used, and returns lines for the history. Arguments: column ->
 #: kind of its values, as for `text._Log`; and the column of the date that belongs to the time, or None.
 Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]

@@ -72,14 +72,11 @@ from sealscope.recordings.formats.timebase import (
 
 #: Bytes read at a time; for pyarrow `_ARROW_FACTOR` times as many.
 _CHUNK, _ARROW_FACTOR = 2**19, 4
-#: Longest line [bytes].
-_MAX_LINE = 2**23
-#: Smallest log [bytes] for which pyarrow is imported.
-_MIN_ARROW_SIZE = 2**20
+_MAX_LINE = 2**23  # longest line [bytes]
+_MIN_ARROW_SIZE = 2**20  # smallest log [bytes] for which pyarrow is imported
 #: Characters that begin quoted cells and comments.
 _MARKS = (b'"', b"#", b"%", b"/", b"!")
-#: Longest description in the first line [bytes].
-_MAX_DESCRIPTION = 64 * 1024 * 1024
+_MAX_DESCRIPTION = 64 * 1024 * 1024  # longest description in the first line [bytes]
 _ROWS_PER_WRITE = 8192
 #: Most lines of text among few samples (marks of events, a summary), and the longest such line.
 _MAX_TEXT_LINES, _MAX_TEXT_LINE = 8, 400

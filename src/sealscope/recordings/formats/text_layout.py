@@ -28,20 +28,17 @@ from sealscope.recordings.formats.headings.preamble import parse_remarks, stated
 from sealscope.recordings.formats.headings.proposal import has_known_word, is_quantity
 from sealscope.recordings.formats.headings.words import WORDS
 
-#: Bytes at the beginning of a file from which its format and layout are detected.
-SNIFF = 64 * 1024
+SNIFF = 64 * 1024  # bytes at the beginning of a file from which its format and layout are detected
 #: Beginning of the first line of logs written by Sealscope, before their description in JSON.
 DESCRIPTION_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
-#: Rows from which the dialect is detected.
-_N_ROWS = 100
+_N_ROWS = 100  # rows from which the dialect is detected
 #: Delimiters, each with the decimal separator of the dialect to try.
 _DIALECTS = (*product("\t;", ".,"), (",", "."), *product("|", ".,"), (",", ","), *product(" ", ".,"))
 #: A digit and a letter after it, which may begin a unit or be an SI prefix, but not the exponent of the number.
 _QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
-#: Most lines of a heading.
-_MAX_HEADING = 12
+_MAX_HEADING = 12  # most lines of a heading
 _SPACED_LABEL = re.compile(r"\S+(?:\s{0,20}(?:\[[^\]]{0,40}\]|\([^)]{0,40}\)))?")
 _DELIMITER_NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blank"}
 

@@ -35,8 +35,7 @@ _DATES = (
 )
 _EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
 _LAST_MONTH = 12
-#: Hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it.
-_WRONG_HOUR = 99
+_WRONG_HOUR = 99  # hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it
 #: A number, which is a stamp only if it has eight digits.
 _BARE_NUMBER = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
@@ -54,23 +53,19 @@ _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
 #: Smallest number without a unit that is read as the time since 1970, and its unit.
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
-#: Fewest samples from which the number of samples per stamp is estimated.
-_MIN_SHARED = 20
+_MIN_SHARED = 20  # fewest samples from which the number of samples per stamp is estimated
 #: Largest deviation of times from a uniform clock that is rounding, in intervals; limits of a rate's relative error.
 _MAX_ROUNDING, _MIN_SLACK, _MAX_SLACK = 0.6, 1e-9, 1e-3
 #: The date used for a time of day without a date.
 _NO_DATE = "1970-01-01"
 _HOUR, _DAY = 3600.0, 86400.0  # [s]
-#: Largest deviation of a clock jump from its nominal size, in median intervals.
-_TOLERANCE = 3.0
-#: Daylight saving time changes before this hour of the day.
-_LATEST_CHANGE = 4
+_TOLERANCE = 3.0  # largest deviation of a clock jump from its nominal size, in median intervals
+_LATEST_CHANGE = 4  # daylight saving time changes before this hour of the day
 #: Range of days since 1899-12-30 in the years 1982 to 2077.
 _EXCEL_RANGE = (30_000, 65_000)
 #: Largest intervals of numbers that count fractions of a day, and days: no logger samples every 2 or 12 us.
 _MAX_FRACTION_STEP, _MAX_DAY_STEP = 2e-6, 1.2e-5
-#: MATLAB's datenum of 1899-12-30.
-_DATENUM_OFFSET = 693_960
+_DATENUM_OFFSET = 693_960  # MATLAB's datenum of 1899-12-30
 #: Numbers from here on (December 2073 if counted from 1970) are seconds since 1904 (then December 2007).
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 #: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.

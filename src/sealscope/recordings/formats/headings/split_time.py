@@ -19,8 +19,7 @@ _NANOSECONDS = {"hour": 3600e9, "minute": 60e9, "second": 1e9, "ms": 1e6, "us": 
 _UPPER_LIMIT = {
     "month": 13.0, "day": 32.0, "hour": 24.0, "minute": 60.0, "second": 60.0, "ms": 1e3, "us": 1e6, "ns": 1e9
 }  # fmt: skip
-#: Fraction of the steps that must follow a rule: a log may have lost some samples.
-_MIN_FRACTION = 0.9
+_MIN_FRACTION = 0.9  # fraction of the steps that must follow a rule: a log may have lost some samples
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:

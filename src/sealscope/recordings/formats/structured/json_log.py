@@ -25,8 +25,7 @@ from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
 
 #: Most names in records, deepest nesting of a record and of a tree, and longest vector in a record.
 _MAX_NAMES, _MAX_DEPTH, _MAX_TREE_DEPTH, _MAX_VECTOR = 1024, 4, 8, 256
-#: An error this near the end of a text [characters] is a truncated last value.
-_MAX_TRUNCATED = 16
+_MAX_TRUNCATED = 16  # an error this near the end of a text [characters] is a truncated last value
 _BEGINS = re.compile(r'\{\s{0,1000}["}]|\[\s{0,1000}[\[{\]"\d\-nN]')
 #: Separators of values: white space, commas, and the record separator of RFC 7464.
 _SEPARATORS = re.compile(r"[\s,\x1e]*")
