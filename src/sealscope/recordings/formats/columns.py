@@ -296,14 +296,12 @@ def _find_time(labels: Sequence[Label]) -> int | None:
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several
         return exact
-    candidates = [
+    with_usual_names = [
         [i for i, label in enumerate(labels) if name in (label.whole.casefold(), label.name.casefold())]
         for name in WORDS["time"]
     ]
-    candidates.append(
-        [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]]
-    )
-    matches = next(filter(None, candidates), [])
+    times = [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]]
+    matches = next(filter(None, (*with_usual_names, times)), [])
     return next((i for i in matches if labels[i].unit is not None), matches[0] if matches else None)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -111,8 +112,6 @@ def split_cells(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return split_at_blanks(line)
     if '"' in line:
-        import csv
-
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     return line.split(delimiter)
 
