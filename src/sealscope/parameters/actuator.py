@@ -41,14 +41,9 @@ class Cylinder(Part):
     G_ext_B: float = conductance("leakage conductance of the rod seal of B")
 
     @property
-    def unevenness(self) -> float:
-        """Difference of the piston areas, divided by their mean; 0 if they are equal."""
-        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B))
-
-    @property
     def single_rod(self) -> bool:
         """True if the piston areas differ by more than makers' tolerances, 10 % of their mean."""
-        return self.unevenness > _MAX_DOUBLE_ROD_UNEVENNESS
+        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B)) > _MAX_DOUBLE_ROD_UNEVENNESS
 
 
 class Friction(Part):

@@ -63,9 +63,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
     """Read the requested columns of a JSON file to the fields of a recording; a truncated last value is left out."""
     place = str(path)
     with path.open("rb") as head:
-        encoding = detect_encoding(head.read(SNIFF))
-    if encoding is None:
-        raise InputError("JSON must be text, got binary data")
+        encoding = detect_encoding(head.read(SNIFF))  # `is_json` has read it as text
     text = path.read_text(encoding, errors="replace").lstrip("\ufeff")
     members, is_cut = _read_members(text, place)
     if not members:
