@@ -21,7 +21,7 @@ from sealscope.paragraphs import format_count
 from sealscope.recordings.chambers import DISPLAY_UNITS
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
 from sealscope.recordings.formats.columns import ChannelMap, Request
-from sealscope.recordings.formats.headings.preamble import clean_remarks
+from sealscope.recordings.formats.headings.preamble import collect_remarks
 from sealscope.storage.opening import raising_unreadable
 from sealscope.units import from_si
 
@@ -194,7 +194,8 @@ class Recording:
     @property
     def remarks(self) -> dict[str, str]:
         """Remarks in the header of the recording's file, such as the operator or the machine, by their names."""
-        return clean_remarks(self.provenance)
+        remarks = self.provenance.get("about")
+        return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 
     def unit_in_log(self, name: str) -> str | None:
         """Return the unit in which a channel was logged; None if it was in SI units or counts, or came from no log."""

@@ -38,6 +38,7 @@ from sealscope.recordings.formats.timebase import (
     nominal_rate,
     parse_stamps,
     time_base,
+    timedelta_seconds,
 )
 from sealscope.units import to_si
 
@@ -323,11 +324,6 @@ def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array,
         return timedelta_seconds(values - known[0]), known[0]
     unit = time.label.unit or unit_of_time(time.label) or "s"
     return to_si(np.asarray(values, dtype=np.float64), unit, "s", name="time"), start
-
-
-def timedelta_seconds(times: Any) -> Array:
-    """Convert timedelta64 values of any shape to seconds."""
-    return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
 
 
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:

@@ -241,6 +241,11 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
 
 
+def timedelta_seconds(times: Any) -> Array:
+    """Convert timedelta64 values of any shape to seconds, NaT to NaN."""
+    return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
+
+
 def nominal_rate(t: Array) -> float:
     """Estimate the nominal sampling rate [Hz] of times `t` (n,) [s].
 
@@ -303,8 +308,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
         nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
     stamps = nanoseconds[known]
     start = stamps[0]
-    t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
-    t[~known] = np.nan
+    t = timedelta_seconds(nanoseconds - start)
     earliest_hour = int((stamps - stamps.astype("datetime64[D]")).min() / np.timedelta64(1, "h"))  # of the day
     note_of_jump = {
         -_DAY: "has no date: begins again with the next day",

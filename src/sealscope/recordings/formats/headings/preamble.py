@@ -80,12 +80,6 @@ def collect_attributes(attributes: Mapping[Any, object]) -> dict[str, str]:
     return collect_remarks(pair for pair in attributes.items() if isinstance(pair[1], str | int | float))
 
 
-def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks from a file's header (`about` in the `provenance`), name -> text, printable and shortened."""
-    remarks = provenance.get("about")
-    return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
-
-
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
     """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`.
 
