@@ -65,7 +65,7 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Raise InputError unless the named attributes of `source`, called `what`, are finite and > 0 or >= 0."""
+    """Raise InputError unless attributes of `source`, called `what`, are finite and > 0 or, if `not_negative`, >= 0."""
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):

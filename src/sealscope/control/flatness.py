@@ -94,7 +94,6 @@ class Flatness:
         """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         pressure, of_difference = drive.mean_pressure(rig), friction.coulomb_pressure == "difference"
-        max_speed = drive.flow_per_volt * rig.daq.u_max / min(cylinder.A_A, cylinder.A_B)
         return cls(
             feedback=PositionPI.from_rig(rig),
             drive=drive,
@@ -105,7 +104,7 @@ class Flatness:
             # behind a valve the pump's leakage does not connect the chambers
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,
             C=cylinder.V / (2.0 * rig.fluid.K_oil),
-            v_max=max_speed,
+            v_max=drive.flow_per_volt * rig.daq.u_max / min(cylinder.A_A, cylinder.A_B),
         )
 
     @property

@@ -33,8 +33,6 @@ CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
     "fault-tolerant": FaultTolerant.from_rig,
     "fault-tolerant-flatness": lambda rig: FaultTolerant.from_rig(rig, Flatness.from_rig(rig)),
 }
-
-
 #: Group of the entry points by which distributions install controllers.
 GROUP = "sealscope.controllers"
 

@@ -291,9 +291,8 @@ class Recording:
         MissingExtra
             matplotlib is not installed.
         """
-        names = list(self.channels if channels is None else channels)
         channels_by_unit: dict[str, list[tuple[str, Array]]] = {}
-        for name in names:
+        for name in self.channels if channels is None else channels:
             values, unit = self[name], self.units[name]
             plot_unit = self.unit_in_log(name) or (self.pressure_unit if unit == "Pa" else _PLOT_UNITS.get(unit, unit))
             values = values if plot_unit == unit else from_si(values, plot_unit, CHANNEL_UNITS.get(name, unit))

@@ -86,7 +86,10 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
-    """Cut a recording to the rows from the first to the last one that has values in all `needed` channels, if any."""
+    """Cut a recording to the rows from the first to the last one that has values in all `needed` channels.
+
+    Without such a row the result is empty. Without `needed` channels, nothing is cut.
+    """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0) if needed else np.array([True])
     if is_complete.all():
         return recording

@@ -99,7 +99,7 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
     The signs are fitted to the position (`_fit_signs`) or, without a position, are those of the command. Returns (None,
-    "") if neither is recorded, or moves in both directions and correlates with the `magnitude` (n,) of the flow.
+    "") if neither is recorded, or if the one used moves one way only or hardly correlates with the `magnitude` (n,).
     """
     has_position = "x" in recording
     if not has_position and "u" not in recording:

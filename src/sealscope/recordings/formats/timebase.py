@@ -348,8 +348,8 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
     """Convert a time column of numbers (n,) to seconds, those with an origin or since 1970 relative to the first.
 
-    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed, by `state`, too, from
-    earlier parts of the log. Raises InputError if no number is finite.
+    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers of the
+    log's first part, which `state` keeps. Raises InputError if no number is finite.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
