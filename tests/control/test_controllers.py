@@ -12,7 +12,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.control import CONTROLLERS, Drive, FaultTolerant, Flatness, PositionPI, controller_named
-from sealscope.control.leak_observer import conductance as estimate_of
+from sealscope.control.drive import drive_voltage
 from sealscope.control.leak_observer import make_observer, update_observer
 from sealscope.control.registry import find_controller_source
 from sealscope.parameters import load_rig
@@ -59,8 +59,8 @@ def test_the_inverse_of_a_drive_gives_the_flow_against_the_pressure():
     """Closed form: k_p (omega_d - omega) + K_i I = C_e omega + R i at constant speed and current."""
     drive, m = Drive.from_rig(RIG), RIG.motor
     omega, dp, rate = 30.0, 2e6, 500.0
-    inverse = drive.inverse(rate)
-    volts = np.array([inverse(omega * drive.displacement, dp) for _ in range(5000)])
+    (coefficients,) = drive.coefficients(rate)
+    volts = np.array([drive_voltage(coefficients, omega * drive.displacement, dp) for _ in range(5000)])
     omega_d = volts * drive.omega_per_volt
     integral = np.cumsum(omega_d - omega) / rate
     needed = m.C_e * omega + m.R_c * drive.displacement * dp / m.C_m
@@ -79,10 +79,10 @@ def test_the_observer_returns_the_conductance_of_a_balance_that_holds(sign):
     theta = (area * x + G * np.cumsum(p_A - p_B) / rate) / balance.D
     for sample in zip(theta, x, p_A, p_B, strict=True):
         update_observer(observer, *sample)
-    estimate, sd, blocks = estimate_of(observer)
+    estimate, sd = observer.state[0], np.sqrt(observer.P[0, 0])
     # left out above: oil is drawn at the low side's pressure, a share of dp/K of what the pump turns
     assert abs(estimate - G) < max(4.0 * sd, 0.02 * G)
-    assert blocks > 30
+    assert observer.n_blocks > 30
 
 
 @pytest.mark.slow
@@ -95,7 +95,7 @@ def test_a_leak_that_opens_at_once_is_followed_within_three_blocks_and_an_outlie
     estimates = []
     for angle in theta:
         update_observer(observer, angle, 0.0, 4e6, 1e6)
-        estimates.append(estimate_of(observer)[0])
+        estimates.append(observer.state[0])
     assert np.abs(estimates[:5000]).max() < 1e-14
     assert estimates[5000 + 3 * 250] == pytest.approx(2.6e-12, rel=0.1)
 

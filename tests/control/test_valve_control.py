@@ -18,6 +18,7 @@ from sealscope.control import (
     controller_named,
     margins,
 )
+from sealscope.control.drive import drive_voltage
 from sealscope.parameters import load_rig
 from sealscope.physics.valve import edge_flow
 from sealscope.simulation.experiment import Experiment
@@ -41,7 +42,8 @@ def followed(command, duration, **options):
 def test_the_inverse_of_a_valve_makes_its_two_open_edges_pass_the_flow(flow, dp, p_s):
     assume(abs(flow) > 1e-7)
     drive = replace(ValveDrive.from_rig(RIG), p_s=p_s)
-    v, u = RIG.valve, drive.inverse(500.0)(flow, dp)
+    (coefficients,), v = drive.coefficients(500.0), RIG.valve
+    u = drive_voltage(coefficients, flow, dp)
     p_A, p_B = 0.5 * (p_s + dp), 0.5 * (p_s - dp)  # over the return, Merritt's p_A + p_B = p_s
     way = v.x_max * abs(u) / v.u_N
     lost = (p_s - p_A, p_B) if flow > 0 else (p_s - p_B, p_A)
@@ -53,10 +55,11 @@ def test_the_inverse_of_a_valve_makes_its_two_open_edges_pass_the_flow(flow, dp,
 
 def test_the_largest_flow_is_that_of_the_largest_voltage():
     drive = ValveDrive.from_rig(RIG)
-    assert drive.steady_voltage(drive.unloaded_flow(7.0)) == pytest.approx(7.0)
+    (coefficients,) = drive.coefficients(500.0)
+    assert drive_voltage(coefficients, 7.0 * drive.flow_per_volt, 0.0) == pytest.approx(7.0)
     assert drive.p_s == pytest.approx(7e6 + 4.9e-6 * 25 / 5e-10)  # 1500 rpm over the relief valve
     stronger = replace(drive, p_s=4 * drive.p_s)
-    assert stronger.unloaded_flow(7.0) == pytest.approx(2 * drive.unloaded_flow(7.0))
+    assert stronger.flow_per_volt == pytest.approx(2 * drive.flow_per_volt)
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def cylinder(rig: Rig, u: Array, leak: float = LEAK) -> dict[str, Array]:
     A dx = D omega dt - (V/K) dp_A/2 + (V/K) dp_B/2 - G (p_A - p_B) dt, with the speed that the drive makes of u.
     """
     drive = Drive.from_rig(rig)
-    omega = drive.flow(u, np.zeros(len(u)), RATE) / drive.displacement
+    omega = drive.speed(u, np.zeros(len(u)), RATE)
     true = [3e6 + sign * (5e4 * np.tanh(omega / 5.0) + 300.0 * omega) for sign in (1.0, -1.0)]
     conductance = leak * (np.arange(len(u)) / RATE >= ONSET)
     flow = rig.pump.q_b / (2.0 * np.pi) * omega

@@ -14,7 +14,6 @@ from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig, parse_overrides
 from sealscope.parameters.drive import Motor
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.names import parse_override
 from sealscope.parameters.rig import declared_fields
 
 from ..refusals import mentions, refusal
@@ -234,16 +233,14 @@ def test_anything_else_is_an_input_error(name: str, value: Any) -> None:
             assert "\n" not in str(error)
 
 
-def test_parse_override() -> None:
-    assert parse_override("V_1=50[cm^3]") == ("V_1", "50[cm^3]")
-    assert parse_override(" motor.R_c = 0.8 ") == ("motor.R_c", "0.8")
+def test_parse_overrides() -> None:
+    assert parse_overrides(["V_1=1", " motor.R_c = 0.8 ", "V_1=1"]) == {"V_1": "1", "motor.R_c": "0.8"}
     for bad in ("V_1", "=3", "V_1=", "", " = "):
         with refusal("NAME=VALUE[unit]"):
-            parse_override(bad)
-    assert parse_overrides(["V_1=1", "V_2=2", "V_1=1"]) == {"V_1": "1", "V_2": "2"}
+            parse_overrides([bad])
     with refusal("V_1", "1", "2"):
         parse_overrides(["V_1=1", "V_1=2"])
-    assert RIG.with_overrides(dict([parse_override("V_1=50[cm^3]")])).line.V_1 == 5e-5
+    assert RIG.with_overrides(parse_overrides(["V_1=50[cm^3]"])).line.V_1 == 5e-5
 
 
 def test_a_rig_shows_itself_in_one_line() -> None:

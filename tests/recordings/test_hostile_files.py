@@ -87,7 +87,7 @@ def test_whatever_a_format_library_raises_names_the_file(
         pytest.importorskip("pyarrow")
     write(Recording(T, {"p_A": P}, {"p_A": "Pa"}, 500.0), path)
     module = {"log.csv": "text", "log.h5": "netcdf", "log.parquet": "parquet"}[name]
-    inner = {"text": "_iter_line_blocks", "netcdf": "_read_values", "parquet": "_read_values"}[module]
+    inner = {"text": "_Log._iter_line_blocks", "netcdf": "_read_values", "parquet": "_read_values"}[module]
 
     def fail(*args: object) -> None:
         raise error("odd\nthing")

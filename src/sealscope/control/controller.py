@@ -14,20 +14,15 @@ from sealscope.recordings.recording import Array
 
 
 class Measured(NamedTuple):
-    """The inputs of a controller at one of its samples: time, target and measurements.
+    """The inputs of a controller at one of its samples: time, target and measurements."""
 
-    `t` [s]: time; `target` [m] of the piston's position; `target_speed` [m/s]: mean speed of the target while the
-    computed voltage will act; `x` [m]: measured position from mid-stroke; `p_A`, `p_B` [Pa]: measured pressures of the
-    two chambers; `theta` [rad]: measured angle of the motor.
-    """
-
-    t: float
-    target: float
-    target_speed: float
-    x: float
-    p_A: float
+    t: float  # [s]
+    target: float  # [m] of the piston's position
+    target_speed: float  # [m/s] mean speed of the target while the computed voltage will act
+    x: float  # [m] measured position from mid-stroke
+    p_A: float  # [Pa] measured pressures of the two chambers
     p_B: float
-    theta: float = 0.0
+    theta: float = 0.0  # [rad] measured angle of the motor
 
 
 #: Compiled function that reads a `Measured` at the address that a compiled control law receives.
@@ -35,18 +30,15 @@ measured_at = record_view(record_dtype(*Measured._fields))
 
 
 class CompiledLaw(NamedTuple):
-    """A controller's control law as machine code, with its memory at the start of a run.
+    """A controller's control law as machine code, with its memory at the start of a run."""
 
-    `address`: address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler.
-    It returns the voltage [V]; `measured` points to the fields of a `Measured` in their order. `memory` (n,):
-    parameters and state of the control law, which each call updates; memory[0] is the leakage flow [m^3/s] that the
-    controller compensates, or NaN if it reports none. `kept`: an object that must exist as long as the law, such as the
-    `CompiledLaw` that the law calls, or None.
-    """
-
+    #: Address of a function ``double law(double *memory, double *measured)``, from numba.cfunc or a C compiler. It
+    #: returns the voltage [V]; `measured` points to the fields of a `Measured` in their order.
     address: int
+    #: Parameters and state (n,) of the control law, which each call updates; memory[0] is the leakage flow [m^3/s] that
+    #: the controller compensates, or NaN if it reports none.
     memory: Array
-    kept: Any = None
+    kept: Any = None  # object that must exist as long as the law, such as the `CompiledLaw` that the law calls
 
 
 class Started:
@@ -66,10 +58,7 @@ class Started:
 
     @property
     def compensated(self) -> float:
-        """Leakage flow [m^3/s] compensated at the last sample.
-
-        Raises AttributeError if the controller reports none, so that it seems to have no such attribute (`Controller`).
-        """
+        """Leakage flow [m^3/s] compensated at the last sample; AttributeError if the controller reports none."""
         flow = float(self._law.memory[0])
         if math.isnan(flow):
             raise AttributeError("compensated")
@@ -81,14 +70,11 @@ LAW = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_void_p, ctypes.c_void_p)
 
 
 class _PythonLaw:
-    """A control law for compiled code (`law`), which calls the function `voltage` of a controller written in Python.
-
-    `raised`: the exception with which the controller failed, None if it has not.
-    """
+    """A control law for compiled code (`law`), which calls the function `voltage` of a controller written in Python."""
 
     def __init__(self, voltage: Callable[[Measured], float]) -> None:
         self._voltage, self._memory = voltage, np.full(1, math.nan)
-        self.raised: BaseException | None = None
+        self.raised: BaseException | None = None  # the exception with which the controller failed
         self._function = LAW(self._call_voltage)
         address = ctypes.cast(self._function, ctypes.c_void_p).value
         assert address is not None  # for the type checker
@@ -97,9 +83,7 @@ class _PythonLaw:
     def _call_voltage(self, _memory: int, measured: int) -> float:
         """Compute the controller's voltage [V] from the numbers of a `Measured` at the address `measured`.
 
-        The leakage flow that the controller compensates is stored in `self._memory[0]`, or NaN if it reports none. If
-        the controller raises an exception, it is stored in `self.raised`, and the result is NaN. `_memory`: address of
-        `self._memory`, not used.
+        The result is NaN if the controller raises an exception. `_memory`: address of `self._memory`, not used.
         """
         try:
             numbers = (ctypes.c_double * len(Measured._fields)).from_address(measured)
@@ -115,8 +99,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run; return its control law in the form that compiled code can call.
 
-    This is the controller's machine code or, if its method `compiled` is missing or returns None, a law that calls the
-    Python function of its method `start`.
+    This is the controller's machine code (`compiled`), or else a law that calls the Python function of `start`.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law

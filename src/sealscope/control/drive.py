@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,7 +12,7 @@ import numpy as np
 from sealscope.compiled import kernel, law, make_record, record_dtype
 from sealscope.errors import InputError
 from sealscope.parameters.circuit import check_circuit_property
-from sealscope.recordings.recording import Array
+from sealscope.recordings.channels import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -21,8 +20,7 @@ if TYPE_CHECKING:
 
 #: Smallest pressure drop across a valve over the supply pressure, to keep the voltage finite under any load.
 _MIN_VALVE_FRACTION = 0.1
-#: Gain by which a small voltage is increased until the overlap of the valve's edges is passed.
-_OVERLAP_GAIN = 4.0
+_OVERLAP_GAIN = 4.0  # gain by which a small voltage is increased until the overlap of the valve's edges is passed
 #: Parameters and filter state of `drive_voltage`: those of a pump's drive, then those of a servo valve (Q_N > 0).
 DRIVE = record_dtype(
     *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),
@@ -59,8 +57,7 @@ def drive_voltage(m: Any, flow: float, dp: float) -> float:
 def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) -> None:
     """Filter `values` (n,), which are constant between samples, by a first-order lag; write the result to `out` (n,).
 
-    out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-T/tau), with the sample
-    interval T and the lag's time constant tau.
+    out[0] = `state`, and out[k] = decay out[k-1] + (1 - decay) values[k-1]. `decay`: exp(-interval/time constant).
     """
     for sample in range(values.size):
         out[sample] = state
@@ -68,56 +65,28 @@ def filter_lag(values: np.ndarray, decay: float, state: float, out: np.ndarray) 
 
 
 def check_numbers(what: str, source: object, positive: Sequence[str], not_negative: Sequence[str] = ()) -> None:
-    """Check that the named attributes of `source` are finite and > 0 (`positive`) or >= 0 (`not_negative`).
-
-    Raises InputError otherwise, with `what` as the name of `source`.
-    """
+    """Raise InputError unless attributes of `source`, called `what`, are finite and > 0 or, if `not_negative`, >= 0."""
     for name in (*positive, *not_negative):
         value = getattr(source, name)
         if not (math.isfinite(value) and (value > 0 or (value == 0 and name in not_negative))):
             raise InputError(f"{name} of {what} must be {'>' if name in positive else '>='} 0, got {value}")
 
 
-class _Invertible(ABC):
-    """A model of a drive from which the voltage for a flow can be computed (`drive_voltage`)."""
-
-    @abstractmethod
-    def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the drive's parameters in the form that `drive_voltage` takes, a record (1,) `DRIVE`.
-
-        `rate` [Hz]: sampling rate of the controller, which a valve ignores; `dead_volts` [V]: largest voltage that is
-        added to pass the overlap of a servo valve's edges, which a pump's drive ignores.
-        """
-
-    def inverse(self, rate: float) -> Callable[[float, float], float]:
-        """Build a function that computes the voltage [V] for a flow [m^3/s] at p_A - p_B [Pa].
-
-        The function must be called once per sample, `rate` [Hz] times a second: each call advances the high-pass filter
-        of a pump's drive by one sample.
-        """
-        (coefficients,) = self.coefficients(rate)
-        return lambda flow, dp: float(drive_voltage(coefficients, flow, dp))
-
-
 @dataclass(frozen=True)
-class Drive(_Invertible):
+class Drive:
     """A controller's model of a pump and of the motor that drives it under speed control.
 
     Without the winding's inductance, the thesis's eqs. (4.3) and (4.4) are k_p (omega_d - omega) + K_i integral of
     (omega_d - omega) dt = C_e omega + R_c i. Here omega_d is the commanded speed, omega the speed, and i = D dp/C_m the
     current, whose torque balances the pressure difference dp = p_A - p_B. Solved for the commanded speed: omega_d =
     omega + (C_e/k_p) s/(s + K_i/k_p) (omega + R_c D dp/(C_m C_e)).
-
-    `displacement` [m^3/rad]: D; `omega_per_volt` [rad/(s V)]: commanded speed over voltage; `shortfall`: C_e/k_p, by
-    which the speed falls short of a quickly changing command, relative to the speed; `corner` [1/s]: K_i/k_p, above
-    which a change is quick; `droop` [rad/(s Pa)]: R_c D/(C_m C_e), speed lost per dp at a constant motor voltage.
     """
 
-    displacement: float
-    omega_per_volt: float
-    shortfall: float
-    corner: float
-    droop: float
+    displacement: float  # [m^3/rad] D
+    omega_per_volt: float  # [rad/(s V)] commanded speed over voltage
+    shortfall: float  # C_e/k_p, by which the speed falls short of a quickly changing command, relative to the speed
+    corner: float  # [1/s] K_i/k_p, above which a change is quick
+    droop: float  # [rad/(s Pa)] R_c D/(C_m C_e), speed lost per dp at a constant motor voltage
 
     def __post_init__(self) -> None:
         not_negative = ("shortfall", "corner", "droop")
@@ -142,51 +111,49 @@ class Drive(_Invertible):
         """Time constant [s] of the motor's speed loop, (1 + shortfall)/corner; infinite if `corner` is 0."""
         return (1.0 + self.shortfall) / self.corner if self.corner > 0.0 else math.inf
 
+    @property
+    def flow_per_volt(self) -> float:
+        """Pump's flow over a constant voltage [m^3/(s V)], if the motor turns at its commanded speed."""
+        return self.omega_per_volt * self.displacement
+
     @staticmethod
     def mean_pressure(rig: Rig) -> float:
         """Return the mean pressure [Pa] of a rig's chambers at standstill: the charge pressure."""
         return rig.fluid.p_charge
 
-    def flow(self, u: Array, dp: Array, rate: float) -> Array:
-        """Compute the pump's flow (n,) [m^3/s] for voltages `u` (n,) [V] against `dp` = p_A - p_B (n,) [Pa].
+    def speed(self, u: Array, dp: Array, rate: float) -> Array:
+        """Compute the pump's speed (n,) [rad/s] for voltages `u` (n,) [V] against `dp` = p_A - p_B (n,) [Pa].
 
-        `rate` [Hz]: sampling rate of both. The motor's speed is omega = (omega_d + shortfall (y - droop dp))/(1 +
-        shortfall), with the commanded speed omega_d. The signal y is omega_d + droop dp after a first-order lag with
-        the time constant `lag` (`filter_lag`). The run begins at standstill under the first dp.
+        `rate` [Hz]: sampling rate of both. The speed is omega = (omega_d + shortfall (y - droop dp))/(1 + shortfall),
+        with the commanded speed omega_d. The signal y is omega_d + droop dp after a first-order lag with the time
+        constant `lag`. The run begins at standstill under the first dp.
         """
         omega_d, droop_speed = self.omega_per_volt * u, self.droop * dp
-        lag_input, y = omega_d + droop_speed, np.empty_like(omega_d)
-        filter_lag(lag_input, math.exp(-1.0 / (self.lag * rate)), float(droop_speed[0]), y)
-        omega = (omega_d + self.shortfall * (y - droop_speed)) / (1.0 + self.shortfall)
-        return np.asarray(self.displacement * omega)
+        y = np.empty_like(omega_d)
+        filter_lag(omega_d + droop_speed, math.exp(-1.0 / (self.lag * rate)), float(droop_speed[0]), y)
+        return np.asarray((omega_d + self.shortfall * (y - droop_speed)) / (1.0 + self.shortfall))
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of a pump's drive for `drive_voltage`, called at `rate` [Hz]; ignore `dead_volts`."""
+        """Make the parameters for `drive_voltage`, a record (1,) `DRIVE`; it is called at `rate` [Hz].
+
+        `dead_volts` is for `ValveDrive` alone.
+        """
         return make_record(DRIVE, self, decay=math.exp(-self.corner / rate))
-
-    def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] for a constant `flow` [m^3/s] if the motor turns at its commanded speed."""
-        return flow / self.displacement / self.omega_per_volt
-
-    def unloaded_flow(self, u: float) -> float:
-        """Compute the pump's flow [m^3/s] at a constant voltage `u` [V] without load."""
-        return u * self.omega_per_volt * self.displacement
 
 
 @dataclass(frozen=True)
-class ValveDrive(_Invertible):
+class ValveDrive:
     """A controller's model of a servo valve and its supply.
 
     The flow is Q = Q_N (u/u_N) sqrt((p_s - sign(Q) dp)/(2 dp_N)): the two open edges are equal, and half of the
     pressure drops across each (Merritt, Hydraulic Control Systems, 1967, section 5.2). The spool follows the command
-    without delay. `Q_N` [m^3/s]: flow at the voltage `u_N` [V] and the pressure drop `dp_N` [Pa] across each edge;
-    `p_s` [Pa]: supply pressure above that of the return.
+    without delay.
     """
 
-    Q_N: float
-    dp_N: float
-    u_N: float
-    p_s: float
+    Q_N: float  # [m^3/s] flow at the voltage u_N and the pressure drop dp_N
+    dp_N: float  # [Pa] across each edge
+    u_N: float  # [V]
+    p_s: float  # [Pa] supply pressure above that of the return
 
     def __post_init__(self) -> None:
         check_numbers("the valve", self, positive=("Q_N", "dp_N", "u_N", "p_s"))
@@ -200,25 +167,21 @@ class ValveDrive(_Invertible):
         p_s = supply.p_set + pump_flow / supply.G_set  # while the whole pump flow passes the supply's relief valve
         return cls(valve.Q_N, valve.dp_N, valve.u_N, p_s)
 
+    @property
+    def flow_per_volt(self) -> float:
+        """Valve's flow over a constant voltage [m^3/(s V)] without load."""
+        return self.Q_N * math.sqrt(0.5 * self.p_s / self.dp_N) / self.u_N
+
     def mean_pressure(self, rig: Rig) -> float:
         """Compute the mean pressure [Pa] of a rig's chambers at standstill: the mean of supply and return."""
         return 0.5 * (self.p_s + 2.0 * rig.supply.p_return)  # the supply is at p_s + p_return
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters of a servo valve for `drive_voltage`; ignore `rate`.
+        """Make the parameters for `drive_voltage`, a record (1,) `DRIVE`; `rate` is for `Drive` alone.
 
         `dead_volts` [V]: largest voltage that is added to pass the overlap of the valve's edges.
         """
         return make_record(DRIVE, self, dead_volts=dead_volts)
-
-    def steady_voltage(self, flow: float) -> float:
-        """Compute the voltage [V] at which the servo valve delivers a constant `flow` [m^3/s] without load."""
-        voltage_for = self.inverse(rate=1.0)  # any rate: a valve's model has no filter
-        return voltage_for(flow, 0.0)  # p_A - p_B = 0
-
-    def unloaded_flow(self, u: float) -> float:
-        """Compute the servo valve's flow [m^3/s] at a constant voltage `u` [V] without load."""
-        return u / self.steady_voltage(flow=1.0)  # flow and voltage are proportional, so any flow will do
 
 
 def drive_of(rig: Rig) -> Drive | ValveDrive:

@@ -12,23 +12,21 @@ import numpy as np
 from sealscope.compiled import address_of, call_at, entry, make_record, record_dtype, record_view
 from sealscope.control.controller import CompiledLaw, Controller, Measured, Started, measured_at, start_law
 from sealscope.control.drive import DRIVE, Drive, check_numbers, drive_voltage
-from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, conductance, make_observer, update_observer
+from sealscope.control.leak_observer import OBSERVER, SHUT, Balance, make_observer, update_observer
 from sealscope.control.position import PositionPI
 from sealscope.parameters.circuit import check_circuit_property
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of the pressures that drive the leak.
-_PRESSURE_LAG = 0.005
+_PRESSURE_LAG = 0.005  # time constant [s] of the average of the pressures that drive the leak
 #: Time constant [s] by which a changed estimate enters the control law, so that the inner integral can follow.
 _BLEND = 0.5
 #: A leak is compensated once its estimate exceeds this many standard errors, until the estimate is below half of them.
 _SIGNIFICANT_SDS = 4.0
 #: The leak must also move the piston by this many encoder counts a second: a slower motion cannot be measured.
 _RESOLVED_COUNTS = 0.5
-#: Number of blocks that the observer must have used before a leak is compensated.
-_MIN_BLOCKS = 4
+_MIN_BLOCKS = 4  # number of blocks that the observer must have used before a leak is compensated
 #: Conductance [m^3/(s Pa)] below which a former leak counts as 0: the voltages are the inner controller's again.
 _NEGLIGIBLE_G = 1e-18
 #: State and parameters of the control law. `inner`, `inner_memory`: addresses of the inner controller's law and memory;
@@ -61,10 +59,9 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
     if m.is_known == 0.0:  # the leak's conductance is estimated
         observer = m.observer
         update_observer(observer, measured.theta, measured.x, measured.p_A, measured.p_B)
-        G, sd, n_blocks = conductance(observer)
-        excess_G = G - m.G_assumed
+        excess_G, sd = observer.state[0] - m.G_assumed, math.sqrt(observer.P[0, 0])
         target_G = 0.0
-        if n_blocks >= _MIN_BLOCKS:
+        if observer.n_blocks >= _MIN_BLOCKS:
             # the largest leak whose motion of the piston the encoder does not resolve; 1 Pa: no division by 0
             unresolved_flow = _RESOLVED_COUNTS * observer.x_step * min(observer.area_A, observer.area_B)
             unresolved_G = unresolved_flow / max(abs(mean_dp), 1.0)
@@ -89,21 +86,20 @@ class FaultTolerant:
 
     The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp.
     Here dp is p_A - p_B, averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
-    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`, the assumed
-    leakage conductance of the pump. G stays 0 until this difference exceeds 4 standard errors and the leak would move
-    the piston by half an encoder count a second. Without a leak the voltages are therefore exactly those of `inner`.
-    The voltage is limited to +-`u_max` [V] while a leak is compensated.
-
-    `known` >= 0 [m^3/(s Pa)], if not None, is taken as G instead of an estimate: an ideal controller that knows the
-    leak. The compensated flow [m^3/s] is reported as `compensated`.
+    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`. G stays 0 until
+    this difference exceeds 4 standard errors and the leak would move the piston by half an encoder count a second.
+    Without a leak the voltages are therefore exactly those of `inner`. The compensated flow [m^3/s] is reported as
+    `compensated`.
     """
 
     inner: Controller
     drive: Drive
     balance: Balance
-    u_max: float
-    G_assumed: float = 0.0
-    known: float | None = None
+    u_max: float  # [V] limit of the voltage while a leak is compensated
+    G_assumed: float = 0.0  # [m^3/(s Pa)] assumed leakage conductance of the pump
+    known: float | None = (
+        None  # [m^3/(s Pa)] taken as G, by an ideal controller that knows the leak; None to estimate G
+    )
 
     def __post_init__(self) -> None:
         not_negative = ("G_assumed",) if self.known is None else ("G_assumed", "known")

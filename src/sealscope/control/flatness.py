@@ -18,8 +18,7 @@ from sealscope.physics.friction import coulomb_friction
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of the load.
-_LOAD_LAG = 0.1
+_LOAD_LAG = 0.1  # time constant [s] of the average of the load
 #: Change of the target's speed within a sample, relative to `v_max`, from which on it is a jump and no acceleration.
 _MAX_SPEED_CHANGE = 0.1
 #: State and parameters of the control law; `v`, `dp`: values of the last sample; `load`: averaged load [N].
@@ -35,10 +34,9 @@ _memory_at = record_view(_MEMORY)
 def _flatness_law(memory: Any, sample: Any) -> Any:
     """Compute the voltage [V] of a sample: feedback plus feed-forward by the equations of `Flatness`, within +-u_max.
 
-    The feed-forward is the voltage at which the drive delivers the flow G dp + C d(dp)/dt against the pressure
-    difference dp that the load and the target's speed v and acceleration a require. At the first sample a and d(dp)/dt
-    are 0. A target that is faster than `v_max` jumps; v is then taken as 0. `memory`, `sample`: addresses of a record
-    `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    The feed-forward is the voltage for the flow G dp + C d(dp)/dt against the pressure difference dp that the load and
+    the target's speed v and acceleration a require. `memory`, `sample`: addresses of a record `_MEMORY`, which is
+    updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     feedback, is_first = m.feedback, m.is_first > 0.0
@@ -72,22 +70,20 @@ class Flatness:
     the pump's leakage G dp, the compression C d(dp)/dt of the oil, and the speed that the drive loses under dp.
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
-    averaged over time. `M` [kg], `F_C` [N], `F_v` [N s/m], `v_th` [m/s], `G` [m^3/(s Pa)] and `C` = V/(2 K) [m^3/Pa]
-    are assumed; V is the volume of a chamber, which takes half of a change of dp, and K the bulk modulus of the oil. A
-    speed of the target above `v_max` [m/s] is taken as a jump, to which only `feedback` responds.
+    averaged over time. A speed of the target above `v_max` is taken as a jump, to which only `feedback` responds.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """
 
     feedback: PositionPI
     drive: Drive | ValveDrive
-    M: float
-    F_C: float
-    F_v: float
-    v_th: float
-    G: float
-    C: float
-    v_max: float
+    M: float  # [kg]
+    F_C: float  # [N]
+    F_v: float  # [N s/m]
+    v_th: float  # [m/s]
+    G: float  # [m^3/(s Pa)]
+    C: float  # [m^3/Pa] V/(2 K): the volume V of a chamber takes half of a change of dp; K: bulk modulus of the oil
+    v_max: float  # [m/s]
 
     def __post_init__(self) -> None:
         not_negative = ("M", "F_C", "F_v", "G", "C")
@@ -98,7 +94,6 @@ class Flatness:
         """Build the controller from a rig's parameters, for its pump or servo valve."""
         cylinder, friction, drive = rig.cylinder, rig.friction, drive_of(rig)
         pressure, of_difference = drive.mean_pressure(rig), friction.coulomb_pressure == "difference"
-        max_speed = drive.unloaded_flow(rig.daq.u_max) / min(cylinder.A_A, cylinder.A_B)
         return cls(
             feedback=PositionPI.from_rig(rig),
             drive=drive,
@@ -109,7 +104,7 @@ class Flatness:
             # behind a valve the pump's leakage does not connect the chambers
             G=rig.pump.G_pump if rig.circuit.pump_feeds_chambers else 0.0,
             C=cylinder.V / (2.0 * rig.fluid.K_oil),
-            v_max=max_speed,
+            v_max=drive.flow_per_volt * rig.daq.u_max / min(cylinder.A_A, cylinder.A_B),
         )
 
     @property

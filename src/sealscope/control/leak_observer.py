@@ -10,12 +10,9 @@ import numpy as np
 
 from sealscope.compiled import law, make_record, record_dtype
 
-#: Length of a block [s] over which volumes are balanced.
-BLOCK = 0.5
-#: Blocks with a smaller mean pressure difference [Pa] are not used.
-MIN_DP = 20e3
-#: A pilot-operated valve counts as shut above this multiple of the sum of its cracking and opening pressures.
-SHUT = 2.0
+BLOCK = 0.5  # length of a block [s] over which volumes are balanced
+MIN_DP = 20e3  # blocks with a smaller mean pressure difference [Pa] are not used
+SHUT = 2.0  # a pilot-operated valve counts as shut above this multiple of the sum of its cracking and opening pressures
 #: Prior standard deviations: of the compliance and the area (relative), and of the conductance [m^3/(s Pa)].
 _SD_C, _SD_AREA, _SD_G = 0.3, 0.01, 1e-11
 #: Standard deviations of the model's errors in a block, relative to the compressed and to the swept volume.
@@ -27,12 +24,12 @@ _WALK, _RELATIVE_WALK = 1e-15, 0.03
 #: A block with an innovation above this many standard deviations is left out as an outlier. If the next block is an
 #: outlier with the same sign, a leak has opened suddenly.
 _OUTLIER_SDS = 4.0
-#: Time constant [s] of the average of all four signals.
-_LAG = 0.01
+_LAG = 0.01  # time constant [s] of the average of all four signals
 #: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
 #: rotation within the block in either direction [rad]; `outlier_G`: change of conductance that the last tested block
 #: implies if it is an outlier, else 0; `means`: averages of angle, position, p_A and p_B up to now; `begin`: these
-#: averages when the block began; `state`: conductance, relative errors of 1/K and of the area; `P`: its covariance.
+#: averages when the block began; `state`: conductance [m^3/(s Pa)], relative errors of 1/K and of the area; `P`: its
+#: covariance; `n_blocks`: number of blocks used.
 OBSERVER = record_dtype(
     *("D", "area_A", "area_B", "V_A", "V_B", "K", "x_step", "noise", "shut", "rate", "length", "lag_gain"),
     *("count", "sum_dp", "min_dp", "max_dp", "turned_forward", "turned_back", "outlier_G", "n_blocks"),
@@ -140,41 +137,25 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     m.n_blocks += 1.0
 
 
-@law
-def conductance(m: Any) -> tuple[float, float, float]:
-    """Return the estimated conductance and its standard error [m^3/(s Pa)], and the number of blocks used.
-
-    `m`: record `OBSERVER`, the memory of the observer.
-    """
-    return m.state[0], math.sqrt(m.P[0, 0]), m.n_blocks
-
-
 @dataclass(frozen=True)
 class Balance:
-    """The leak observer's model of the machine, from which it computes the volume balance of a chamber.
+    """The leak observer's model of the machine, from which it computes the volume balance of a chamber."""
 
-    `D` [m^3/rad]: displacement of the pump; `area_A`, `area_B` [m^2]: piston areas; `V_A`, `V_B` [m^3]: volumes of the
-    chambers at mid-stroke; `K` [Pa]: bulk modulus of the oil; `x_step` [m]: position change of one encoder count;
-    `noise` [Pa]: standard deviation of a pressure sample; `shut` [Pa]: |p_A - p_B| above which the pilot-operated check
-    valve of the chamber with the higher pressure is shut, 0 without such valves.
-    """
-
-    D: float
-    area_A: float
+    D: float  # [m^3/rad] displacement of the pump
+    area_A: float  # [m^2] piston areas
     area_B: float
-    V_A: float
+    V_A: float  # [m^3] volumes of the chambers at mid-stroke
     V_B: float
-    K: float
-    x_step: float
-    noise: float
+    K: float  # [Pa] bulk modulus of the oil
+    x_step: float  # [m] position change of one encoder count
+    noise: float  # [Pa] standard deviation of a pressure sample
+    #: |p_A - p_B| [Pa] above which the pilot-operated check valve of the chamber with the higher pressure is shut; 0
+    #: without such valves.
     shut: float = 0.0
 
 
 def make_observer(balance: Balance, rate: float) -> Any:
-    """Make the memory of a leak observer before its first sample, a record (1,) of the type `OBSERVER`.
-
-    `balance`: model of the machine, whose parameters the memory contains; `rate` [Hz]: sampling rate.
-    """
+    """Make the memory of a leak observer that samples at `rate` [Hz], a record (1,) `OBSERVER`."""
     return make_record(
         OBSERVER,
         balance,

@@ -12,21 +12,18 @@ from numpy.typing import NDArray
 from sealscope.control.controller import Controller, Measured
 from sealscope.control.drive import drive_of
 from sealscope.errors import InputError
+from sealscope.recordings.channels import Array
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-Array = NDArray[np.float64]
-#: Duration [s] of a controller's impulse response.
-_RESPONSE_DURATION = 60.0
+_RESPONSE_DURATION = 60.0  # duration [s] of a controller's impulse response
 #: Sizes of the impulses of position [m] (above the built-in controllers' default dead bands), pressure [Pa] and angle
 #: [rad].
 _IMPULSE_X, _IMPULSE_P, _IMPULSE_THETA = 1e-3, 1e4, 1.0
-#: Time [s] in which a moving piston settles before the rig is linearised.
-_SETTLING = 0.5
+_SETTLING = 0.5  # time [s] in which a moving piston settles before the rig is linearised
 _N_FREQUENCIES = 4000
-#: Samples of an impulse response that are summed at once.
-_BLOCK = 64
+_BLOCK = 64  # samples of an impulse response that are summed at once
 #: Steps of the voltage [V], and of each state [SI] in the order of `STATES`, for the finite differences.
 _VOLTAGE_STEP = 1e-3
 _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e-9, 1e-7, 1e-4)
@@ -36,21 +33,17 @@ _STATE_STEPS = (1e-3, 1e-3, 1e-2, 1e-3, 1e-6, 1e-6, 1e2, 1e2, 1e2, 1e2, 1e-9, 1e
 class Margins:
     """Stability margins of a control loop with the open-loop response L, at one speed of the piston.
 
-    `speed` [m/s]: speed of the piston; `gain`: factor by which the loop's gain may grow, inf if unlimited; `phase`
-    [rad]: smallest distance of arg L from -pi where |L| = 1; `crossover` [Hz]: highest frequency at which |L| = 1;
-    `delay` [s]: smallest additional delay at which the loop becomes unstable; `peak`: largest sensitivity 1/|1 + L|;
-    `damped`: True if the rig without controller is stable. If |L| is never 1, phase and delay are inf, and crossover is
-    0. The rig may be unstable in slow strokes, where friction falls with speed; the margins then do not prove that the
+    The rig may be unstable in slow strokes, where friction falls with speed; the margins then do not prove that the
     loop is stable.
     """
 
-    speed: float
-    gain: float
-    phase: float
-    crossover: float
-    delay: float
-    peak: float
-    damped: bool
+    speed: float  # [m/s] of the piston
+    gain: float  # factor by which the loop's gain may grow, inf if unlimited
+    phase: float  # [rad] smallest distance of arg L from -pi where |L| = 1; inf if |L| is never 1
+    crossover: float  # [Hz] highest frequency at which |L| = 1; 0 if there is none
+    delay: float  # [s] smallest additional delay at which the loop becomes unstable; inf if |L| is never 1
+    peak: float  # largest sensitivity 1/|1 + L|
+    damped: bool  # True if the rig without controller is stable
 
 
 def margins(rig: Rig, controller: Controller, speed: float = 0.0, load: float = 0.0) -> Margins:
@@ -142,7 +135,7 @@ def _linearise(rig: Rig, rate: float, speed: float, load: float) -> tuple[Array,
             return last_state, float(last_state[POSITION] - first_state[POSITION]) * rate / samples
 
         _, drift_speed = find_moving_state(0.0)  # the load may move the piston at 0 V
-        next_u = drive_of(rig).steady_voltage(speed * rig.cylinder.A_A)  # a first guess
+        next_u = speed * rig.cylinder.A_A / drive_of(rig).flow_per_volt  # a first guess
         for _ in range(5):  # adjust the voltage to the stated speed: the drive falls short of its command
             u = min(max(next_u, -limit), limit)
             state, mean_speed = find_moving_state(u)

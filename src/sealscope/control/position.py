@@ -16,8 +16,7 @@ from sealscope.control.drive import DRIVE, Drive, ValveDrive, check_numbers, dri
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load.
-_PRESSURE_LAG = 0.02
+_PRESSURE_LAG = 0.02  # time constant [s] of the average of p_A - p_B, whose sign tells which side carries the load
 #: State and parameters of the control law: `integral` is k_i times the integral of the error [m/s], `dp` the averaged
 #: p_A - p_B [Pa].
 FOLLOWING = record_dtype(
@@ -31,10 +30,7 @@ _memory_at = record_view(FOLLOWING)
 def following_voltage(m: Any, measured: Any) -> float:
     """Compute the voltage [V] of a sample by PI control with velocity feed-forward (`PositionPI`), within +-u_max.
 
-    At this voltage the drive delivers the flow A v_c. A is the piston area of the chamber with the higher pressure. The
-    commanded velocity is v_c = v_target + k_v e + k_i integral of e dt, with the target's speed v_target and the error
-    e = target - x. `m`: a record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a
-    `Measured`.
+    `m`: a record `FOLLOWING`, whose integral and averaged p_A - p_B are updated; `measured`: a `Measured`.
     """
     m.dp += m.pressure_gain * (measured.p_A - measured.p_B - m.dp)
     error = measured.target - measured.x
@@ -62,27 +58,23 @@ class PositionPI:
     pressure, which carries the load. For a pump the load is neglected: the commanded speed of the motor is omega_d =
     omega_c + (C_e/k_p) s/(s + K_i/k_p) omega_c, where omega_c is the speed for the flow. This inverts the speed loop
     omega/omega_d = (k_p s + K_i)/((k_p + C_e) s + K_i), eqs. (4.2)-(4.4) of the thesis. For a servo valve the voltage
-    depends on the measured pressure difference. Small voltages are increased by up to `dead_volts` [V] to pass the
-    overlap of the valve's edges.
+    depends on the measured pressure difference. Small voltages are increased by up to `dead_volts` to pass the overlap
+    of the valve's edges.
 
-    The integral is frozen within `dead_band` [m] of the target, where it would oscillate against static friction or
-    between two encoder counts. It is also frozen while the voltage is at its limit `u_max` [V], unless the error has
-    the opposite sign.
-
-    `rate` [Hz]: sampling rate; `delay`: whole samples from a measurement to the voltage computed from it; `k_v` [1/s]
-    and `k_i` [1/s^2]: gains; `area_A`, `area_B` [m^2]: piston areas of the two chambers.
+    The integral is frozen within `dead_band` of the target, where it would oscillate against static friction or between
+    two encoder counts. It is also frozen while the voltage is at its limit, unless the error has the opposite sign.
     """
 
-    area_A: float
+    area_A: float  # [m^2] piston areas of the two chambers
     area_B: float
     drive: Drive | ValveDrive
-    u_max: float
-    dead_volts: float = 0.0
-    k_v: float = 12.0
-    k_i: float = 24.0
-    dead_band: float = 30e-6
-    rate: float = 500.0
-    delay: int = 1
+    u_max: float  # [V] limit of the voltage
+    dead_volts: float = 0.0  # [V]
+    k_v: float = 12.0  # [1/s]
+    k_i: float = 24.0  # [1/s^2]
+    dead_band: float = 30e-6  # [m]
+    rate: float = 500.0  # [Hz] sampling rate
+    delay: int = 1  # whole samples from a measurement to the voltage computed from it
 
     def __post_init__(self) -> None:
         not_negative = ("dead_volts", "k_v", "k_i", "dead_band", "delay")

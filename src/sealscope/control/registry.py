@@ -33,8 +33,6 @@ CONTROLLERS: Mapping[str, Callable[[Rig], Controller]] = {
     "fault-tolerant": FaultTolerant.from_rig,
     "fault-tolerant-flatness": lambda rig: FaultTolerant.from_rig(rig, Flatness.from_rig(rig)),
 }
-
-
 #: Group of the entry points by which distributions install controllers.
 GROUP = "sealscope.controllers"
 
@@ -51,10 +49,7 @@ def is_installed(name: str) -> bool:
 
 
 def check_controller_name(name: str) -> None:
-    """Raise InputError unless `name` is a known controller, or has the form ``MODULE:NAME`` or ``FILE.py:NAME``.
-
-    Whether such a module or file exists is not checked.
-    """
+    """Raise InputError unless `name` is a known controller, or has the form ``MODULE:NAME`` or ``FILE.py:NAME``."""
     module_or_file, _, attribute = name.rpartition(":")
     if not is_installed(name) and not (module_or_file and attribute):
         names = (*CONTROLLERS, *_installed())
@@ -70,13 +65,6 @@ def controller_named(name: str, rig: Rig) -> Controller:
     `name`: a built-in or installed controller, or ``MODULE:NAME`` or ``FILE.py:NAME`` of a class or function. A class
     with a method `from_rig` makes the controller by this method; any other class or function is called with the rig.
     Raises InputError for an unknown name, for code that fails, and for a controller without `rate`, `delay` or `start`.
-
-    Examples
-    --------
-    >>> import sealscope as ss
-    >>> from sealscope.control import controller_named
-    >>> controller_named("pi", ss.load_rig("thesis-closed-loop")).rate
-    500.0
     """
     if name in CONTROLLERS:
         return CONTROLLERS[name](rig)
@@ -99,10 +87,7 @@ def controller_named(name: str, rig: Rig) -> Controller:
 
 
 def find_controller_source(name: str) -> Path | None:
-    """Find the source file of a controller without importing it; return None for a built-in one.
-
-    Raises InputError for an unknown name, and if the file does not exist.
-    """
+    """Find a controller's source file without importing it; None for a built-in one, InputError if there is none."""
     if name in CONTROLLERS:
         return None
     check_controller_name(name)

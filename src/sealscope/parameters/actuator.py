@@ -41,21 +41,15 @@ class Cylinder(Part):
     G_ext_B: float = conductance("leakage conductance of the rod seal of B")
 
     @property
-    def unevenness(self) -> float:
-        """Difference of the piston areas, divided by their mean; 0 if they are equal."""
-        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B))
-
-    @property
     def single_rod(self) -> bool:
         """True if the piston areas differ by more than makers' tolerances, 10 % of their mean."""
-        return self.unevenness > _MAX_DOUBLE_ROD_UNEVENNESS
+        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B)) > _MAX_DOUBLE_ROD_UNEVENNESS
 
 
 class Friction(Part):
     """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22) of the thesis.
 
-    `law` may instead select the law of Karnopp or of LuGre near standstill, which use the same Coulomb, Stribeck and
-    viscous forces while the piston slides.
+    `law` may select another law near standstill, which uses the same forces while the piston slides.
     """
 
     F_pr: float = quantity("preload force of the seals", "N", ge=0, le=1e7)

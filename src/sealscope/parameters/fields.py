@@ -6,9 +6,8 @@ parameter may declare the value that switches its law off (`absent`), which a fi
 
 from __future__ import annotations
 
-import typing
 from collections.abc import Iterator, Mapping
-from typing import Any, Self, get_args, get_origin
+from typing import Any, Literal, Self, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.fields import FieldInfo
@@ -53,8 +52,7 @@ def absent_of(field: FieldInfo) -> float | str | None:
 
 def choices_of(field: FieldInfo) -> tuple[str, ...]:
     """Return the options of a parameter that is a choice, () for a number."""
-    annotation = field.annotation
-    return get_args(annotation) if get_origin(annotation) is typing.Literal else ()
+    return get_args(field.annotation) if get_origin(field.annotation) is Literal else ()
 
 
 def with_unit(number: float, unit: str) -> str:
@@ -63,10 +61,9 @@ def with_unit(number: float, unit: str) -> str:
 
 
 def format_broken_rule(error: ValidationError, model: type[BaseModel]) -> str:
-    """Format a validation error of pydantic as a line "SYMBOL must be ..., got ...".
+    """Format a validation error of pydantic about the parameters of a class as a line "SYMBOL must be ..., got ...".
 
-    Of several errors, one about an unknown name is formatted if there is any, otherwise the first. `model`: the class,
-    such as `Pump`, whose parameters are invalid. If a bound is broken, the parameter's unit follows the bound.
+    Of several errors, one about an unknown name is formatted if there is any, otherwise the first.
     """
     first = error.errors(include_url=False)[0]
     symbol = ".".join(map(str, first["loc"]))

@@ -7,7 +7,6 @@ import os
 from collections.abc import Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
 
 from sealscope.calls import checked_call, suggestion
 from sealscope.errors import InputError
@@ -112,10 +111,9 @@ def _load_file(path: Path, place: str) -> Rig:
 
 
 def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -> None:
-    """Write a channel map into a rig's file, as its table `[map]`; an earlier map is replaced.
+    """Write the map `columns`, channel -> column, into a rig's file as its table `[map]`, in place of an earlier one.
 
-    `columns`: mapping from channel to column of the machine's logs. Raises InputError if `path` is not the file of a
-    rig or cannot be written; the file is then unchanged.
+    Raises InputError if `path` is not the file of a rig or cannot be written; the file is then unchanged.
     """
     if os.fspath(path) in rig_names():
         raise InputError(f"a map must be saved in your own rig's file (.toml), got the packaged rig {path}")
@@ -135,22 +133,16 @@ def save_channel_map(path: str | os.PathLike[str], columns: Mapping[str, str]) -
         _read_layers(temporary, os.fspath(path), visited=())  # raises if the result is not a rig's file
 
 
-class _RigFile(NamedTuple):
-    """Content of a rig's file, including the files that it extends."""
-
-    head: dict[str, str]  # its table `[rig]`
-    entries: dict[str, ParameterEntry]  # the parameters by dotted name
-    columns: dict[str, str]  # channel -> column of the machine's logs
-
-
-def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
+def _read_layers(
+    path: Path, place: str, visited: tuple[Path, ...]
+) -> tuple[dict[str, str], dict[str, ParameterEntry], dict[str, str]]:
     """Read a rig's file together with the files that it extends.
 
-    A parameter of the file replaces that of an extended file. A table `[map]` that is not empty replaces the whole map
-    of an extended file. If the file describes a commissioned machine, its tables `MACHINE_TABLES`, which are no part of
-    a rig, are left out. `place`: name of the file in messages; `visited`: the files that extend it, directly or
-    indirectly. Raises InputError for a wrong table or key, for files that extend each other in a circle, or for more
-    than `_MAX_LAYERS` files.
+    Returns its table `[rig]`, the parameters by dotted name, and the map from channel to column of the machine's logs.
+    A parameter of the file replaces that of an extended file, and a table `[map]` that is not empty the whole map. The
+    tables `MACHINE_TABLES` of a commissioned machine are left out. `place`: name of the file in messages; `visited`:
+    the files that extend it, directly or indirectly. Raises InputError for a wrong table or key, and for files that
+    extend each other in a circle, or more than `_MAX_LAYERS` deep.
     """
     file = path.resolve()
     if file in visited or len(visited) >= _MAX_LAYERS:
@@ -188,4 +180,4 @@ def _read_layers(path: Path, place: str, visited: tuple[Path, ...]) -> _RigFile:
         raise InputError(
             f"extends must be a packaged rig ({', '.join(rig_names())}) or a .toml file, got {base!r} ({place})"
         )
-    return _RigFile(rig_table, entries | flatten_entries(tree.items(), place), channel_map or columns)
+    return rig_table, entries | flatten_entries(tree.items(), place), channel_map or columns

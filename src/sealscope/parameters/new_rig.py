@@ -11,14 +11,11 @@ from sealscope.parameters.load import load_rig
 from sealscope.parameters.rig import GAS_OVER_ROD, Rig
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
-#: Dead volume of each side, divided by the larger swept volume.
-_DEAD_VOLUME_RATIO = 0.25
-#: Speed of a supply's pump [rev/s].
-_SUPPLY_SPEED = 25.0
+_DEAD_VOLUME_RATIO = 0.25  # dead volume of each side, divided by the larger swept volume
+_SUPPLY_SPEED = 25.0  # speed of a supply's pump [rev/s]
 #: Pressure [Pa] above the setting of a supply's relief valve at which the valve passes the pump's whole flow.
 _RELIEF_RANGE = 2.5e5
-#: Precharge pressure of a supply's accumulator, divided by the setting of the relief valve.
-_PRECHARGE_RATIO = 0.7
+_PRECHARGE_RATIO = 0.7  # precharge pressure of a supply's accumulator, divided by the setting of the relief valve
 _STATED = "stated when this file was written: replace by drawing or data sheet"
 
 
@@ -36,22 +33,10 @@ def piston_areas(bore: float, rod: float, *, double_rod: bool = False) -> tuple[
 def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacement: float) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by its pump.
 
-    All other parameters are taken from the rig `thesis` if the areas are equal, else from `single-rod-eha`. Some of
-    them are scaled to the machine's size, such as friction with the bore or area, and the moving mass with the volume.
-    A table `[makeup]`, for the oil that the rod displaces, is written only if the areas differ.
-
-    Parameters
-    ----------
-    name : str
-        Name of the rig.
-    area_A, area_B, stroke, displacement : float
-        Piston areas [m^2], stroke [m], and displacement of the pump [m^3/rev].
-
-    Raises
-    ------
-    InputError
-        A number is not finite and > 0, or the name is blank or contains a character other than a letter, a digit,
-        `-`, `_` or a blank.
+    `area_A`, `area_B` [m^2]: piston areas; `stroke` [m]; `displacement` [m^3/rev] of the pump. All other parameters are
+    taken from the rig `thesis` if the areas are equal, else from `single-rod-eha`. Some of them are scaled to the
+    machine's size, such as friction with the bore or area, and the moving mass with the volume. A table `[makeup]`, for
+    the oil that the rod displaces, is written only if the areas differ. Raises InputError as `_check_arguments` does.
     """
     _check_arguments(name, {"area-A": area_A, "area-B": area_B, "stroke": stroke, "displacement": displacement})
     is_single_rod = area_A != area_B
@@ -80,24 +65,10 @@ def valve_rig_text(
 ) -> str:
     """Format a new rig's TOML file, with comments, for a cylinder that is controlled by a servo valve.
 
-    All other parameters are taken from the rig `servo-valve`; some of them are scaled to the machine's size.
-
-    Parameters
-    ----------
-    name : str
-        Name of the rig.
-    area_A, area_B, stroke, rated_flow : float
-        Piston areas [m^2], stroke [m], and rated flow of the valve [m^3/s].
-    rated_drop : float, optional
-        Pressure drop of one edge at the rated flow [Pa]; by default that of a servo valve, 35 bar.
-    pressure : float, optional
-        Pressure of the supply above the return [Pa]; by default that of `servo-valve`.
-
-    Raises
-    ------
-    InputError
-        A number is not finite and > 0, or the name is blank or contains a character other than a letter, a digit,
-        `-`, `_` or a blank.
+    `area_A`, `area_B` [m^2]: piston areas; `stroke` [m]; `rated_flow` [m^3/s]: flow of the valve at the pressure drop
+    `rated_drop` [Pa] of one edge, by default 35 bar; `pressure` [Pa]: that of the supply above the return, by default
+    as in the rig `servo-valve`. All other parameters are taken from this rig; some of them are scaled to the machine's
+    size. Raises InputError as `_check_arguments` does.
     """
     base = load_rig("servo-valve")
     drop = base.valve.dp_N if rated_drop is None else rated_drop
@@ -152,10 +123,9 @@ def _cylinder_parameters(base: Rig, area_A: float, area_B: float, stroke: float)
     `area_A`, `area_B` [m^2] and `stroke` [m] are those of the new cylinder. In the texts, areas are in mm^2, lengths in
     mm, volumes in cm^3, and other values in SI units.
     """
-    volume_ratio = _volume_ratio(base, area_A, area_B, stroke)
+    friction, volume_ratio = base.friction, _volume_ratio(base, area_A, area_B, stroke)
     bore_ratio = math.sqrt(max(area_A, area_B) / max(base.cylinder.A_A, base.cylinder.A_B))
     mass = base.cylinder.M_eq * volume_ratio
-    friction = base.friction
     # V: volume of the larger side at half stroke; V_rod: volume that a rod on side B takes from side B at half stroke
     V_rod = max(0.5 * (area_A - area_B) * stroke, 0.0)
     return {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from operator import attrgetter
 from typing import Any, NamedTuple, Self, TypeVar
@@ -19,7 +19,6 @@ from sealscope.parameters.circuit import CIRCUITS, HydraulicCircuit
 from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.names import resolve_name
 from sealscope.parameters.valve import ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
@@ -27,8 +26,16 @@ Value = float | int | str
 P = TypeVar("P", bound=Part)
 #: Prefix of the source of a value that is not stated for this machine.
 ASSUMED = "assumed:"
-#: Volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke.
-GAS_OVER_ROD = 5.0
+GAS_OVER_ROD = 5.0  # volume of an accumulator's gas, divided by that of the oil that the rod displaces in a stroke
+#: Names of parameters in textbooks and other programs, in lower case and without underscores.
+_OTHER_NAMES = {
+    **dict.fromkeys(("beta", "betae", "bulkmodulus"), "fluid.K_oil"),
+    **dict.fromkeys(("ap", "area", "pistonarea"), "cylinder.A_A"),
+    **dict.fromkeys(("m", "mass"), "cylinder.M_eq"),
+    **dict.fromkeys(("dp", "displacement"), "pump.q_b"),
+    **dict.fromkeys(("kt", "torqueconstant"), "motor.C_m"),
+    **dict.fromkeys(("stroke", "strokelength"), "cylinder.L"),
+}
 
 
 class ParameterEntry(NamedTuple):
@@ -45,17 +52,14 @@ class ParameterEntry(NamedTuple):
 
 
 class ParameterRow(NamedTuple):
-    """A row of the table of a rig's parameters.
-
-    `value` is in the SI unit `unit`; `given`: value and unit as text, as the rig's file or an override states them.
-    """
+    """A row of the table of a rig's parameters."""
 
     symbol: str
     name: str
     meaning: str
-    value: Value
+    value: Value  # in the SI unit `unit`
     unit: str
-    given: str
+    given: str  # value and unit, as the rig's file or an override states them
     source: str
 
 
@@ -157,11 +161,7 @@ class Rig(Part):
         return self
 
     def _check_circuit(self) -> None:
-        """Raise ValueError unless parameters have the values that the rig's circuit and a servo valve's supply require.
-
-        If the rig has a supply, the speed loop of its motor must have an integral gain > 0, and the precharge of its
-        accumulator, if any, must be below the supply's pressure.
-        """
+        """Raise ValueError unless parameters have the values that the circuit and a servo valve's supply require."""
         supply, circuit = self.supply, self.circuit
         for name, required in circuit.required.items():
             value = attrgetter(name)(self)
@@ -180,11 +180,7 @@ class Rig(Part):
             )
 
     def _check_lines(self) -> None:
-        """Raise ValueError for a valve or filter without the part that it needs, or for conflicting viscosities.
-
-        Shut-off valves and filters need a line (`line.orifices`), clogging and a bypass valve need a filter. The
-        viscosity must be lower at 100 deg C than at 40 deg C.
-        """
+        """Raise ValueError for a valve or filter without the part that it needs, or for conflicting viscosities."""
         line, oil = self.line, self.fluid
         # `absent`: the value of a rig without such a valve or filter
         for name, absent in (("open_A", 1.0), ("open_B", 1.0), ("R_A", 0.0), ("R_B", 0.0)):
@@ -255,13 +251,13 @@ class Rig(Part):
     def __getitem__(self, name: str) -> Value:
         """Return the SI value of a parameter; `name`: its symbol, if that is unique, or its dotted name."""
         value: Any = self
-        for symbol in resolve_name(name, declared_names()).split("."):
+        for symbol in resolve_name(name).split("."):
             value = getattr(value, symbol)
         return value  # type: ignore[no-any-return]
 
     def entry(self, name: str) -> ParameterEntry:
         """Return the value, unit and source stated for a parameter; `name`: its symbol or its dotted name."""
-        return self._stated_entries()[resolve_name(name, declared_names())]
+        return self._stated_entries()[resolve_name(name)]
 
     def states(self, *names: str) -> bool:
         """Test whether all the named parameters are stated for this machine, i.e. have no source `assumed: ...`."""
@@ -296,7 +292,7 @@ class Rig(Part):
         entries = self._stated_entries()
         names_by_parameter: dict[str, str] = {}  # dotted name -> name that the caller wrote
         for name, value in overrides.items():
-            full_name = resolve_name(name, declared_names())
+            full_name = resolve_name(name)
             if full_name in names_by_parameter:
                 raise InputError(f"{full_name} must be set once, got {names_by_parameter[full_name]} and {name}")
             names_by_parameter[full_name] = name
@@ -307,10 +303,9 @@ class Rig(Part):
     def with_areas(self, A_A: float, A_B: float, *, source: str) -> Rig:
         """Return the same rig with other piston areas [m^2] from `source`, and with volumes that suit these areas.
 
-        If the chambers' volumes depend on the position, they are computed anew, with a dead volume that is scaled with
-        the larger area. The gas of an accumulator, if the rig has one, is scaled likewise, and is at least
-        `GAS_OVER_ROD` times the oil that the rod displaces in a stroke. These values are marked as assumed. All other
-        parameters stay the same.
+        Chamber volumes that depend on the position are computed anew, with a dead volume that is scaled with the larger
+        area. The gas of an accumulator is scaled likewise, and is at least `GAS_OVER_ROD` times the oil that the rod
+        displaces in a stroke. These values are marked as assumed.
         """
         entries, cylinder = self._stated_entries(), self.cylinder
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
@@ -323,10 +318,10 @@ class Rig(Part):
             min_gas = GAS_OVER_ROD * abs(A_A - A_B) * cylinder.L
             scaled_values["makeup.V_gas"] = max(scale * self.makeup.V_gas, min_gas)
         assumed = f"{ASSUMED} that of {self._name}, scaled with the area"
-        stated_values = {"cylinder.A_A": A_A, "cylinder.A_B": A_B}
-        sources = dict.fromkeys(scaled_values, assumed) | dict.fromkeys(stated_values, source)
-        for full_name, value in {**scaled_values, **stated_values}.items():
-            entries[full_name] = _make_entry(full_name, value, sources[full_name], source)
+        for full_name, value in scaled_values.items():
+            entries[full_name] = _make_entry(full_name, value, assumed, source)
+        for full_name, value in (("cylinder.A_A", A_A), ("cylinder.A_B", A_B)):
+            entries[full_name] = _make_entry(full_name, value, source, source)
         return self._with_entries(entries, source)
 
     def table(self) -> list[ParameterRow]:
@@ -354,10 +349,7 @@ class Rig(Part):
         return {name: self[name] for name, field in declared_fields().items() if self[name] != absent_of(field)}
 
     def as_dict(self) -> dict[str, Any]:
-        """Convert the rig to nested values that JSON can contain: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`.
-
-        The channel map is left out.
-        """
+        """Convert the rig, without channel map, to nested values: `{"motor": {"R_c": {"value": 0.73, ...}}, ...}`."""
         tree: dict[str, Any] = {"rig": {"name": self._name, "title": self._title}}
         for name, entry in self._stated_entries().items():
             *groups, symbol = name.split(".")
@@ -381,19 +373,19 @@ class Rig(Part):
         """Build a rig from the entries of its parameters by dotted name; `place`: where they come from, for messages.
 
         A parameter without an entry gets its `absent` value. Raises InputError if it has no such value, or if an entry
-        has an unknown name or a wrong value.
+        has a wrong value.
         """
-        entries = {**_absent_entries(place), **entries}
-        names = declared_names()
-        for full_name in entries:
-            if full_name not in declared_fields():
-                raise _unknown_name_error(full_name, entries[full_name].place)
-        for full_name in names:
-            if full_name not in entries:
-                raise InputError(f"{full_name} is missing ({place})")
-        rig = _build_part(cls, "", entries, place)
-        rig._name, rig._title = name, title
-        rig._entries = tuple((full_name, entries[full_name]) for full_name in names)
+        complete_entries: dict[str, ParameterEntry] = {}
+        for full_name, field in declared_fields().items():
+            entry = entries.get(full_name)
+            if entry is None:
+                value = absent_of(field)
+                if value is None:
+                    raise InputError(f"{full_name} is missing ({place})")
+                entry = ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
+            complete_entries[full_name] = entry
+        rig = _build_part(cls, "", complete_entries, place)
+        rig._name, rig._title, rig._entries = name, title, tuple(complete_entries.items())
         return rig
 
 
@@ -403,24 +395,46 @@ def declared_fields() -> dict[str, FieldInfo]:
     return dict(iter_fields(Rig))
 
 
-def _absent_entries(place: str) -> dict[str, ParameterEntry]:
-    """Build the entries that a rig's file `place` may omit, with the values for an absent part or effect."""
-    return {
-        full_name: ParameterEntry(value, unit_of(field), "absent from the model: not stated", place)
-        for full_name, field in declared_fields().items()
-        if (value := absent_of(field)) is not None
-    }
-
-
 @cache
 def declared_names() -> tuple[str, ...]:
     """List the dotted names of all parameters, in the order of declaration."""
     return tuple(declared_fields())
 
 
-def _unknown_name_error(full_name: str, place: str) -> InputError:
-    """Build the InputError for a dotted name, stated in `place`, that no parameter has."""
-    return InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
+def resolve_name(name: str) -> str:
+    """Find the dotted name of a parameter from its end, such as `V_1` or `p_A.noise`, or from the dotted name itself.
+
+    Raises InputError if no parameter has the name, or if several have it. The error for a name that is usual in other
+    programs (`_OTHER_NAMES`) suggests the parameter.
+    """
+    names = declared_names()
+    if name in names:
+        return name
+    matches = [full_name for full_name in names if full_name.endswith("." + name)] if name else []
+    if len(matches) == 1:
+        return matches[0]
+    if matches:
+        listed_names = ", ".join(matches[:6]) + (", ..." if len(matches) > 6 else "")
+        raise InputError(f"parameter {name} is not unique, give one of {listed_names}")
+    if synonym := _OTHER_NAMES.get(name.casefold().replace("_", "").replace(" ", "")):
+        raise InputError(f"{name!r} is not a parameter; did you mean {synonym}?")
+    symbols = dict.fromkeys(full_name.rpartition(".")[2] for full_name in names)
+    raise InputError(f"{name!r} is not a parameter{suggestion(name, names if '.' in name else symbols)}")
+
+
+def parse_overrides(texts: Sequence[str]) -> dict[str, str]:
+    """Parse overrides `NAME=VALUE[unit]`, as typed on a command line, to a mapping from `NAME` to `VALUE[unit]`.
+
+    Raises InputError for a text of another form, or for a name with two different values.
+    """
+    overrides: dict[str, str] = {}
+    for text in texts:
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise InputError(f"an override must be NAME=VALUE or NAME=VALUE[unit], got {text!r}")
+        if overrides.setdefault(name, value) != value:
+            raise InputError(f"{name} must be set once, got {overrides[name]} and {value}")
+    return overrides
 
 
 def _build_part(model: type[P], path: str, entries: Mapping[str, ParameterEntry], place: str) -> P:
@@ -508,25 +522,22 @@ def _make_entry(full_name: str, value: Any, source: str, place: str) -> Paramete
 def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "") -> dict[str, ParameterEntry]:
     """Flatten nested tables `{group: {symbol: {value, unit, source}}}` to entries by dotted name.
 
-    `tree`: pairs of key and table; `place`: their file, for messages; `prefix`: beginning of the dotted names. Raises
-    InputError for an unknown name or an invalid entry.
+    `tree`: pairs of key and table. Raises InputError for an unknown name or an invalid entry.
     """
     entries: dict[str, ParameterEntry] = {}
     for key, item in tree:
         full_name = prefix + key
-        if full_name in declared_fields() or (isinstance(item, dict) and "value" in item):
+        if full_name in declared_fields():
             entries[full_name] = _parse_entry(full_name, item, place)
-        elif isinstance(item, dict):
+        elif isinstance(item, dict) and "value" not in item:
             entries |= flatten_entries(item.items(), place, full_name + ".")
         else:
-            raise _unknown_name_error(full_name, place)
+            raise InputError(f"{full_name} is not a parameter{suggestion(full_name, declared_names())} ({place})")
     return entries
 
 
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
     """Check the table of a parameter with value, unit and source, and convert it; raise InputError if it is wrong."""
-    if full_name not in declared_fields():
-        raise _unknown_name_error(full_name, place)
     short_name = _short_name(full_name)
     if not isinstance(item, dict):
         raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")

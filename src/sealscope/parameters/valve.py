@@ -8,12 +8,10 @@ from pydantic import model_validator
 
 from sealscope.parameters.fields import Part, choice, quantity, with_unit
 
-_OVERLAP = "overlap of the edge from {} (< 0: underlap)"
-
 
 def _overlap(edge: str) -> Any:
     """Declare the parameter for the overlap [m] of a metering edge of the valve; `edge`: name, such as "P to A"."""
-    return quantity(_OVERLAP.format(edge), "m", absent=0, ge=-0.1, le=0.1)
+    return quantity(f"overlap of the edge from {edge} (< 0: underlap)", "m", absent=0, ge=-0.1, le=0.1)
 
 
 class ServoValve(Part):

@@ -43,8 +43,7 @@ _SAFE_FORMATS = tuple(kind for kind, entry in _FORMATS.items() if entry.get("saf
 #: _MEMORY_RATIO * size. The speed [bytes/s] is _MIN_SPEED_SLOW for formats that `formats.toml` calls slow.
 _BASE_TIME, _MIN_SPEED, _MIN_SPEED_SLOW = 10.0, 20e6, 5e5
 _BASE_MEMORY, _MEMORY_RATIO = 2**31, 64
-#: Deepest nesting of archives that is unpacked.
-_MAX_NESTING = 3
+_MAX_NESTING = 3  # deepest nesting of archives that is unpacked
 
 
 def _detect_format(path: Path) -> str:
@@ -82,12 +81,14 @@ def _detect_format(path: Path) -> str:
 
 def _find_format(head: bytes, *, is_text: bool) -> str | None:
     """Find the text or binary format whose `recognise` function accepts a file's first bytes; None if none does."""
-    candidates = {
-        kind: entry["recognise"]
-        for kind, entry in _FORMATS.items()
-        if "recognise" in entry and bool(entry.get("text")) == is_text
-    }
-    return next((kind for kind, name in candidates.items() if _format_function(kind, name)(head)), None)
+    for kind, entry in _FORMATS.items():
+        if (
+            "recognise" in entry
+            and bool(entry.get("text")) == is_text
+            and _format_function(kind, entry["recognise"])(head)
+        ):
+            return kind
+    return None
 
 
 def _format_function(kind: str, name: str) -> Callable[..., Any]:

@@ -26,11 +26,9 @@ if TYPE_CHECKING:
 def to_pandas(
     values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> pandas.DataFrame:
-    """Make a data frame of a recording's samples, with the index `t [s]` and columns such as `p_A [Pa]`.
+    """Make a data frame of the content of `Recording.series`, with the index `t [s]` and columns such as `p_A [Pa]`.
 
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history. The `attrs` of the frame contain the units by column, the rate, the provenance and the history. Raises
-    MissingExtra without pandas.
+    Its `attrs` contain the units by column, the rate, the provenance and the history.
     """
     pandas = import_library("pandas", "a data frame", "pandas")
     columns = {f"{name} [{units[name]}]": series.copy() for name, series in values.items() if name != "t"}
@@ -93,11 +91,7 @@ def _convert_column(dtypes: Any, series: Any, name: str) -> NDArray[Any]:
 
 
 def to_xarray(values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]) -> xarray.Dataset:
-    """Make a data set of a recording's samples: variables over the coordinate `t`, with attributes as in NetCDF files.
-
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history. Raises MissingExtra without xarray.
-    """
+    """Make a data set of the content of `Recording.series`, named and described as in NetCDF files."""
     xarray = import_library("xarray", "a data set", "xarray")
     variables = {
         name: ("t", series.copy(), {"units": units[name], "long_name": LONG_NAMES.get(name, name)})

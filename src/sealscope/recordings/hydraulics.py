@@ -11,8 +11,7 @@ from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.readings
-#: Largest difference of a copied channel, by rounding, as a fraction of its standard deviation.
-_COPY_TOLERANCE = 1e-6
+_COPY_TOLERANCE = 1e-6  # largest difference of a copied channel, by rounding, as a fraction of its standard deviation
 
 
 def find_implausibility(recording: Recording) -> str | None:
@@ -25,8 +24,7 @@ def find_implausibility(recording: Recording) -> str | None:
     - Pressures in Pa stay below `readings.pressure` of `priors.toml`, as those in another unit would.
     - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
 
-    Constant and absent channels are ignored, as a chamber may rest at charge pressure. Raw counts may have any offset
-    and range.
+    Constant and absent channels are ignored: a chamber may rest at charge pressure. Raw counts may have any range.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -70,12 +68,10 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
 
 def _is_noise(values: Array, is_zero_known: bool) -> bool:
-    """Test whether a signal (n,) is mostly white noise, or has missing samples.
+    """Test whether a signal (n,) is mostly white noise (`readings.noise` of `priors.toml`), or has missing samples.
 
-    The noise variance is estimated as a twentieth of the mean square of the third difference. The signal is noise if
-    this variance exceeds the fraction `readings.noise` (`priors.toml`) of the signal's variance. With `is_zero_known`,
-    i.e. for p_A - p_B, zero means no load, and the signal's mean square is taken instead of its variance, so that a
-    constant load is a signal; a single pressure has the charge pressure as an offset.
+    With `is_zero_known`, i.e. for p_A - p_B, zero means no load, and the mean square is taken instead of the variance:
+    then a constant load is a signal. A single pressure has the charge pressure as an offset.
     """
     power = np.mean(values**2) if is_zero_known else np.var(values)
     # the third difference of white noise has 20 times its variance; `not <=`: missing samples count as noise

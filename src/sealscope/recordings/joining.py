@@ -16,8 +16,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.formats.timebase import counts_from_1970, parse_epoch
 from sealscope.recordings.recording import Recording
 
-#: Starts that differ by less [s] are equal: the times then continue from file to file.
-_SAME_START = 1e-6
+_SAME_START = 1e-6  # starts that differ by less [s] are equal: the times then continue from file to file
 _YEAR_FIRST = re.compile(
     r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
     r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"
@@ -46,8 +45,7 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
 def file_seconds(recording: Recording, path: Path) -> float:
     """Find the time of a file's first sample [s since 1970].
 
-    If neither the recording nor the file's name states it (`start_seconds`), it is estimated as the time of the file's
-    last change minus the duration of the recording.
+    If it is not known (`start_seconds`), it is the time of the file's last change minus the duration of the recording.
     """
     start = start_seconds(recording, path.name)
     if start is not None:
@@ -73,10 +71,7 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the provenance; None if it is not there.
-
-    It is the entry `start_epoch_s`, if this counts from 1970 and not from another origin, or else the entry `start`.
-    """
+    """Find the time of t = 0 [s since 1970] in the entry `start_epoch_s` or else `start` of the provenance, or None."""
     epoch = recording.provenance.get("start_epoch_s")
     if isinstance(epoch, Real) and counts_from_1970(float(epoch)):
         return float(epoch)

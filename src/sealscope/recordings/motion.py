@@ -21,10 +21,8 @@ ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
 #: Shortest run of equal values that can be stuck, and number of samples on either side with which it is compared.
 _MIN_STUCK, _NEIGHBOURHOOD = 5, 100
-#: A run is stuck if fewer runs of its length than this are expected in the channel.
-_MAX_EXPECTED = 1e-6
-#: Smallest jump at an end of a stuck run, in quantisation steps: more than three.
-_MIN_JUMP = 3.5
+_MAX_EXPECTED = 1e-6  # a run is stuck if fewer runs of its length than this are expected in the channel
+_MIN_JUMP = 3.5  # smallest jump at an end of a stuck run, in quantisation steps: more than three
 #: A longer channel is thinned to this many samples, or up to twice as many, to estimate the quantisation step.
 _QUANTUM_SAMPLES = 2**15
 
@@ -40,13 +38,10 @@ def is_moving(values: Array) -> bool:
 
 
 class Holds(NamedTuple):
-    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading.
+    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading."""
 
-    `flags` (n,): True for held samples. `pending`: index of the first flag that later samples may still change.
-    """
-
-    flags: NDArray[np.bool_]
-    pending: int
+    flags: NDArray[np.bool_]  # (n,), True for held samples
+    pending: int  # index of the first flag that later samples may still change
 
 
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
@@ -54,8 +49,7 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
 
     A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; `rate`: sampling rate [Hz]. The
     first sample of a hold is a reading and not flagged. `before`: value of a hold just before these samples, NaN if
-    there is none. If the first run has this value, it continues that hold: all its samples are flagged, even if it is
-    short.
+    there is none; a first run of this value continues the hold, and is flagged from its first sample on.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -105,10 +99,7 @@ def smallest_step(values: Array) -> float:
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,), the smallest difference of two of its values.
-
-    The result is 0 for a constant channel. A long channel is thinned evenly (`_QUANTUM_SAMPLES`).
-    """
+    """Estimate the quantisation step of a channel (n,), thinned if it is long; 0 for a constant channel."""
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
@@ -138,10 +129,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     n_unchanged = np.r_[0, np.cumsum(is_same)]
 
     def unchanged_fraction(begin: NDArray[Any], end: NDArray[Any]) -> Array:
-        """Estimate the fraction of samples that equal the previous one in each range `begin` to `end` (k,).
-
-        The rule of succession is used, so that the result is never 0 or 1.
-        """
+        """Estimate the fraction of samples that equal the previous one in each range (k,) by the rule of succession."""
         begin, end = np.maximum(begin, 0), np.minimum(end, is_same.size)
         return np.asarray((n_unchanged[end] - n_unchanged[begin] + 1) / (end - begin + 2), dtype=np.float64)
 

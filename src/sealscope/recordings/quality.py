@@ -23,8 +23,7 @@ from sealscope.recordings.recording import Recording
 
 Severity = Literal["note", "warning", "fatal"]
 
-#: Fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1.
-SHORTEST = 226
+SHORTEST = 226  # fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1
 _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS = (
     RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible
 )  # fmt: skip
@@ -34,19 +33,16 @@ _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
 @dataclass(frozen=True)
 class Finding:
-    """One defect of a recording.
+    """One defect of a recording."""
 
-    `code`: kind of defect; `severity`: ``fatal`` (the recording cannot be analysed as it is), ``warning`` (check the
-    time or the channel before relying on a verdict) or ``note``; `channel`: None for the time; `count`: number of
-    samples or intervals; `first_t`: time of the first [s], None if it has none; `text`: description in words.
-    """
-
-    code: str
+    code: str  # kind of defect
+    #: ``fatal``: the recording cannot be analysed as it is; ``warning``: check the time or the channel before you rely
+    #: on a verdict; or ``note``.
     severity: Severity
-    channel: str | None
-    count: int
-    first_t: float | None
-    text: str
+    channel: str | None  # None for the time
+    count: int  # number of samples or intervals
+    first_t: float | None  # time of the first [s], None if it has none
+    text: str  # description in words
 
 
 @checked_call
@@ -150,8 +146,7 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     """Find a steady drift of (p_A + p_B)/2 over a whole recording, which a sealed circuit does not show.
 
     The recording is divided into equal parts. The steps of the mean from part to part must be alike, and the drift fast
-    enough (`creep` in `priors.toml`). Returns one finding or none; also none if the recording is short, or p_A or p_B
-    is absent or not in Pa.
+    enough (`creep` in `priors.toml`). Returns one finding or none.
     """
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
@@ -235,8 +230,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
 def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] | None:
     """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none.
 
-    The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing". `rate`: sampling rate
-    [Hz].
+    The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing".
     """
     is_missing = np.isnan(values)
     if not is_missing.any():
@@ -296,15 +290,12 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
 
 
 class Rail(NamedTuple):
-    """An end of a channel's range, "low" or "high" (`side`), at which it is clipped.
+    """An end of a channel's range at which it is clipped."""
 
-    `samples`: number of samples with this `value`; `first`: index of the first of them.
-    """
-
-    side: str
+    side: str  # "low" or "high"
     value: float
-    samples: int
-    first: int
+    samples: int  # number of samples with this value
+    first: int  # index of the first of them
 
 
 def is_mostly_clipped(values: Array) -> bool:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
-from threading import Lock
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -22,7 +21,7 @@ from sealscope.paragraphs import format_count
 from sealscope.recordings.chambers import DISPLAY_UNITS
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
 from sealscope.recordings.formats.columns import ChannelMap, Request
-from sealscope.recordings.formats.headings.preamble import clean_remarks
+from sealscope.recordings.formats.headings.preamble import collect_remarks
 from sealscope.storage.opening import raising_unreadable
 from sealscope.units import from_si
 
@@ -46,15 +45,6 @@ def _freeze(values: Any) -> Array:
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
-
-
-@dataclass
-class _CachedResult:
-    """A result of `compute_once`: one thread computes it and holds the `lock`; `known` is True if `value` is set."""
-
-    lock: Lock = field(default_factory=Lock)
-    value: Any = None
-    known: bool = False
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,7 +100,7 @@ class Recording:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     history: tuple[str, ...] = ()
     bridged: NDArray[np.bool_] | None = None
-    _results: dict[Hashable, _CachedResult] = field(default_factory=dict, init=False)  # cache of `compute_once`
+    _results: dict[Hashable, Any] = field(default_factory=dict, init=False)  # cache of `compute_once`
 
     def __post_init__(self) -> None:
         """Check the arguments and replace them by read-only copies."""
@@ -123,17 +113,16 @@ class Recording:
         bridged = None if self.bridged is None else np.array(self.bridged, dtype=bool)
         if t.ndim != 1:
             raise InputError(f"t must be one-dimensional, got shape {t.shape}")
-        for name, values in {
-            **{f"channel {name}": series for name, series in channels.items()},
-            "bridged": bridged,
-        }.items():
-            if values is not None and values.shape != t.shape:
-                raise InputError(f"{name} must have as many samples as t ({t.size}), got shape {values.shape}")
-        if absent := next((name for name in channels if name not in self.units), None):
-            raise InputError(f"channel {absent} must have a unit, got none")
+        for name, values in channels.items():
+            if values.shape != t.shape:
+                raise InputError(f"channel {name} must have as many samples as t ({t.size}), got shape {values.shape}")
+            if name not in self.units:
+                raise InputError(f"channel {name} must have a unit, got none")
         if not (np.isfinite(rate) and rate > 0):
             raise InputError(f"rate must be > 0 Hz, got {self.rate}")
         if bridged is not None:
+            if bridged.shape != t.shape:
+                raise InputError(f"bridged must have as many samples as t ({t.size}), got shape {bridged.shape}")
             bridged.setflags(write=False)
             bridged = bridged if bridged.any() else None
         units = MappingProxyType({name: self.units[name] for name in channels})
@@ -205,7 +194,8 @@ class Recording:
     @property
     def remarks(self) -> dict[str, str]:
         """Remarks in the header of the recording's file, such as the operator or the machine, by their names."""
-        return clean_remarks(self.provenance)
+        remarks = self.provenance.get("about")
+        return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
 
     def unit_in_log(self, name: str) -> str | None:
         """Return the unit in which a channel was logged; None if it was in SI units or counts, or came from no log."""
@@ -213,10 +203,10 @@ class Recording:
         return str(units[name]) if isinstance(units, Mapping) and name in units else None
 
     def format_value(self, name: str, value: float, digits: int = 6, *, is_span: bool = False) -> str:
-        """Format a value of the channel `name` in the unit of its log, with `digits` significant digits.
+        """Format a value of the channel `name`, stated in its unit (`units`), in the unit of its log if this has one.
 
-        `value`: in the channel's own unit (`units`), which is kept if the log states none (`unit_in_log`); `is_span`:
-        the value is a difference of two values, to which the offset of a unit does not apply.
+        `digits`: number of significant digits; `is_span`: the value is a difference, to which the offset of a unit does
+        not apply.
         """
         unit = self.units[name]
         display_unit = self.unit_in_log(name) or unit
@@ -227,10 +217,7 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are displayed, such as bar.
-
-        It is the first unit of a logged pressure that is in `DISPLAY_UNITS`, by default bar.
-        """
+        """Unit in which pressures are displayed: the first unit of a logged pressure in `DISPLAY_UNITS`, else bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 
@@ -257,8 +244,8 @@ class Recording:
     def series(self) -> tuple[dict[str, Array], dict[str, str], dict[str, Any]]:
         """Return the content for writers of files: (name -> samples, name -> unit, description).
 
-        The time is called `t`. The description has rate, provenance and history. Raises InputError if the provenance
-        has values that JSON does not have.
+        The time is called `t`. The description has rate, provenance and history as JSON values; raises InputError if
+        the provenance has others.
         """
         from sealscope.recordings.formats.table import make_description
 
@@ -304,9 +291,8 @@ class Recording:
         MissingExtra
             matplotlib is not installed.
         """
-        names = list(self.channels if channels is None else channels)
         channels_by_unit: dict[str, list[tuple[str, Array]]] = {}
-        for name in names:
+        for name in self.channels if channels is None else channels:
             values, unit = self[name], self.units[name]
             plot_unit = self.unit_in_log(name) or (self.pressure_unit if unit == "Pa" else _PLOT_UNITS.get(unit, unit))
             values = values if plot_unit == unit else from_si(values, plot_unit, CHANNEL_UNITS.get(name, unit))
@@ -378,13 +364,11 @@ def compute_once(
     """Return `compute(recording)`, which is computed once for each `key` and then cached with the recording.
 
     `channels`: the channels on which the result depends, by default all. Copies of the recording with fewer channels
-    (`Recording.only`) share the result if they have these channels. Other threads that need the result wait for it.
+    (`Recording.only`) share the result if they have these channels.
     """
-    all_channels = frozenset(recording.channels)
-    names = all_channels if channels is None else all_channels.intersection(channels)
-    cached = recording._results.setdefault((key, names), _CachedResult())
-    with cached.lock:
-        if not cached.known:
-            cached.value, cached.known = compute(recording), True
-        value: _T = cached.value
-    return value
+    names = frozenset(recording.channels)
+    if channels is not None:
+        names = names.intersection(channels)
+    if (key, names) not in recording._results:
+        recording._results[key, names] = compute(recording)
+    return recording._results[key, names]  # type: ignore[no-any-return]

@@ -24,14 +24,10 @@ from sealscope.errors import SealscopeError, UnreadableFile
 from sealscope.storage.unpacking import MAX_UNPACKED
 
 T = TypeVar("T")
-#: Time that starting a process may take in addition to the work [s].
-_MAX_START_TIME = 30.0
-#: Most memory of a process [bytes]: a few copies of the largest recording.
-MAX_MEMORY = 12 * 2**30
-#: A process that occupies more memory than this after a request is not used again [bytes].
-_MAX_IDLE_MEMORY = 2**30
-#: Most processes at a time: with several, a slow file does not delay the files of other threads.
-_MAX_PROCESSES = 4
+_MAX_START_TIME = 30.0  # time that starting a process may take in addition to the work [s]
+MAX_MEMORY = 12 * 2**30  # most memory of a process [bytes]: a few copies of the largest recording
+_MAX_IDLE_MEMORY = 2**30  # a process that occupies more memory than this after a request is not used again [bytes]
+_MAX_PROCESSES = 4  # most processes at a time: with several, a slow file does not delay the files of other threads
 #: Environment that saves memory: libraries start a thread for each core, and Arrow's allocator reserves a gigabyte.
 _LOW_MEMORY_ENVIRONMENT = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
@@ -161,8 +157,7 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
     """Limit this process to `seconds` [s], `memory` [bytes] and written files of up to `disk` [bytes] each.
 
-    The system's timer ends the process even if its parent is dead; 0 s is no limit. The memory is also limited to
-    `MAX_MEMORY` and half the machine's. Only Unix has these limits.
+    The system's timer ends the process even if its parent is dead; 0 s is no limit. Only Unix has these limits.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)

@@ -321,10 +321,9 @@ class ParameterDrift:
 
     def __post_init__(self) -> None:
         if self.parameter not in PARAMETER_GROUPS:
-            from sealscope.parameters import declared_names
-            from sealscope.parameters.names import resolve_name
+            from sealscope.parameters.rig import resolve_name
 
-            object.__setattr__(self, "parameter", resolve_name(self.parameter, declared_names()))
+            object.__setattr__(self, "parameter", resolve_name(self.parameter))
         if not (self._is_instrument() or model_parameters_derived_from(self.parameter)):
             raise InputError(f"{self.parameter} cannot drift within a run")
         if self.absolute != is_absolute_drift(self.parameter):

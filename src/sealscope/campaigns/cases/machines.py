@@ -16,8 +16,7 @@ from sealscope.campaigns.plans.duty import (
     parse_throttle_values,
 )
 from sealscope.campaigns.plans.model import SimulatedPlan
-from sealscope.parameters import declared_names
-from sealscope.parameters.names import resolve_name
+from sealscope.parameters.rig import resolve_name
 from sealscope.simulation.bench.machines import BenchMachine, draw
 from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.experiment import Experiment
@@ -76,7 +75,7 @@ def experiment_with_flow_leak(plan: SimulatedPlan, case: CampaignCase) -> Experi
         elif name != FAMILY:
             values[name] = level
     # full names; if two entries are for the same parameter, the later one counts
-    overrides = {resolve_name(name, declared_names()): value for name, value in values.items()}
+    overrides = {resolve_name(name): value for name, value in values.items()}
     machine = replace(machine, overrides=overrides)
     fault = parse_plan_fault(case.fault, plan.onset_s) if case.fault else None
     return machine.experiment(seed=case.noise_seed, fault=fault, leak=case_leaks(plan, case))

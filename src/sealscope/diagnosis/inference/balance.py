@@ -483,7 +483,7 @@ def derive_drive_signals(
             dp = _hold_missing(samples["p_A"] - samples["p_B"])
             # the order of the pump's ports is unknown: the load is dp or -dp, whichever correlates positively with u
             load = dp if float((u - u.mean()) @ (dp - dp.mean())) >= 0.0 else -dp
-        speed = drive.flow(u, load, rate) / drive.displacement
+        speed = drive.speed(u, load, rate)
         derived["omega"] = np.where(np.isnan(samples["u"]), np.nan, speed)
     return {**samples, **derived}
 

@@ -20,10 +20,6 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.clock
 #: Longest interval that is interpolated, in median intervals.
 MAX_INTERVAL: float = _PRIORS.near
-#: Largest fraction of lost samples before the recording is cut.
-MAX_GAP_FRACTION: float = _PRIORS.lost
-#: Largest fraction of rows that are not later than all rows before; with more, one run of rows is used.
-MAX_LATE_FRACTION: float = _PRIORS.late
 
 
 def resample_evenly(recording: Recording) -> Recording:
@@ -31,8 +27,7 @@ def resample_evenly(recording: Recording) -> Recording:
 
     If the intervals are whole numbers of sampling steps, to within `clock.scatter` of `priors.toml` (rms), rows of NaN
     are inserted for lost samples; else the samples are interpolated linearly. Rows without a time, or not later than
-    all rows before, are dropped. If long breaks divide the recording, only its longest stretch is used. A recording
-    with even times is returned unchanged.
+    all rows before, are dropped. If long breaks divide the recording, only its longest stretch is used.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
@@ -51,15 +46,15 @@ def resample_evenly(recording: Recording) -> Recording:
 def _ordered_rows(t: Array) -> NDArray[np.intp]:
     """Find the indices of the rows that are later than all earlier rows of a log; `t` (n,): times [s], NaN if missing.
 
-    If more than the fraction `MAX_LATE_FRACTION` of the timed rows are out of this order, the result is the longest run
-    of rows whose times do not step back, without repeated times.
+    If more than the fraction `clock.late` (`priors.toml`) of the timed rows are out of this order, the result is the
+    longest run of rows whose times do not step back, without repeated times.
     """
     timed = np.flatnonzero(np.isfinite(t))
     if timed.size < 2:
         return timed
     latest_time = np.maximum.accumulate(t[timed])
     is_out_of_order = np.r_[False, t[timed][1:] <= latest_time[:-1]]
-    if np.mean(is_out_of_order) <= MAX_LATE_FRACTION:
+    if np.mean(is_out_of_order) <= _PRIORS.late:
         return np.asarray(timed[~is_out_of_order])
     runs = np.split(timed, np.flatnonzero(np.diff(t[timed]) < 0.0) + 1)
     run = max(runs, key=len)
@@ -67,14 +62,14 @@ def _ordered_rows(t: Array) -> NDArray[np.intp]:
 
 
 def _longest_dense_stretch(t: Array, rate: float) -> slice:
-    """Find the longest stretch of rows in which at most the fraction `MAX_GAP_FRACTION` of the samples is lost.
+    """Find the longest stretch of rows that lacks at most the fraction `clock.lost` (`priors.toml`) of the samples.
 
     `t` (n,): increasing times [s]; `rate` [Hz]: number of samples that a complete recording has per second.
     """
     # surplus of a row: number of rows before it, less the number that a dense stretch must have up to its time. A
     # stretch is dense enough if the surplus of its last row is not below that of its first row
     first_time = t[:1].sum()  # 0 if there are no rows
-    surplus = np.arange(t.size) - (1.0 - MAX_GAP_FRACTION) * rate * (t - first_time)
+    surplus = np.arange(t.size) - (1.0 - _PRIORS.lost) * rate * (t - first_time)
     max_later_surplus = np.maximum.accumulate(surplus[::-1])[::-1]
     # for each first row, the last row whose surplus is not below its own (minus: `searchsorted` needs rising values)
     last = np.searchsorted(-max_later_surplus, -surplus, side="right") - 1

@@ -29,29 +29,23 @@ from sealscope.units import P_ATM
 
 Flags = NDArray[np.bool_]
 
-#: Longest gap bridged by a spline [samples].
-SPLINE = 3
-#: Longest gap bridged by another cycle, as a fraction of the recording.
-MAX_CYCLE_GAP = 0.1
-#: Largest fraction of impossible samples in a channel with the right unit.
-_MAX_IMPOSSIBLE_FRACTION = 0.1
-#: Number of different positions of a sensor that works; an encoder at rest shows one or two.
-_MIN_POSITIONS = 10
+SPLINE = 3  # longest gap bridged by a spline [samples]
+MAX_CYCLE_GAP = 0.1  # longest gap bridged by another cycle, as a fraction of the recording
+_MAX_IMPOSSIBLE_FRACTION = 0.1  # largest fraction of impossible samples in a channel with the right unit
+_MIN_POSITIONS = 10  # number of different positions of a sensor that works; an encoder at rest shows one or two
 _GAPS = RECORDINGS.gaps
 #: Largest fraction of bridged samples in a block: so few change the sums over the block less than its noise does.
 MAX_BRIDGED_FRACTION = 0.01
 #: Samples on either side of a gap whose means set the offset of a copied cycle. A cycle is compared only if so many
 #: samples beside the gap are in the recording, and so many in total are known; a spline needs more known values.
 _N_END = 8
-#: Largest rms difference of a copied cycle around the gap, relative to its rms about the mean.
-_MAX_MISMATCH = 0.4
-#: Uncertainty of the cycle's length [samples].
-_SLACK = 2
+_MAX_MISMATCH = 0.4  # largest rms difference of a copied cycle around the gap, relative to its rms about the mean
+_SLACK = 2  # uncertainty of the cycle's length [samples]
 
 
 def set_missing(recording: Recording, flags: Mapping[str, Flags]) -> Recording:
-    """Set flagged samples of a recording to NaN; `flags`: channel -> flags (n,) of its samples."""
-    channels = {name: np.where(is_flagged, np.nan, recording[name]) for name, is_flagged in flags.items()}
+    """Set flagged samples to NaN; return the recording itself if there are none. `flags`: channel -> flags (n,)."""
+    channels = {name: np.where(mask, np.nan, recording[name]) for name, mask in flags.items() if mask.any()}
     return replace(recording, channels={**recording.channels, **channels}) if channels else recording
 
 
@@ -60,11 +54,10 @@ def remove_dropouts(recording: Recording) -> Recording:
 
     A converter that is off writes zeros; two noisy transducers never read zero together.
     """
-    chambers = chambers_of(recording)
-    if len(chambers) < 2:
+    if len(chambers_of(recording)) < 2:
         return recording
-    is_dropout = np.logical_not(recording["p_A"]) & np.logical_not(recording["p_B"])  # both are 0, not NaN
-    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout)) if is_dropout.any() else recording
+    is_dropout = (recording["p_A"] == 0.0) & (recording["p_B"] == 0.0)
+    return set_missing(recording, dict.fromkeys(recording.channels, is_dropout))
 
 
 def remove_unsupplied(recording: Recording) -> Recording:
@@ -80,22 +73,18 @@ def remove_unsupplied(recording: Recording) -> Recording:
 
     The recording must be whole, as its beginning, its end and the largest values decide.
     """
-    chambers, unsupplied = chambers_of(recording), dict[str, Flags]()
-    if len(chambers) == 2:
-        is_off = np.logical_and(*(_is_below_live_zero(recording[name]) for name in chambers))
-        unsupplied = dict.fromkeys(recording.channels, is_off) if is_off.any() else {}
+    is_off = np.zeros(len(recording), dtype=bool)
+    if len(chambers_of(recording)) == 2:
+        is_off = _is_below_live_zero(recording["p_A"]) & _is_below_live_zero(recording["p_B"])
+    unsupplied = dict.fromkeys(recording.channels, is_off)
     if "x" in recording:
-        is_off = unsupplied.get("x", np.zeros(len(recording), dtype=bool))
-        is_dead = _flag_dead_ends(np.where(is_off, np.nan, recording["x"]))
-        if is_dead.any():
-            unsupplied["x"] = is_dead | is_off
+        unsupplied["x"] = is_off | _flag_dead_ends(np.where(is_off, np.nan, recording["x"]))
     return set_missing(recording, unsupplied)
 
 
 def _is_below_live_zero(pressure: Array) -> Flags:
     """Flag the samples (n,) of a sensor without a supply: a `pressure` p [Pa] < -P_ATM - `gaps.live_zero` max(0, p)."""
-    highest = float(np.nanmax(pressure, initial=0.0))
-    return np.asarray(pressure < -P_ATM - _GAPS.live_zero * highest)
+    return np.asarray(pressure < -P_ATM - _GAPS.live_zero * np.nanmax(pressure, initial=0.0))
 
 
 def _flag_dead_ends(position: Array) -> Flags:
@@ -131,8 +120,8 @@ def remove_impossible(recording: Recording) -> Recording:
     A channel stays as it is if over a tenth of its samples are impossible, because its unit is then wrong.
     """
     flags = {name: flag_impossible(values, recording.units[name]) for name, values in recording.channels.items()}
-    is_removed = {name: mask & (np.mean(mask) <= _MAX_IMPOSSIBLE_FRACTION) for name, mask in flags.items() if len(mask)}
-    return set_missing(recording, is_removed) if any(mask.any() for mask in is_removed.values()) else recording
+    max_count = _MAX_IMPOSSIBLE_FRACTION * len(recording)
+    return set_missing(recording, {name: mask for name, mask in flags.items() if np.count_nonzero(mask) <= max_count})
 
 
 def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
@@ -140,8 +129,7 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
 
     A gap of up to `SPLINE` samples is filled by a spline. A longer one is filled from another cycle of the motion, or
     by a straight line if no cycle is similar enough or the gap exceeds the fraction `MAX_CYCLE_GAP` of the recording.
-    Values that other channels miss in the same rows are filled in the same way. The times must be evenly spaced. The
-    recording is returned unchanged if there is no such gap, or no row with values in all `needed` channels.
+    Values that other channels miss in the same rows are filled in the same way. The times must be evenly spaced.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
     if not len(recording) or is_complete.all() or not is_complete.any():
@@ -159,9 +147,11 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
         bridged[first:stop] = True
         if length <= SPLINE:
             spline_rows[first:stop] = True
-            continue
-        period = 0.0 if cycle is None or length > MAX_CYCLE_GAP * len(recording) else cycle * recording.rate
-        if not (period and _copy_other_cycle(channels, needed, first, stop, period)):
+        elif (
+            cycle is None
+            or length > MAX_CYCLE_GAP * len(recording)
+            or not _copy_other_cycle(channels, needed, first, stop, cycle * recording.rate)
+        ):
             line_rows[first:stop] = True
     for values in channels.values():
         _fill_rows(values, spline_rows, by_spline=True)
@@ -225,9 +215,9 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    The two nearest cycles on either side are tried, the nearer ones first. `channels`: name -> values (n,); the gap has
-    the samples `first` to `stop` - 1; `needed`: channels that must be complete in the copied cycle; `period`: length of
-    a cycle [samples].
+    The two nearest cycles on either side are tried, the nearer ones first. `channels`: name -> values (n,); `first`,
+    `stop`: the gap's first sample, and the first one after it; `needed`: channels that must be complete in the copied
+    cycle; `period`: length of a cycle [samples].
     """
     half_cycle = round(0.5 * period)
     # the copied samples must not overlap the gap, nor the half cycle next to it
@@ -249,11 +239,10 @@ def _cycle_mismatch(
     """Compute how much the machine's motion around a gap differs from its motion `shift` samples later.
 
     The motion is seen in the command u if this is `needed`, else in p_A - p_B or the only chamber pressure
-    (`duty_signal`). The gap, i.e. the samples `first` to `stop` - 1, and up to `half_cycle` samples on either side are
-    compared with the stretch `shift` samples later, or earlier if `shift` is negative. The result is the rms difference
-    of the two stretches, after their means are subtracted, over the standard deviation of the shifted stretch. It is
-    infinite if too few samples are known, or if one of the `needed` channels lacks samples to copy into the gap.
-    `channels`: name -> values (n,).
+    (`duty_signal`). The gap and up to `half_cycle` samples on either side are compared with the stretch `shift` samples
+    later, or earlier if `shift` is negative. The result is the rms difference of the two stretches, after their means
+    are subtracted, over the standard deviation of the shifted stretch. It is infinite if too few samples are known, or
+    if one of the `needed` channels lacks samples to copy into the gap.
     """
     n = next(iter(channels.values())).size
     # half a cycle on either side of the gap, as far as both stretches lie within the recording
@@ -273,10 +262,7 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill a gap, the missing values from `first` to `stop` - 1, in place with the values `shift` samples later.
-
-    A linear offset is added to these, so that they join the values before and after the gap.
-    """
+    """Fill a gap in place with the values `shift` samples later, plus a linear offset by which they join its ends."""
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
         _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends
@@ -289,8 +275,7 @@ def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
 def _fill_rows(values: Array, rows: Flags, by_spline: bool) -> None:
     """Fill missing values (n,) in the flagged `rows` (n,), in place, by a cubic spline or by linear interpolation.
 
-    Values before the first known one and after the last one stay missing; so do all if at most `_N_END` are known for a
-    spline.
+    Values before the first known one and after the last one stay missing, and for a spline all if too few are known.
     """
     from scipy.interpolate import CubicSpline
 

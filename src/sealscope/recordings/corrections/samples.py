@@ -34,18 +34,12 @@ from sealscope.recordings.recording import Recording
 
 
 class CorrectedSamples(NamedTuple):
-    """A recording after the correction of its samples.
+    """A recording after the correction of its samples."""
 
-    - `recording`: evenly spaced samples, from the first to the last row with all chamber pressures and the command.
-    - `findings`: the corrections that `correct_samples` reports.
-    - `stuck`: names of chamber pressures that repeat one value for too long to be used.
-    - `used_fraction`: fraction of the original samples within the time span of `recording`.
-    """
-
-    recording: Recording
-    findings: tuple[Finding, ...]
-    stuck: tuple[str, ...]
-    used_fraction: float
+    recording: Recording  # evenly spaced, from the first to the last row with all chamber pressures and the command
+    findings: tuple[Finding, ...]  # the corrections that `correct_samples` reports
+    stuck: tuple[str, ...]  # names of chamber pressures that repeat one value for too long to be used
+    used_fraction: float  # fraction of the original samples within the time span of `recording`
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
@@ -63,8 +57,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     the rows stays as it is, and is named as unusable.
     """
     part = remove_unsupplied(remove_dropouts(remove_impossible(recording)))
-    is_frozen = flag_frozen_rows(part)
-    part = set_missing(part, dict.fromkeys(part.channels, is_frozen)) if is_frozen.any() else part
+    part = set_missing(part, dict.fromkeys(part.channels, flag_frozen_rows(part)))
     chambers = chambers_of(part)
     # empty channels are left out, except chamber pressures
     names = [name for name in part.channels if name in chambers or np.any(np.isfinite(part[name]))]
@@ -107,8 +100,7 @@ def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:
 def remove_holes(recording: Recording) -> Recording:
     """Replace the filled samples of long gaps by NaN, for detectors that cannot give filled samples a lower weight.
 
-    All channels become NaN in the rows of `flag_holes`. Short gaps stay filled, but are no longer marked as `bridged`.
-    A recording without long gaps is returned unchanged, with its marks.
+    Short gaps stay filled, but are no longer marked as `bridged`. A recording without long gaps keeps these marks.
     """
     is_hole = flag_holes(recording)
     if not is_hole.any():

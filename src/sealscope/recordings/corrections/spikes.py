@@ -21,8 +21,7 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.spike
 #: Number of leaps on either side with which a spike is compared, and fewest samples of a channel.
 _NEIGHBOURS, _MIN_SAMPLES = 10, 50
-#: Smallest spike, in quantisation steps.
-_MIN_QUANTA = 10.0
+_MIN_QUANTA = 10.0  # smallest spike, in quantisation steps
 #: More changes are thinned to this many, or up to twice as many, to estimate the usual size of a change.
 _N_CHANGES = 2**15
 

@@ -22,10 +22,8 @@ from sealscope.recordings.recording import Recording
 _PRIORS = RECORDINGS.stale
 #: Largest fraction of stuck samples of a pressure: up to it they are missing, beyond it the channel is not used.
 MAX_STUCK_FRACTION: float = _PRIORS.stuck
-#: Smallest jump, in quantisation steps; a smaller one may be a slow change.
-_MIN_JUMP = 1.5
-#: Samples from the beginning from which the holding period is estimated.
-_N_ESTIMATE = 2**18
+_MIN_JUMP = 1.5  # smallest jump, in quantisation steps; a smaller one may be a slow change
+_N_ESTIMATE = 2**18  # samples from the beginning from which the holding period is estimated
 #: Largest number of equal rows in succession, i.e. a reading and its repeats, for the repeats to be left out; also the
 #: tolerance [rows] of the ends of a long repeat (`flag_frozen_rows`).
 _MAX_REPEAT = 3
@@ -51,11 +49,10 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
         values = recording[name]
         stale = repeated & np.isfinite(values)
         if (period := estimate_holding_period(recording.t, values)) is not None:
-            stale = stale | _flag_held(recording.t, values, period)
+            stale |= _flag_held(recording.t, values, period)
             text = f"{name}: repeats each sample for {period:.2g} s: interpolated between new ones"
-            findings.append(
-                Finding("held_samples", "note", name, int(np.count_nonzero(stale)), float(recording.t[0]), text)
-            )
+            count = int(np.count_nonzero(stale))
+            findings.append(Finding("held_samples", "note", name, count, float(recording.t[0]), text))
         fresh = np.isfinite(values) & ~stale & is_ordered
         if stale.any() and fresh.any():
             channels[name] = np.where(stale, np.interp(recording.t, recording.t[fresh], values[fresh]), values)
@@ -88,10 +85,9 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     Nothing is flagged without both chamber pressures.
     """
     flags = np.zeros(len(recording), dtype=bool)
-    pressures = [recording[name] for name in CHAMBERS if name in recording]
-    if len(pressures) < len(CHAMBERS):
+    if not all(name in recording for name in CHAMBERS):
         return flags
-    holds_a, holds_b = (find_runs(find_holds(values, recording.rate).flags) for values in pressures)
+    holds_a, holds_b = (find_runs(find_holds(recording[name], recording.rate).flags) for name in CHAMBERS)
     begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
     channels = list(recording.channels.values())
     for first, length in holds_a.tolist():
@@ -190,7 +186,7 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     by more than `_MIN_JUMP` quantisation steps both before and after these rows. Nothing is flagged unless there are at
     least `stale.repeats` (`priors.toml`) times as many places as rows that are expected to repeat by chance. The
     expected fraction of rows is that for channels that repeat independently of each other, but at least `stale.fewest`.
-    Fewer than `stale.runs` rows show no habit of a logger; none of them is flagged.
+    Nothing is flagged in fewer than `stale.runs` rows.
     """
     moving = [values for values in channels if np.isfinite(values).any() and np.nanmax(values) > np.nanmin(values)]
     if not moving or moving[0].size < _PRIORS.runs:
@@ -210,8 +206,7 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
         is_candidate |= jumps_before & jumps_after
     repeated = np.zeros(is_same.size, dtype=bool)
     # the product of the last two factors is the number of repeated rows expected by chance
-    if np.count_nonzero(is_candidate) < _PRIORS.repeats * max(p_equal, _PRIORS.fewest) * is_same.size:
-        return repeated
-    for begin, end in zip(first[is_candidate].tolist(), stop[is_candidate].tolist(), strict=True):
-        repeated[begin:end] = True
+    if np.count_nonzero(is_candidate) >= _PRIORS.repeats * max(p_equal, _PRIORS.fewest) * is_same.size:
+        for begin, end in zip(first[is_candidate].tolist(), stop[is_candidate].tolist(), strict=True):
+            repeated[begin:end] = True
     return repeated

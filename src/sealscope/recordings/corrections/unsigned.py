@@ -26,8 +26,7 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.unsigned
-#: Most iterations of the fit; each uses the signs of the previous one.
-_MAX_ITERATIONS = 10
+_MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the previous one
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 #: Channel -> its quantity, for messages.
@@ -45,10 +44,10 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     for name, quantity in _NAMES.items():
         if name not in recording or not _has_one_sign(recording[name]):
             continue
-        sign, source = _find_sign(recording, np.abs(recording[name]))
+        values = recording[name]
+        sign, source = _find_sign(recording, np.abs(values))
         if sign is None:
             continue
-        values = recording[name]
         # sign of the side of zero on which the channel stays
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
@@ -100,18 +99,17 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     """Find the signs (n,), +1 or -1, of the flow into chamber A; also return the source of the signs, in words.
 
     The signs are fitted to the position (`_fit_signs`) or, without a position, are those of the command. Returns (None,
-    "") if neither is recorded, or if the one used does not move in both directions or hardly correlates with the
-    `magnitude` (n,) of the speed or flow.
+    "") if neither is recorded, or if the one used moves one way only or hardly correlates with the `magnitude` (n,).
     """
-    if "x" in recording:
-        speed = _piston_speed(recording["x"], recording.rate)
-        if _moves_both_ways(speed) and _correlation(np.abs(speed), magnitude) >= _PRIORS.correlation:
-            return _fit_signs(recording, speed, magnitude), "the position's rate and the pressures"
+    has_position = "x" in recording
+    if not has_position and "u" not in recording:
         return None, ""
-    if "u" not in recording or not _moves_both_ways(recording["u"]):
+    motion = _piston_speed(recording["x"], recording.rate) if has_position else recording["u"]
+    if not _moves_both_ways(motion) or _correlation(np.abs(motion), magnitude) < _PRIORS.correlation:
         return None, ""
-    is_correlated = _correlation(np.abs(recording["u"]), magnitude) >= _PRIORS.correlation
-    return (np.where(recording["u"] < 0.0, -1.0, 1.0), "the command") if is_correlated else (None, "")
+    if has_position:
+        return _fit_signs(recording, motion, magnitude), "the position's rate and the pressures"
+    return np.where(motion < 0.0, -1.0, 1.0), "the command"
 
 
 def _piston_speed(x: Array, rate: float) -> Array:
@@ -134,8 +132,7 @@ def _half_span(rate: float) -> int:
 def _moves_both_ways(values: Array) -> bool:
     """Test whether a speed or command (n,) moves far enough in both directions.
 
-    Of the sum of its positive values and that of its negative values, the smaller must exceed `unsigned.least`
-    (`priors.toml`) times the larger in magnitude.
+    Of the sums of its positive and of its negative values, the smaller must exceed `unsigned.least` times the larger.
     """
     smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
     return smaller > _PRIORS.least * larger > 0.0
@@ -193,11 +190,10 @@ def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
 
 
 def _noise_variance(speed: Array, rate: float) -> float:
-    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz].
+    """Estimate the noise variance [(m/s)^2] of a piston speed (n,) sampled at `rate` [Hz]; 0 for a short recording.
 
-    It is half the median of the locally averaged squared differences of samples that are just over twice
-    `unsigned.half` (`priors.toml`) apart, whose speeds share no position. Motion changes only some of these averages,
-    and hardly their median. The result is 0 for a recording that is shorter than this distance.
+    It is half the median of the locally averaged squared differences of samples just over twice `unsigned.half` apart,
+    whose speeds share no position. Motion changes only some of these averages, and hardly their median.
     """
     n_lag = 2 * _half_span(rate) + 1
     steps = speed[n_lag:] - speed[:-n_lag]
@@ -224,8 +220,7 @@ def _draw_noise_signs(values: Array, rate: float) -> Array:
 
     The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Where the ratio
     of the local mean of `values` (n,) to their local standard deviation, from second differences, is at most 1.32 plus
-    three standard errors, they are taken for noise and get random signs. Elsewhere they stay. The signs are the same in
-    every call. `rate`: sampling rate [Hz].
+    three standard errors, they are taken for noise and get random signs. `rate`: sampling rate [Hz].
     """
     if values.size < 3:
         return values

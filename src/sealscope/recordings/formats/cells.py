@@ -23,8 +23,7 @@ from sealscope.units import parse_unit
 
 #: Texts that loggers write for a missing sample, in lower case.
 MISSING = frozenset({"", *WORDS["missing"]})
-#: Largest fraction of a column's cells that may be words, as loggers write on overflow.
-MAX_WORD_FRACTION = 0.01
+MAX_WORD_FRACTION = 0.01  # largest fraction of a column's cells that may be words, as loggers write on overflow
 #: Longest number, and longest number with its unit [characters].
 _MAX_NUMBER, _MAX_QUANTITY = 400, 80
 #: Decimal separator -> pattern of a number.
@@ -45,8 +44,7 @@ _QUANTITY = re.compile(
 #: A number with the prefix of a power of ten behind it, `170.3m` or `-3k`, at the end of a cell.
 _PREFIXED = re.compile(r"(?<=\d)(?P<prefix>[pnu\u00b5\u03bcmkKMG])(?=[ ]{0,8}\"?[ ]{0,8}(?:[;,|\t]|$))")
 _POWERS = {"p": -12, "n": -9, "u": -6, "\u00b5": -6, "\u03bc": -6, "m": -3, "k": 3, "K": 3, "M": 6, "G": 9}
-#: Most different units that are looked up for a file.
-_MAX_UNITS = 64
+_MAX_UNITS = 64  # most different units that are looked up for a file
 
 
 def is_missing(cell: str) -> bool:
@@ -73,8 +71,7 @@ def is_value(cell: str, decimal: str) -> bool:
 def parse_numbers(cells: Sequence[str], decimal: str, format_place: Callable[[int], str]) -> tuple[Array, list[int]]:
     """Parse a column's cells to doubles (n,), NaN for words and missing samples; also return the indices of words.
 
-    `decimal`: decimal separator, "." or ","; `format_place`: index of a cell -> its place, for messages. Raises
-    InputError for an infinite number.
+    `format_place`: index of a cell -> its place, for messages. Raises InputError for an infinite number.
     """
     # with a decimal comma a point is not a decimal separator: `?` makes `float` refuse the cell
     texts = [cell.replace(".", "?").replace(",", ".") for cell in cells] if decimal == "," else cells
@@ -165,10 +162,7 @@ def remove_units(line: str, units: Iterable[str]) -> str:
 
 
 def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> list[Label]:
-    """Add the units in cells, column -> unit, to headings that state none.
-
-    Raises InputError if a heading states another unit, or one that is not known. `place`: the file, for messages.
-    """
+    """Add the units in cells, column -> unit, to headings that state none; raise InputError if one states another."""
     result = []
     for column, label in enumerate(labels):
         unit = units.get(column)
@@ -182,10 +176,9 @@ def add_units(labels: Sequence[Label], units: Mapping[int, str], place: str) -> 
 
 
 def strip_unit(cells: Sequence[str], unit: str, is_cut: bool, format_place: Callable[[int], str]) -> list[str]:
-    """Remove the unit after the number from each cell of a column.
+    """Remove the unit after the number from each cell of a column; words, and zeros without a unit, stay as they are.
 
-    Words, and zeros without a unit, stay as they are. `is_cut`: the last cell may be incomplete, and becomes empty if
-    it does not end in `unit`; `format_place`: index of a cell -> its place, for messages. Raises InputError for a
+    `is_cut`: the last cell may be incomplete, and becomes empty if it does not end in `unit`. Raises InputError for a
     number with another unit, and for a number other than zero without a unit.
     """
     result = [cell.strip() for cell in cells]

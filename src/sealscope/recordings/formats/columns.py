@@ -30,8 +30,7 @@ from sealscope.recordings.formats.headings.split_time import find_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension, to_si
 
-#: Most digits of a column's number; no log has as many columns.
-_MAX_DIGITS = 9
+_MAX_DIGITS = 9  # most digits of a column's number; no log has as many columns
 #: Separators of the parts of a path such as `Rig.Cyl.p_A`.
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: Channel (or `t`) -> column, given by a caller; or "auto": choose by the columns' names. The entry `REST` -> "auto" of
@@ -105,10 +104,7 @@ def _check_channel(channel: str) -> None:
 
 
 def check_request(channel_map: ChannelMap, rate: float | None) -> None:
-    """Raise InputError for an invalid map from channels to columns, and for a sampling rate that is not positive.
-
-    A map is invalid if it names an unknown channel, or if the map or its entry `REST` is a text other than "auto".
-    """
+    """Raise InputError for an unknown channel or a wrong word in a map, and for a rate that is not positive."""
     if isinstance(channel_map, str) and channel_map != "auto":
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     for channel in explicit_columns(channel_map):
@@ -135,7 +131,6 @@ def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
     """Reconstruct the map that "auto" has chosen for a recording, channel -> column, from its provenance.
 
     A unit at the end of a column's name is added, as in `PA_bar[bar]`; units in a user's map are not in the provenance.
-    Without an entry `columns` in the provenance, the map is empty.
     """
     names = provenance.get("columns")
     columns = {str(channel): str(heading) for channel, heading in names.items()} if isinstance(names, Mapping) else {}
@@ -235,10 +230,7 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
 
 
 def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
-    """Add to `choice` the channels and the time column that a user has mapped.
-
-    `columns`: for each channel, or "t" for the time, the text of a column or of a formula of several columns.
-    """
+    """Add to `choice` the channels and the time column that a user has mapped: channel or "t" -> text of the map."""
     for channel, column_text in columns.items():
         formula = _parse_mapping(choice.labels, channel, column_text)
         name = column_text if formula.column is None else choice.labels[formula.column].whole
@@ -256,10 +248,7 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
 
 
 def _apply_names(choice: ColumnMap) -> None:
-    """Complete `choice` with the channels and the time column that the names of columns show.
-
-    Channels, columns and a time column that are already chosen stay as they are.
-    """
+    """Add to `choice` the channels and the time column that the names of columns show, beside those already chosen."""
     labels = choice.labels
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
@@ -307,14 +296,12 @@ def _find_time(labels: Sequence[Label]) -> int | None:
     if (exact := next((i for i, label in enumerate(labels) if label.name == "t"), None)) is not None:
         _find_column(labels, "t", "t")  # raises if there are several
         return exact
-    candidates = [
+    with_usual_names = [
         [i for i, label in enumerate(labels) if name in (label.whole.casefold(), label.name.casefold())]
         for name in WORDS["time"]
     ]
-    candidates.append(
-        [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]]
-    )
-    matches = next(filter(None, candidates), [])
+    times = [i for i, label in enumerate(labels) if is_time(label) and label.name.casefold() not in WORDS["date"]]
+    matches = next(filter(None, (*with_usual_names, times)), [])
     return next((i for i in matches if labels[i].unit is not None), matches[0] if matches else None)
 
 

@@ -6,7 +6,6 @@ A file is read as a tree of structs and objects (`structured.tree`).
 from __future__ import annotations
 
 import struct
-import warnings
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -61,12 +60,10 @@ def read_matlab(path: Path, request: Request) -> RecordingFields:
             if _STREAMS in file:
                 return build_fields(list(_read_streams(file)), request, "MATLAB", size=size)
     matio = import_library("matio", "a MATLAB file", "mat-io")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # about classes without a Python equivalent
-        for name, (shape, *_) in matio.whosmat(path).items():
-            if np.prod([float(length) for length in shape]) > MAX_VALUES:
-                raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
-        variables = matio.load_from_mat(path, add_table_attrs=True)
+    for name, (shape, *_) in matio.whosmat(path).items():
+        if np.prod([float(length) for length in shape]) > MAX_VALUES:
+            raise InputError(f"{name} must have at most {MAX_VALUES} values, got the shape {shape}")
+    variables = matio.load_from_mat(path, add_table_attrs=True)
     values = {name: value for name, value in variables.items() if not name.startswith("__")}
     remarks = collect_remarks((name, format_remark(value)) for name, value in values.items())
     return build_fields(list(iter_series(values)), request, "MATLAB", remarks, stated_rate(remarks), size=size)
@@ -94,7 +91,6 @@ def _read_streams(file: Any) -> Iterator[Series]:
     """Yield the signals of an open HDF5 file that stores the samples of each signal as a stream of doubles.
 
     Each signal has `CompressedTime` (first time, step, number of samples) and `DataR2` (the number of its stream).
-    Signals of another form are left out.
     """
     import h5py
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from datetime import UTC
 from functools import partial
 from pathlib import Path
-from traceback import walk_tb
 from typing import Any
 
 import numpy as np
@@ -22,7 +21,7 @@ from sealscope.recordings.formats.table import Clock, RecordingFields, Series, b
 
 def read_mdf(path: Path, request: Request) -> RecordingFields:
     """Read the requested channels of an MDF file in physical values, without decoding bus frames; needs asammdf."""
-    with _open_file(import_library("asammdf", "MDF", "asammdf").MDF, path) as file:
+    with import_library("asammdf", "MDF", "asammdf").MDF(path) as file:
         start_time = np.datetime64(file.header.start_time.astimezone(UTC).replace(tzinfo=None), "us")
         # a file without a date states 1980 or before
         start = start_time if start_time > np.datetime64("1980-01-02") else None
@@ -40,21 +39,6 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
         header = ("author", "department", "project", "subject", "comment")
         remarks = collect_remarks((name, getattr(file.header, name, "")) for name in header)
         return build_fields(series, request, f"MDF {file.version}", remarks, size=path.stat().st_size)
-
-
-def _open_file(MDF: Any, path: Path) -> Any:
-    """Open an MDF file by the class `MDF` of asammdf.
-
-    If that fails, the incomplete object is marked as closed, because its destructor would print an error.
-    """
-    try:
-        return MDF(path)
-    except Exception as error:
-        for frame, _ in walk_tb(error.__traceback__):
-            unopened: Any = frame.f_locals.get("self")
-            if hasattr(unopened, "_closed"):
-                unopened._closed = True
-        raise
 
 
 def _read_times(file: Any, group: int, start: np.datetime64 | None) -> tuple[Array, np.datetime64 | None]:

@@ -27,8 +27,7 @@ from sealscope.recordings.formats.table import (
     parse_description,
 )
 
-#: Most fill values of a data set: the CF conventions have one, a few tools write two.
-_MAX_FILLS = 16
+_MAX_FILLS = 16  # most fill values of a data set: the CF conventions have one, a few tools write two
 #: Most bytes, and most texts, that are read at a time from a data set of texts.
 _CHUNK_BYTES, _CHUNK_TEXTS = 500_000_000, 4096
 #: Attribute of files written by Sealscope: the version of their format.
@@ -60,11 +59,10 @@ def read_netcdf(path: Path, request: Request) -> RecordingFields:
                 if data.dtype[field].kind in "fiub"
             ]
         description = _read_description(file) if FORMAT_ATTRIBUTE in file.attrs else None
-        file_attributes = (
-            {} if description else {name: value for name, value in file.attrs.items() if not name.startswith("_")}
-        )
         remarks = collect_remarks(
-            (name, format_remark(_decode_text(value) or value)) for name, value in file_attributes.items()
+            (name, format_remark(_decode_text(value) or value))
+            for name, value in file.attrs.items()
+            if description is None and not name.startswith("_")
         )
         kind = "NetCDF" if "_NCProperties" in file.attrs else "HDF5"
         return build_fields(series, request, kind, remarks, stated_rate(remarks), description=description, size=size)
@@ -190,8 +188,7 @@ def write_netcdf(
 ) -> None:
     """Write the content of `Recording.series` as a NetCDF-4 file without loss of precision.
 
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history. The file is made in memory first, because libhdf5 aborts the process if the disk is full.
+    The file is made in memory first, because libhdf5 aborts the process if the disk is full.
     """
     import h5netcdf
 

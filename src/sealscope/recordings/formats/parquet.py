@@ -87,10 +87,7 @@ def _is_text(field: Any) -> bool:
 
 
 def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDArray[Any]:
-    """Read the column `field` as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types.
-
-    `read_column`: reads its cells, as a pyarrow ChunkedArray.
-    """
+    """Read the column `field` as doubles, datetime64, timedelta64 or texts (n,); raise InputError for other types."""
     import pyarrow
     from pyarrow import compute, types
 
@@ -114,11 +111,7 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
 def write_parquet(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any]
 ) -> None:
-    """Write the content of `Recording.series` as Parquet columns `t [s]`, `p_A [Pa]`, ... of doubles.
-
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history.
-    """
+    """Write the content of `Recording.series` as Parquet columns `t [s]`, `p_A [Pa]`, ... of doubles."""
     pyarrow = import_library("pyarrow", "Parquet", "pyarrow")
     columns = {f"{name} [{units[name]}]": pyarrow.array(series, from_pandas=False) for name, series in values.items()}
     table = pyarrow.table(columns).replace_schema_metadata({_DESCRIPTION_KEY: json.dumps(description).encode()})

@@ -25,8 +25,7 @@ _CHUNK = 2**20
 def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
     """Read the requested columns of a spreadsheet, from the first sheet that has all of them.
 
-    Visible sheets are tried before hidden ones, and longer before shorter ones. If no sheet has the columns, the error
-    of the sheet that was tried first is raised.
+    Visible sheets are tried before hidden ones, and longer before shorter ones. If all fail, the first error is raised.
     """
     _check_members(path)
     workbook = import_library("python_calamine", "a spreadsheet", "python-calamine").CalamineWorkbook.from_path(

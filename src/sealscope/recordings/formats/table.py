@@ -38,11 +38,11 @@ from sealscope.recordings.formats.timebase import (
     nominal_rate,
     parse_stamps,
     time_base,
+    timedelta_seconds,
 )
 from sealscope.units import to_si
 
-#: Most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz.
-MAX_VALUES = 2**28
+MAX_VALUES = 2**28  # most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz
 #: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
 _MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
 #: Most texts in a column, most bytes of each text, and most bytes of all texts together.
@@ -52,14 +52,11 @@ FORMAT_VERSION = 1
 _CLOCK_LABEL = Label("t [s]", "t", "s")
 #: Channels whose clock all others are brought to, in order of preference.
 _BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
-#: Longest interval of a slower series that is interpolated, in median intervals.
-_MAX_INTERVAL = 3.0
-#: Largest difference of equal clocks, as a fraction of an interval.
-_SAME_CLOCK = 1e-2
+_MAX_INTERVAL = 3.0  # longest interval of a slower series that is interpolated, in median intervals
+_SAME_CLOCK = 1e-2  # largest difference of equal clocks, as a fraction of an interval
 #: Relative difference up to which the written rate of a recording takes precedence over the rate of its time stamps.
 _SAME_RATE = 0.01
-#: Most names in a long table.
-_MAX_NAMES = 4096
+_MAX_NAMES = 4096  # most names in a long table
 #: Function that reads columns before their values are used, and returns lines for the history. Arguments: column ->
 #: kind of its values, as for `text._Log`; and the column of the date that belongs to the time, or None.
 Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
@@ -133,22 +130,18 @@ def build_fields(
 ) -> RecordingFields:
     """Build the fields of a recording from the series in a file; raise InputError if they do not fit together.
 
-    If no columns can be chosen but the series form a long table, in which each row is one sample of a named channel,
-    each of these names is read as a column.
+    If no columns can be chosen, the series may form a long table, in which each row is one sample of a named channel.
 
     - `kind`: format of the file in words; `remarks`: entries in its header.
     - `rate` [Hz]: sampling rate stated by the file, for series without sampling times (`Series.clock`).
     - `description`: rate, provenance and history in a file that Sealscope has written.
-    - `prepare`: function that reads all used columns together, before their values are needed, and returns lines for
-      the history.
+    - `prepare`: function that reads all used columns together before their values are needed.
     - `size` [bytes]: size of a file that may be compressed, from which `check_size` limits the number of values.
     """
     candidates, notes = _make_names_unique(_assign_clocks(series))
     labels = [member.label for member in candidates]
     # sampling times of series count as one more column, unless a series is called t
-    uses_clock = any(member.clock is not None for member in candidates) and not any(
-        label.name == "t" for label in labels
-    )
+    uses_clock = any(member.clock is not None for member in candidates) and all(label.name != "t" for label in labels)
     try:
         choice = choose_columns([*labels, _CLOCK_LABEL] if uses_clock else labels, request, rate)
     except InputError:
@@ -189,13 +182,11 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns that were read from a table to the fields of a recording.
 
-    - `choice`: the columns and their meaning; `columns`: column -> values (n,), doubles or, for the time, datetime64.
-    - `kind`: format of the file in words; `remarks`: entries in its header; `notes`: lines for the history.
-    - `description`: rate, provenance and history in a file that Sealscope has written; None for other files.
+    - `columns`: column -> values (n,), doubles or, for the time, datetime64; `notes`: lines for the history.
+    - `kind`, `remarks`, `description`: as for `build_fields`.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
-    Rows that begin with the last sample are reversed. Raises InputError if there are no rows, or only dates in place of
-    times.
+    Rows that begin with the last sample are reversed. Raises InputError without rows, and for dates in place of times.
     """
     label, start = choice.time_label, dict[str, Any]()
     remarks = remarks or {}
@@ -335,11 +326,6 @@ def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array,
     return to_si(np.asarray(values, dtype=np.float64), unit, "s", name="time"), start
 
 
-def timedelta_seconds(times: Any) -> Array:
-    """Convert timedelta64 values of any shape to seconds."""
-    return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
-
-
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
@@ -363,14 +349,11 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
         group = preferred[min(ambiguous)].group  # of one of these channels, as it often has all
         other_groups = join_names(dict.fromkeys(member.group for member in series if member.group != group), 4)
         notes.append(f"channels of group {group} read, not those of the same name of {other_groups}")
-    unique_names = [
-        member.label.name if preferred[name] is member else member.path
-        for name, member in zip(names, series, strict=True)
-    ]
-    return [
-        replace(member, group="", label=Label(member.path, name, member.label.unit))
-        for name, member in zip(unique_names, series, strict=True)
-    ], notes
+    members = []
+    for name, member in zip(names, series, strict=True):
+        unique_name = member.label.name if preferred[name] is member else member.path
+        members.append(replace(member, group="", label=Label(member.path, unique_name, member.label.unit)))
+    return members, notes
 
 
 def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
@@ -495,8 +478,7 @@ def _read_long_channel(
 
     Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `choice`: the time column, and
     the values as the only channel `u`, in counts (`_count_request`); `table`: column -> cells; `value_column`: column
-    of the values; `label`: heading of the channel. Rows without a time are left out. Raises InputError if too many
-    samples are words.
+    of the values. Rows without a time are left out. Raises InputError for too many words.
     """
     assert choice.time is not None
     times = table[choice.time][rows]
@@ -527,9 +509,8 @@ def _pivot_long_table(
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `column_by_kind`: number of the columns "name", "value" and, if they exist, "unit" and "valid"; `prepare`: as for
-    `build_fields`. Values with a 0 in the column "valid" become NaN. Also returns lines for the history. Raises
-    InputError without a time, or for too many names.
+    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`. Values with a 0 in the column
+    "valid" become NaN. Also returns lines for the history. Raises InputError without a time, or for too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
     text_columns = [column_by_kind[kind] for kind in ("name", "unit") if kind in column_by_kind]
@@ -593,10 +574,7 @@ def check_size(n_rows: int, n_columns: int, file_size: int | None = None) -> Non
 
 
 def check_texts(count: int, width: int, name: str) -> None:
-    """Raise InputError if the texts of the column `name` are too many, too long or too large in all.
-
-    `count`: number of texts; `width` [bytes]: length of the longest one.
-    """
+    """Raise InputError if `count` texts of up to `width` [bytes] in the column `name` are too many or too long."""
     if count > _MAX_TEXTS or width > _MAX_TEXT_WIDTH or count * width > _MAX_TEXT_BYTES:
         raise InputError(
             f"{name} must hold numbers, or at most {_MAX_TEXTS} texts of {_MAX_TEXT_WIDTH} bytes, "

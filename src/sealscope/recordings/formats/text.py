@@ -18,7 +18,7 @@ from itertools import accumulate, chain, pairwise
 from math import inf, isnan
 from os import SEEK_CUR
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -72,14 +72,11 @@ from sealscope.recordings.formats.timebase import (
 
 #: Bytes read at a time; for pyarrow `_ARROW_FACTOR` times as many.
 _CHUNK, _ARROW_FACTOR = 2**19, 4
-#: Longest line [bytes].
-_MAX_LINE = 2**23
-#: Smallest log [bytes] for which pyarrow is imported.
-_MIN_ARROW_SIZE = 2**20
+_MAX_LINE = 2**23  # longest line [bytes]
+_MIN_ARROW_SIZE = 2**20  # smallest log [bytes] for which pyarrow is imported
 #: Characters that begin quoted cells and comments.
 _MARKS = (b'"', b"#", b"%", b"/", b"!")
-#: Longest description in the first line [bytes].
-_MAX_DESCRIPTION = 64 * 1024 * 1024
+_MAX_DESCRIPTION = 64 * 1024 * 1024  # longest description in the first line [bytes]
 _ROWS_PER_WRITE = 8192
 #: Most lines of text among few samples (marks of events, a summary), and the longest such line.
 _MAX_TEXT_LINES, _MAX_TEXT_LINE = 8, 400
@@ -120,10 +117,7 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     log = _Log(path, layout, kinds=choice.columns, date=choice.date)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
-        """Convert one part of the log to fields, with `more_notes` in its history.
-
-        `state`: state of the time column after the previous part, which is updated.
-        """
+        """Convert a part of the log to fields; update `state`, that of the time column after the previous part."""
         columns, notes = log.join_blocks(blocks)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
@@ -159,10 +153,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         time_of_column = {column: max(time for time in time_columns if time < column) for column in columns}
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-        """Read the requested columns and their times, and return lines for the history.
-
-        `kinds`: index in `columns` -> kind of its values, such as "numbers"; `date`: column of the date, or None.
-        """
+        """Read the columns with the indices `kinds` in `columns`, and their times; return lines for the history."""
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
         log = _Log(path, layout, kinds_by_column | time_kinds, None if time_columns else date)
@@ -197,9 +188,9 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
 
 
 def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup a log's blocks into lists of blocks with `size` rows in all; the last list may have fewer rows.
+    """Regroup a log's blocks, divided where necessary, into lists with `size` rows in all; the last may have fewer.
 
-    Blocks are divided where necessary. If `size` is inf, all blocks are in a single list.
+    If `size` is inf, all blocks are in a single list.
     """
     group: list[_Block] = []
     missing_rows = size
@@ -254,15 +245,12 @@ class _Log:
     """Reader of the rows of a text log, block by block; a word is a text in place of a number or a time stamp."""
 
     def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
-        """Prepare to read the log at `path`, without reading rows, and decide if pyarrow can read its layout.
+        """Prepare to read the log at `path`, and decide if pyarrow can read its layout.
 
         `kinds`: column to read -> kind of its values: "numbers"; "any", i.e. numbers with inf in place of words;
         "time"; or "texts". `date`: column of the date that belongs to the time, or None.
         """
-        self.path, self.place = path, str(path)
-        self.layout = layout
-        self.kinds = kinds
-        self.date = date
+        self.path, self.layout, self.kinds, self.date = path, layout, kinds, date
         self.min_cells = max(kinds) + 1  # fewest cells that a row must have
         self.n_rows = self.n_repeated = self.n_text_lines = 0  # rows, repeated heading lines, lines of text until now
         self.first_text_line = ""  # the first line of text with its place, for messages
@@ -281,30 +269,59 @@ class _Log:
 
     def iter_blocks(self) -> Iterator[_Block]:
         """Yield the rows of the log in blocks, read by pyarrow as far as possible, else row by row."""
-        is_first = True
-        with self.path.open("rb") as file:
-            line_blocks = _iter_line_blocks(
-                file, self.layout.encoding, self.place,
-                lambda: _CHUNK * (_ARROW_FACTOR if self.uses_arrow and not is_first else 1),
-            )  # fmt: skip
-            for first_line, content, end, is_cut in line_blocks:
-                block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
-                if is_first and block is None:
-                    # the first block fails if pyarrow cannot read the log, later ones also for a comment or a word
+        for first_line, content, end, is_cut in self._iter_line_blocks():
+            block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
+            if block is None:
+                if first_line == 1:  # later blocks fail also for a comment or a word
                     self.uses_arrow = False
-                is_first = False
-                if block is None:
-                    rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
-                    self._count_rows(len(rows))
-                    block = self._parse_rows(rows, line_numbers, is_cut) if rows else None
-                if block is not None:
-                    yield block
+                rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
+                self._count_rows(len(rows))
+                block = self._parse_rows(rows, line_numbers, is_cut) if rows else None
+            if block is not None:
+                yield block
+
+    def _iter_line_blocks(self) -> Iterator[tuple[int, bytes, int, bool]]:
+        """Yield the log in blocks of lines: (number of the first line, from 1; bytes; end; is_cut).
+
+        The bytes before index `end` are complete lines; the others come again in the next block. Lines end at a
+        newline; in a one-byte encoding, those of a block without any newline end at a carriage return. Only the last
+        block may have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's
+        length. Raises InputError for binary data, and for a line that is too long.
+        """
+        encoding = self.layout.encoding
+        character_bytes = 2 if encoding.startswith("utf-16") else 1
+        newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
+        first_line, n_bytes = 1, _CHUNK
+        with self.path.open("rb") as file:
+            while block := file.read(n_bytes):
+                while (end := _last_newline(block, newline)) < 0 and len(block) < _MAX_LINE:
+                    if not (more := file.read(n_bytes)):
+                        break
+                    block += more
+                if character_bytes == 1 and b"\0" in block:
+                    line = first_line + block[: block.index(b"\0")].count(b"\n")
+                    raise InputError(f"a text log must be text throughout, got binary data (line {line}, {self.path})")
+                if end < 0 and len(block) >= _MAX_LINE:
+                    if b"\r" not in block or character_bytes == 2:
+                        raise InputError(f"a text log must have lines, got {len(block)} bytes without")
+                    end = block.rfind(b"\r")
+                if end < 0:
+                    yield first_line, block, len(block), not block.endswith(b"\r")
+                    return
+                end += character_bytes
+                file.seek(end - len(block), SEEK_CUR)  # reading again costs less than copying the block
+                yield first_line, block, end, False
+                # numpy counts newlines faster than bytes does
+                characters = np.frombuffer(block, f"<u{character_bytes}", end // character_bytes)
+                n_lines = int(np.count_nonzero(characters == int.from_bytes(newline, "little")))
+                first_line += n_lines or block.count(b"\r", 0, end)
+                n_bytes = _CHUNK * (_ARROW_FACTOR if self.uses_arrow else 1)
 
     def _split_rows(self, first_line: int, block: bytes, is_cut: bool) -> tuple[list[list[str]], Sequence[int]]:
         """Split a block of bytes of the log into rows of cells; also return the line number of each row.
 
-        Lines that are not samples are left out. `first_line`: number of the block's first line, from 1; `is_cut`: the
-        file ends within the block's last line. If this is shorter than the row before, its last number is left out.
+        Lines that are not samples are left out. `first_line`, `is_cut`: as in `_iter_line_blocks`. If a cut last line
+        has fewer cells than the row before, its last number is left out.
         """
         lines = _decode_lines(block, self.layout)
         samples = self._select_samples(lines, max(0, self.layout.first_row + 1 - first_line))
@@ -326,10 +343,9 @@ class _Log:
         check_size(self.n_rows, len(self.kinds))
 
     def _read_by_arrow(self, first_line: int, block: bytes, end: int) -> _Block | None:
-        """Read the rows of a block of bytes by pyarrow, and count them.
+        """Read the rows of a block of bytes by pyarrow; `first_line`, `end`: as in `_iter_line_blocks`.
 
-        `first_line`: number of the block's first line, from 1; `end`: number of bytes of its complete lines. Returns
-        None, and counts no rows, unless all cells to read are plain finite numbers or missing.
+        Returns None unless all cells to read are plain finite numbers or missing.
         """
         from pyarrow import ArrowInvalid, csv, float64, py_buffer
 
@@ -371,10 +387,7 @@ class _Log:
         return result
 
     def _select_samples(self, lines: Sequence[str], first: int) -> list[int]:
-        """List the indices of lines with samples, from `first` on: no comments, blank lines or repeated headings.
-
-        Repeated headings are counted in `n_repeated`.
-        """
+        """List the indices of lines with samples, from `first` on: no comments, blank lines or repeated headings."""
         blank = " " if self.layout.delimiter == "\t" else None  # a line of tabs is a row of missing samples
         content = [
             i for i in range(first, len(lines)) if lines[i].strip(blank) and not lines[i].lstrip().startswith(COMMENTS)
@@ -385,10 +398,9 @@ class _Log:
         return rows
 
     def _split_lines(self, lines: list[str], line_numbers: Sequence[int], is_cut: bool) -> list[list[str]]:
-        """Split lines of the log into cells; `line_numbers` are those in the file.
+        """Split lines of the log into cells; raise InputError for a quotation mark that is not closed on its line.
 
-        Raises InputError for a quotation mark that is not closed on its line. If the file ends within the last line
-        (`is_cut`), such a cell becomes empty instead.
+        In a last line within which the file ends (`is_cut`), such a cell becomes empty instead.
         """
         delimiter = self.layout.delimiter
         if delimiter == " ":
@@ -402,10 +414,8 @@ class _Log:
             if reader.line_num > line + 1:  # a quoted cell continues on the next line
                 if is_cut and line == len(lines) - 1:
                     return [*rows, [*row[:-1], ""]]
-                raise InputError(
-                    f"a quotation mark must be closed on its line, got an open one "
-                    f"(line {line_numbers[line]}, {self.place})"
-                )
+                place = f"(line {line_numbers[line]}, {self.path})"
+                raise InputError(f"a quotation mark must be closed on its line, got an open one {place}")
             rows.append(row)
         return rows[:-1]  # without the empty line
 
@@ -424,7 +434,7 @@ class _Log:
         for i, row in enumerate(rows):
             is_short = len(row) < self.min_cells
             has_value = any(is_value(cell, layout.decimal) for cell in row)
-            place = f"(line {line_numbers[i]}, {self.place})"
+            place = f"(line {line_numbers[i]}, {self.path})"
             if is_short and not has_value and sum(map(len, row)) <= _MAX_TEXT_LINE:
                 self.first_text_line = self.first_text_line or f"{layout.delimiter.join(row).strip()[:40]!r} {place}"
                 self.n_text_lines += 1
@@ -435,10 +445,9 @@ class _Log:
         return [rows[i] for i in complete_rows], [line_numbers[i] for i in complete_rows]
 
     def _parse_rows(self, rows: Sequence[Sequence[str]], line_numbers: Sequence[int], is_cut: bool) -> _Block:
-        """Parse rows of cells to a block of values.
+        """Parse rows of cells to a block of values; `line_numbers`: line of each row; `is_cut`: the last is incomplete.
 
-        `line_numbers`: line of each row in the file; `is_cut`: the last row is incomplete. Words become NaN or NaT and
-        are counted in `n_words`; in a column of the kind "any" they become inf and are not counted.
+        Words become NaN or NaT and are counted in `n_words`; in a column of the kind "any" they become inf, uncounted.
         """
         block = _Block()
         for column, kind in self.kinds.items():
@@ -468,11 +477,10 @@ class _Log:
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
-        """Return True if the time column contains dates or times of day as text, False if it contains numbers.
+        """Test whether the time column, with `cells` in `rows`, contains dates or times of day as text, not numbers.
 
-        `cells`: cells of the time column in `rows`. The first cell that is not missing decides for the whole log, and
-        sets `has_stamps`, and `has_date`: True if the stamps are times of day, and the cell in the date column is a
-        date.
+        The first cell that is not missing decides for the whole log, and sets `has_stamps`, and `has_date`: True if the
+        stamps are times of day, and the cell in the date column is a date.
         """
         index = next((i for i, cell in enumerate(cells) if not is_missing(cell)), None)
         if self.has_stamps is None and index is not None:
@@ -493,7 +501,7 @@ class _Log:
 
     def _format_place(self, index: int, line_numbers: Sequence[int], column: int) -> str:
         """Format the line, column and file of the cell in row `index` of a block, whose `line_numbers` are given."""
-        return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.place})"
+        return f"(line {line_numbers[index]}, column {self.layout.labels[column].whole}, {self.path})"
 
     def _parse_dates(
         self, cells: list[str], format_place: Callable[[int], str]
@@ -501,8 +509,7 @@ class _Log:
         """Parse cells of the time column to time stamps (n,), NaT for empty cells and words (texts without digits).
 
         Also returns the indices of the words. At the first ambiguous date, such as 05/06/2024, the log's dates decide
-        `day_first`. Raises InputError for texts with digits that are not stamps. `format_place`: index of a cell -> its
-        place.
+        `day_first`. Raises InputError for texts with digits that are not stamps.
         """
         texts = ["" if cell.strip().lower() in MISSING else cell for cell in cells]
         if self.day_first is None and ambiguous_dates(texts):
@@ -523,17 +530,15 @@ class _Log:
             raise InputError(f"{_STAMP_RULE}, got {cells[bad_row]!r} {format_place(bad_row)}") from None
 
     def _detect_day_first(self) -> bool:
-        """Detect if the day precedes the month in the log's dates.
+        """Detect if the day precedes the month, from the log's beginning to the first date with a number over 12.
 
-        The log is read from its beginning to the first date with a number over 12. Without such a date, the order is
-        guessed (`is_day_first`), and `order_note` says so.
+        Without such a date, the order is guessed (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
         dates: list[dict[str, None]] = [{} for _ in columns]
-        with suppress(InputError), self.path.open("rb") as file:  # errors are raised when the row is read again
-            line_blocks = _iter_line_blocks(file, self.layout.encoding, self.place, lambda: _CHUNK)
-            for first_line, content, end, is_cut in line_blocks:
+        with suppress(InputError):  # errors are raised when the row is read again
+            for first_line, content, end, is_cut in log._iter_line_blocks():
                 rows, _line_numbers = log._split_rows(first_line, content[:end], is_cut)
                 for column, column_dates in zip(columns, dates, strict=True):
                     column_dates.update(ambiguous_dates(self._join_dates(rows, column)))
@@ -585,52 +590,16 @@ class _Log:
         return columns, notes
 
     def describe_text_lines(self) -> list[str]:
-        """Describe, for the history, the lines of text and repeated headings that were left out.
-
-        Raises InputError if there are too many lines of text.
-        """
+        """Describe the text and repeated headings that were left out; raise InputError for too many lines of text."""
         if self.n_text_lines > max(MAX_WORD_FRACTION * self.n_rows, _MAX_TEXT_LINES):
             raise InputError(f"a sample must be a number, got {self.first_text_line}")
-        lines = format_count(self.n_text_lines, "line")
-        text = f"{lines} of text among the samples left out, first {self.first_text_line}"
-        headings = f"{format_count(self.n_repeated, 'line')} of the heading repeated among the samples left out"
-        return [*([text] if self.n_text_lines else []), *([headings] if self.n_repeated else [])]
-
-
-def _iter_line_blocks(
-    file: BinaryIO, encoding: str, place: str, n_bytes: Callable[[], int]
-) -> Iterator[tuple[int, bytes, int, bool]]:
-    """Yield a text file in blocks of lines: (number of the first line, bytes, end, is_cut).
-
-    The bytes before index `end` are complete lines; the others come again in the next block. Lines end at a newline; in
-    a one-byte encoding, those of a block without any newline end at a carriage return. Only the last block may have an
-    incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's length. `encoding`: for
-    UTF-16 with its byte order; `place`: name of the file in errors; `n_bytes`: number of bytes to read next. Raises
-    InputError for binary data, and for a line that is too long.
-    """
-    character_bytes = 2 if encoding.startswith("utf-16") else 1
-    newline = "\n".encode(encoding if character_bytes == 2 else "ascii")
-    first_line = 1
-    while block := file.read(n_bytes()):
-        while (end := _last_newline(block, newline)) < 0 and len(block) < _MAX_LINE and (more := file.read(n_bytes())):
-            block += more
-        if character_bytes == 1 and b"\0" in block:
-            line = first_line + block[: block.index(b"\0")].count(b"\n")
-            raise InputError(f"a text log must be text throughout, got binary data (line {line}, {place})")
-        if end < 0 and len(block) >= _MAX_LINE:
-            if b"\r" not in block or character_bytes == 2:
-                raise InputError(f"a text log must have lines, got {len(block)} bytes without")
-            end = block.rfind(b"\r")
-        if end < 0:
-            yield first_line, block, len(block), not block.endswith(b"\r")
-            return
-        end += character_bytes
-        file.seek(end - len(block), SEEK_CUR)  # reading again costs less than copying the block
-        yield first_line, block, end, False
-        # numpy counts newlines faster than bytes does
-        characters = np.frombuffer(block, f"<u{character_bytes}", end // character_bytes)
-        n_lines = int(np.count_nonzero(characters == int.from_bytes(newline, "little")))
-        first_line += n_lines or block.count(b"\r", 0, end)
+        notes = []
+        if self.n_text_lines:
+            lines = format_count(self.n_text_lines, "line")
+            notes.append(f"{lines} of text among the samples left out, first {self.first_text_line}")
+        if self.n_repeated:
+            notes.append(f"{format_count(self.n_repeated, 'line')} of the heading repeated among the samples left out")
+        return notes
 
 
 def _last_newline(block: bytes, newline: bytes) -> int:
@@ -652,10 +621,10 @@ def _decode_lines(block: bytes, layout: Layout) -> list[str]:
 def write_text(
     path: Path, values: Mapping[str, Array], units: Mapping[str, str], description: Mapping[str, Any], delimiter: str
 ) -> None:
-    """Write a text log: `# sealscope: {...}`, the header `t [s],p_A [Pa],...` and one row per sample, without loss.
+    """Write the content of `Recording.series` as a text log, without loss.
 
-    `values`: name -> samples (n,), with the time as `t`; `units`: name -> unit; `description`: rate, provenance and
-    history. Missing samples become empty cells. Raises InputError for an infinite sample.
+    It consists of the line `# sealscope: {...}` with the description, the header `t [s],p_A [Pa],...` and one row per
+    sample. Missing samples become empty cells. Raises InputError for an infinite sample.
     """
     for name, series in values.items():
         if np.isinf(series).any():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import codecs
+import csv
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -28,20 +29,17 @@ from sealscope.recordings.formats.headings.preamble import parse_remarks, stated
 from sealscope.recordings.formats.headings.proposal import has_known_word, is_quantity
 from sealscope.recordings.formats.headings.words import WORDS
 
-#: Bytes at the beginning of a file from which its format and layout are detected.
-SNIFF = 64 * 1024
+SNIFF = 64 * 1024  # bytes at the beginning of a file from which its format and layout are detected
 #: Beginning of the first line of logs written by Sealscope, before their description in JSON.
 DESCRIPTION_MARK = "# sealscope: "
 COMMENTS = ("#", "%", "//", '"#', "!")
-#: Rows from which the dialect is detected.
-_N_ROWS = 100
+_N_ROWS = 100  # rows from which the dialect is detected
 #: Delimiters, each with the decimal separator of the dialect to try.
 _DIALECTS = (*product("\t;", ".,"), (",", "."), *product("|", ".,"), (",", ","), *product(" ", ".,"))
 #: A digit and a letter after it, which may begin a unit or be an SI prefix, but not the exponent of the number.
 _QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
 _RULER = re.compile(r"[-=_:+]{1,80}")
-#: Most lines of a heading.
-_MAX_HEADING = 12
+_MAX_HEADING = 12  # most lines of a heading
 _SPACED_LABEL = re.compile(r"\S+(?:\s{0,20}(?:\[[^\]]{0,40}\]|\([^)]{0,40}\)))?")
 _DELIMITER_NAMES = {"\t": "tab", ";": "semicolon", ",": "comma", "|": "bar", " ": "blank"}
 
@@ -107,16 +105,13 @@ def split_at_blanks(line: str) -> list[str]:
 
 
 def split_cells(line: str, delimiter: str) -> list[str]:
-    """Split a line into cells at the `delimiter`, but not within quotation marks.
+    """Split a line into cells at the `delimiter`, or at blanks and tabs if this is a blank.
 
-    A blank as the delimiter stands for any blanks and tabs. Quotation marks are removed; if the delimiter is a blank,
-    they have no meaning and stay.
+    Other delimiters do not count within quotation marks, which are removed.
     """
     if delimiter == " ":
         return split_at_blanks(line)
     if '"' in line:
-        import csv
-
         return next(csv.reader([line], delimiter=delimiter, skipinitialspace=True), [])
     return line.split(delimiter)
 
@@ -131,8 +126,7 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 
     Each pair of separators in `_DIALECTS` is tried. Its table consists of the rows of one width, namely the width with
     most values (numbers and time stamps), and must contain at least half of all values. A pair's rank is the number of
-    values in its table over the number of cells, except missing ones, in all rows with a value. The highest rank wins.
-    Rows of a single cell are ignored.
+    values in its table over the number of cells, except missing ones, in all rows with a value.
     """
     ranks: dict[tuple[str, str, int], tuple[float, float, bool, int]] = {}
     text = "\n".join(body)

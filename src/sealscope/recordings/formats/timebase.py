@@ -35,8 +35,7 @@ _DATES = (
 )
 _EITHER_DATE = re.compile(rf"\s*(?P<date>{_EITHER})")
 _LAST_MONTH = 12
-#: Hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it.
-_WRONG_HOUR = 99
+_WRONG_HOUR = 99  # hour of a wrong time on a 12-hour clock, such as 13 PM; numpy refuses it
 #: A number, which is a stamp only if it has eight digits.
 _BARE_NUMBER = re.compile(r"[+-]?\d*(?:[.,]\d*)?")
 _CLOCK = r"\d{1,2}:\d{2}(?::\d{2}(?:[.,:]\d{1,9})?|[.,]\d{1,9})?|\d{6}(?:[.,]\d{1,9})?"
@@ -54,23 +53,19 @@ _SINCE = re.compile(r"(?P<unit>[a-z]{1,20})\s{1,9}since\s{1,9}(?P<start>.{1,64})
 _LONG_UNITS = {"milliseconds": "ms", "microseconds": "us", "nanoseconds": "ns", "days": "day", "day": "day"}
 #: Smallest number without a unit that is read as the time since 1970, and its unit.
 _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
-#: Fewest samples from which the number of samples per stamp is estimated.
-_MIN_SHARED = 20
+_MIN_SHARED = 20  # fewest samples from which the number of samples per stamp is estimated
 #: Largest deviation of times from a uniform clock that is rounding, in intervals; limits of a rate's relative error.
 _MAX_ROUNDING, _MIN_SLACK, _MAX_SLACK = 0.6, 1e-9, 1e-3
 #: The date used for a time of day without a date.
 _NO_DATE = "1970-01-01"
 _HOUR, _DAY = 3600.0, 86400.0  # [s]
-#: Largest deviation of a clock jump from its nominal size, in median intervals.
-_TOLERANCE = 3.0
-#: Daylight saving time changes before this hour of the day.
-_LATEST_CHANGE = 4
+_TOLERANCE = 3.0  # largest deviation of a clock jump from its nominal size, in median intervals
+_LATEST_CHANGE = 4  # daylight saving time changes before this hour of the day
 #: Range of days since 1899-12-30 in the years 1982 to 2077.
 _EXCEL_RANGE = (30_000, 65_000)
 #: Largest intervals of numbers that count fractions of a day, and days: no logger samples every 2 or 12 us.
 _MAX_FRACTION_STEP, _MAX_DAY_STEP = 2e-6, 1.2e-5
-#: MATLAB's datenum of 1899-12-30.
-_DATENUM_OFFSET = 693_960
+_DATENUM_OFFSET = 693_960  # MATLAB's datenum of 1899-12-30
 #: Numbers from here on (December 2073 if counted from 1970) are seconds since 1904 (then December 2007).
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 #: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.
@@ -143,7 +138,7 @@ def parse_stamps(cells: Sequence[str], day_first: bool | None = None) -> NDArray
     try:
         return np.array(iso_stamps, dtype="datetime64[ns]")
     except ValueError:  # such as the 30th of February
-        raise ValueError(next(index for index, text in enumerate(iso_stamps) if not _is_datetime(text))) from None
+        raise ValueError([text == "NaT" or parse_epoch(text) is not None for text in iso_stamps].index(False)) from None
 
 
 def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
@@ -152,10 +147,7 @@ def ambiguous_dates(cells: Iterable[str]) -> dict[str, None]:
 
 
 def explicit_order(dates: Iterable[str]) -> bool | None:
-    """Decide from dates such as 05/06/2024 if the day precedes the month; None if they do not show it.
-
-    The first date with exactly one number over 12 decides: True if this is its first number, as in 31/12/2024.
-    """
+    """Decide from dates such as 31/12/2024 if the day comes first; None if none has exactly one number over 12."""
     over_12 = ((first > _LAST_MONTH, second > _LAST_MONTH) for first, second, _ in map(_date_numbers, dates))
     return next((is_first_over for is_first_over, is_second_over in over_12 if is_first_over != is_second_over), None)
 
@@ -198,15 +190,6 @@ def _date_numbers(text: str) -> tuple[int, int, int]:
     return int(first), int(second), int(year) + (2000 if len(year) == 2 else 0)
 
 
-def _is_datetime(text: str) -> bool:
-    """Test whether a text in ISO form is a valid datetime64, which the 30th of February is not."""
-    try:
-        np.datetime64(text, "ns")
-    except ValueError:
-        return False
-    return True
-
-
 def counts_from_1970(clock: float) -> bool:
     """Test whether a clock reading [s] counts from 1970, i.e. would then be a time from March 1973 to the year 5138."""
     return _MIN_EPOCH < clock < _MAX_EPOCH
@@ -235,10 +218,7 @@ def parse_epoch(stamp: str) -> float | None:
 
 
 def _format_clock(text: str) -> str:
-    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`.
-
-    `12:00` and other times in this form stay as they are, except that a decimal comma becomes a point.
-    """
+    """Rewrite times of day such as `120000`, `59:59.9` and `12:00:00:250` as `hour:minute:second.fraction`."""
     text = text.replace(",", ".")
     if ":" not in text:
         return f"{text[:2]}:{text[2:4]}:{text[4:]}"
@@ -251,10 +231,7 @@ def _format_clock(text: str) -> str:
 
 
 def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
-    """Format the date in the `parts` of a time stamp in ISO form, or 1970-01-01 if they contain no date.
-
-    `day_first`: the day precedes the month, as in 31/12/2024.
-    """
+    """Format the date in the `parts` of a time stamp in ISO form, or 1970-01-01 if they contain no date."""
     if days := parts.get("days"):  # a duration
         return str(np.datetime64(_NO_DATE) + int(days))
     year, month, day = (parts.get(name) for name in ("year", "month", "day"))
@@ -262,6 +239,11 @@ def _iso_date(parts: Mapping[str, str | None], day_first: bool) -> str:
         first, second = parts["first"], parts["second"]
         month, day = (second, first) if day_first else (first, second)
     return f"{'20' if len(year) == 2 else ''}{year}-{month:0>2}-{day:0>2}" if year else _NO_DATE
+
+
+def timedelta_seconds(times: Any) -> Array:
+    """Convert timedelta64 values of any shape to seconds, NaT to NaN."""
+    return np.asarray(times / np.timedelta64(1, "ns"), dtype=np.float64) / 1e9
 
 
 def nominal_rate(t: Array) -> float:
@@ -287,8 +269,7 @@ def nominal_rate(t: Array) -> float:
 def interpolate_samples(t: Array, times: Array, values: Array, max_interval: float) -> Array:
     """Interpolate `values` (m,) at increasing `times` (m,) [s] linearly to the times `t` (n,) [s].
 
-    The result is NaN beyond the ends, within intervals over `max_interval` times the median interval, and throughout
-    for fewer than two samples.
+    The result is NaN beyond the ends, within intervals over `max_interval` median intervals, and for under two samples.
     """
     if times.size < 2:
         return np.full(t.size, np.nan)
@@ -315,8 +296,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
 
     Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
     hour are removed. In dated stamps a single jump by an hour in the night, due to daylight saving time, is removed.
-    Returns the times (n,) [s], the provenance of the start, and lines for the history. Raises InputError if all stamps
-    are missing.
+    Raises InputError if all stamps are missing.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -328,8 +308,7 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
         nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
     stamps = nanoseconds[known]
     start = stamps[0]
-    t = (nanoseconds - start).astype(np.int64).astype(np.float64) / 1e9
-    t[~known] = np.nan
+    t = timedelta_seconds(nanoseconds - start)
     earliest_hour = int((stamps - stamps.astype("datetime64[D]")).min() / np.timedelta64(1, "h"))  # of the day
     note_of_jump = {
         -_DAY: "has no date: begins again with the next day",
@@ -367,12 +346,10 @@ def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
 
 
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
-    """Convert a time column of numbers (n,) to seconds.
+    """Convert a time column of numbers (n,) to seconds, those with an origin or since 1970 relative to the first.
 
-    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers. Only the
-    guess uses `name`, the column's name for messages, and `state`, what is known from earlier parts of the log. Returns
-    the times (n,) [s], the provenance of the start, and lines for the history. Times with an origin, or since 1970,
-    become relative to the first. Raises InputError if no number is finite.
+    `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers of the
+    log's first part, which `state` keeps. Raises InputError if no number is finite.
     """
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -400,8 +377,7 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     """Convert a time column of numbers (n,) without a unit to seconds; `finite` (m,) are the finite ones of `values`.
 
     A long log is read in parts. The finite values of the first part, which `state` keeps, tell for all parts whether
-    the numbers are days or seconds, and from which date they count. Returns the times (n,) [s], the provenance of the
-    start, and lines for the history, which call the column `name`. Raises InputError if the numbers only count rows.
+    the numbers are days or seconds, and from which date they count. Raises InputError if the numbers only count rows.
     """
     first = float(finite[0])
     is_first_part = state.head is None
@@ -490,10 +466,9 @@ def time_base(
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
     """Replace the times of samples that share each reading of a coarse clock by evenly spaced times.
 
-    Returns (clock step [s], new times (n,)) for the times `t` (n,) [s]. Returns None if a time is missing or steps
-    back, if there are fewer than two samples per clock step on average, or if a step's number of samples differs from
-    this average by more than one. A part of a log that is too short to show this gets the clock step and the sampling
-    rate of the earlier parts from `state`.
+    Returns (clock step [s], new times (n,)), or None if a time is missing or steps back, if there are fewer than two
+    samples per clock step on average, or if a step's number of samples differs from this average by more than one. A
+    part of a log too short to show this gets the clock step and the rate of the earlier parts from `state`.
     """
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes

@@ -87,7 +87,7 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
     volts = command.volts(np.arange(0.0, duration + dt, dt))
     area = 0.5 * (cylinder.A_A + cylinder.A_B)
     if not rig.circuit.pump_feeds_chambers:
-        flow_per_volt = drive_of(rig).unloaded_flow(1.0)
+        flow_per_volt = drive_of(rig).flow_per_volt
         positions = dt * np.cumsum(volts) * flow_per_volt / area
         centre = 0.5 * (min(positions.min(), 0.0) + max(positions.max(), 0.0))  # 0: the path's start
         return float(np.clip(-centre, -half_stroke, half_stroke))

@@ -10,10 +10,8 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field
 
 from sealscope.errors import InputError
-from sealscope.parameters import declared_names
 from sealscope.parameters.fields import choices_of, unit_of
-from sealscope.parameters.names import resolve_name
-from sealscope.parameters.rig import declared_fields
+from sealscope.parameters.rig import declared_fields, resolve_name
 from sealscope.simulation.changes import ParameterDrift, is_absolute_drift, linear_path
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
 from sealscope.storage.plain_values import convert_type
@@ -163,7 +161,7 @@ def _parse_nuisance(table: Any) -> AnyNuisance:
 
 def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
     """Make the nuisance of an entry, in SI units; raise InputError if the entry's fields do not fit together."""
-    parameters = tuple(resolve_name(name, declared_names()) for name in entry.parameters)
+    parameters = tuple(resolve_name(name) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
     choices, si_unit = next(iter(kinds))  # several are refused below, except for a `scale`, which has no unit

@@ -25,8 +25,7 @@ def apply_descriptions(labels: Sequence[Label], rows: Sequence[Sequence[str]]) -
 
     They are in a table of channels above the heading, whose rows begin with the last word of a column's name, or in a
     row of labels, in the order of the columns, with `label` or `labels` in place of the first. The first description of
-    a column counts; it may state the unit. `rows`: cells of all these lines. The last word of a replaced name is kept
-    in `Label.called`.
+    a column counts; it may state the unit. `rows`: cells of all these lines.
     """
     names: dict[str, str] = {}
     name_column: int | None = None
@@ -56,10 +55,7 @@ def _column_key(label: Label) -> str:
 
 
 def _rename_label(label: Label, description: str) -> Label:
-    """Replace a column's name by a description, and keep the last word of the replaced name in `Label.called`.
-
-    The label stays as it is if the description is empty, too long or equal to that word.
-    """
+    """Replace a column's name by a description, unless this is empty, too long or the last word of the name."""
     if not description or len(description) > _MAX_NAME or _fold(description) == _column_key(label):
         return label
     renamed = Label.parse(description)  # it may end in a unit

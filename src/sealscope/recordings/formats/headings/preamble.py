@@ -80,18 +80,11 @@ def collect_attributes(attributes: Mapping[Any, object]) -> dict[str, str]:
     return collect_remarks(pair for pair in attributes.items() if isinstance(pair[1], str | int | float))
 
 
-def clean_remarks(provenance: Mapping[str, object]) -> dict[str, str]:
-    """Return the remarks from a file's header (`about` in the `provenance`), name -> text, printable and shortened."""
-    remarks = provenance.get("about")
-    return collect_remarks(remarks.items()) if isinstance(remarks, Mapping) else {}
-
-
 def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
     """Parse the remarks above a log's heading, such as `Operator: N. N.`, `Oil = 40 degC` or `Date;2024-05-31`.
 
-    Returns name -> text for up to `_MAX_REMARKS` remarks (`collect_remarks`). Only the first 4 * `_MAX_REMARKS` of the
-    `lines`, and 500 characters of each, are read. `delimiter`: separator of the log's cells, which may also separate
-    the name of a remark from its text.
+    Returns name -> text. Only the first 4 * `_MAX_REMARKS` of the `lines`, and 500 characters of each, are read.
+    `delimiter`: separator of the log's cells, which may also separate the name of a remark from its text.
     """
     pairs: list[tuple[str, str]] = []
     for line in lines[: 4 * _MAX_REMARKS]:

@@ -57,8 +57,7 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
 
     Left out are columns that already have a channel's name, and channels for which several columns are equally likely.
-    A unit at the end of a name (``PA_bar``) becomes the unit of the column. The map is empty if it would contain only
-    the time.
+    A unit at the end of a name (``PA_bar``) becomes the unit of the column. A map of the time alone is left out, too.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
     head_side = _find_head_side(labels)  # the chamber that the word "head" means in these names
@@ -160,10 +159,7 @@ def find_name_and_unit(label: Label) -> tuple[str, str | None]:
 
 
 def ends_in(name: str, words: str) -> bool:
-    """Test whether the name of a column ends in `words`, as `ADC1_Channel_2` in `ch2` and `Main_Pa` in `Pa`.
-
-    False unless `words` begins with a letter: a number alone would fit many names.
-    """
+    """Test whether the name of a column ends in `words` that begin with a letter, as `ADC1_Channel_2` ends in `ch2`."""
     token_lists = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if word in WORDS["input"] else word for word in tokens] for tokens in token_lists)
@@ -176,10 +172,7 @@ def names_oil(name: str) -> bool:
 
 
 def is_oil_temperature(name: str) -> bool:
-    """Test whether the name of a temperature is the oil's.
-
-    It has a word for oil, or none but words for a temperature, as in `TT101` or `Temp 1`.
-    """
+    """Test whether the name of a temperature has a word for oil, or none but for a temperature, as in `TT101`."""
     return names_oil(name) or {word for word in _split_words(name) if not word.isdigit()} <= _KIND["temperature"]
 
 
@@ -216,8 +209,7 @@ def _split_words(name: str) -> set[str]:
     """Split a name into its words, in lower case, and parts of words.
 
     Parts are both words of a German compound with a known ending, such as `kolbenseite` and `druck`, the first one also
-    without an n or s that links them; both letters of `pa` and `pb`; and known words of languages without spaces, such
-    as Chinese.
+    without a linking n or s; both letters of `pa` and `pb`; and known words of languages without spaces.
     """
     words = {word for word in _UNSPACED if word in name}
     for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
@@ -285,10 +277,9 @@ def is_current_or_fraction(unit: str) -> bool:
 
 
 def _guess_at_valve(label: Label, kind: str) -> _Guess | None:
-    """Guess from the name if a column is the pressure upstream or downstream of a valve.
+    """Guess from the name if a column is the pressure upstream ("before") or downstream ("behind") of a valve.
 
-    `kind`: "before" for upstream, "behind" for downstream. Returns None if the name has no such word, the unit is not
-    one of pressure, or the name means a set point.
+    Returns None if the name has no such word, the unit is not one of pressure, or the name means a set point.
     """
     name, unit = find_name_and_unit(label)
     words = _split_words(name)

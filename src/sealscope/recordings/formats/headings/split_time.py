@@ -19,8 +19,7 @@ _NANOSECONDS = {"hour": 3600e9, "minute": 60e9, "second": 1e9, "ms": 1e6, "us": 
 _UPPER_LIMIT = {
     "month": 13.0, "day": 32.0, "hour": 24.0, "minute": 60.0, "second": 60.0, "ms": 1e3, "us": 1e6, "ns": 1e9
 }  # fmt: skip
-#: Fraction of the steps that must follow a rule: a log may have lost some samples.
-_MIN_FRACTION = 0.9
+_MIN_FRACTION = 0.9  # fraction of the steps that must follow a rule: a log may have lost some samples
 
 
 def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecond: bool = False) -> dict[str, int]:
@@ -51,9 +50,8 @@ def find_time_parts(labels: Sequence[Label], used: Container[int], only_subsecon
 def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str | None) -> NDArray[Any] | None:
     """Combine several columns of a time, such as date, hours and minutes, to time stamps or seconds (n,).
 
-    `base` (n,): the time column, datetime64 or doubles in `unit`; if there is a part "hour", only the dates in `base`
-    are used. `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the
-    start.
+    `base` (n,): the time column, datetime64 or doubles in `unit`, of which only dates are used beside a part "hour";
+    `parts`: part -> values (n,). None if these cannot be parts of a time, such as milliseconds since the start.
     """
     subsecond_parts = [part for part in _SUBSECOND if part in parts]
     smallest_part = subsecond_parts[-1] if subsecond_parts else "second"
@@ -83,9 +81,8 @@ def combine_time_parts(base: NDArray[Any], parts: Mapping[str, Array], unit: str
 def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
     """Test whether the parts of a second grow from sample to sample and restart when the next second begins.
 
-    `base` (n,): times without parts of a second, in s or datetime64; `offset` (n,): the parts of a second [ns]. A
-    tenth of the steps may differ. False if fewer than half of the steps are within a second, because the parts then
-    show no order.
+    `base` (n,): whole seconds, numbers or datetime64; `offset` (n,): the parts of a second [ns]. A tenth of the steps
+    may differ. False if fewer than half of the steps are within a second, because the parts then show no order.
     """
     steps = np.diff(base) / (np.timedelta64(1, "s") if base.dtype.kind == "M" else 1.0)
     is_same_second, is_next_second, change = steps == 0, steps == 1, np.diff(offset)

@@ -102,10 +102,7 @@ def _open_member(path: Path, kind: str) -> Iterator[tuple[IO[bytes], str, int]]:
 
 
 def _select_recording(names: Sequence[str], path: Path) -> str:
-    """Select the only file of an archive that is not a document; raise UnreadableFile if there is none, or several.
-
-    Hidden files, readme files and licences are not counted, either. If there is a single file, it may be of any kind.
-    """
+    """Select the only file of an archive that is no document and not hidden; a single file may be of any kind."""
     names = [name for name in names if "__MACOSX" not in name and not Path(name).name.startswith(".")]
     candidates = [name for name in names if Path(name).suffix.lower() not in _DOCUMENTS] if len(names) > 1 else names
     if len(candidates) > 1:

@@ -25,8 +25,7 @@ from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
 
 #: Most names in records, deepest nesting of a record and of a tree, and longest vector in a record.
 _MAX_NAMES, _MAX_DEPTH, _MAX_TREE_DEPTH, _MAX_VECTOR = 1024, 4, 8, 256
-#: An error this near the end of a text [characters] is a truncated last value.
-_MAX_TRUNCATED = 16
+_MAX_TRUNCATED = 16  # an error this near the end of a text [characters] is a truncated last value
 _BEGINS = re.compile(r'\{\s{0,1000}["}]|\[\s{0,1000}[\[{\]"\d\-nN]')
 #: Separators of values: white space, commas, and the record separator of RFC 7464.
 _SEPARATORS = re.compile(r"[\s,\x1e]*")
@@ -64,9 +63,7 @@ def read_json(path: Path, request: Request) -> RecordingFields:
     """Read the requested columns of a JSON file to the fields of a recording; a truncated last value is left out."""
     place = str(path)
     with path.open("rb") as head:
-        encoding = detect_encoding(head.read(SNIFF))
-    if encoding is None:
-        raise InputError("JSON must be text, got binary data")
+        encoding = detect_encoding(head.read(SNIFF))  # `is_json` has read it as text
     text = path.read_text(encoding, errors="replace").lstrip("\ufeff")
     members, is_cut = _read_members(text, place)
     if not members:
@@ -133,9 +130,8 @@ def _iter_cells(group: str, name: str, value: Any, depth: int) -> Iterator[tuple
     """Yield the single values in an entry of a JSON record, as (group, name, cell, unit).
 
     `group`, `name`: names of the records around the entry, and of the entry; `depth`: number of records and vectors
-    around the entry; `value`: a text, number or null; or `{"value": ..., "unit": ...}`; or a vector, with members
-    called `name(1)`, `name(2)`, ...; or a record, whose name then belongs to the group. Raises InputError for other
-    values.
+    around it. The `value` is a text, number or null; or `{"value": ..., "unit": ...}`; or a vector, with members called
+    `name(1)`, `name(2)`, ...; or a record, whose name then belongs to the group. Raises InputError for others.
     """
     if isinstance(value, Mapping) and depth < _MAX_DEPTH:
         unit = value.get("unit")

@@ -18,7 +18,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import collect_remarks
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, build_fields, check_size
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
-from sealscope.recordings.formats.timebase import ambiguous_dates, is_day_first, parse_stamps
+from sealscope.recordings.formats.timebase import ambiguous_dates, is_day_first, parse_stamps, timedelta_seconds
 
 #: Line that ends each header.
 _END_MARK = "***End_of_Header***"
@@ -167,10 +167,7 @@ def _list_series(packets: Sequence[_Packet], x_columns: str) -> list[Series]:
 
 
 def _compute_times(packet: _Packet, index: int, count: int) -> Array:
-    """Compute the times (count,) [s] of channel `index` from `X0` (by default 0) and `Delta_X` in a packet's header.
-
-    Raises InputError if `Delta_X` is not a positive number.
-    """
+    """Compute the times (count,) [s] of channel `index` from `X0` (by default 0) and `Delta_X` in a packet's header."""
     step = packet.number("delta_x", index)
     if not step > 0:
         raise InputError(f"Delta_X must be > 0 s, got {packet.head.get('delta_x')}")
@@ -187,4 +184,4 @@ def _packet_offsets(packets: Sequence[_Packet], day_first: bool) -> list[float]:
     known = [moment for moment in moments if moment is not None]
     if len(known) < len(packets) or all(after > before for before, after in pairwise(first_times)):
         return [0.0] * len(packets)
-    return [float((moment - known[0]) / np.timedelta64(1, "ns")) / 1e9 for moment in known]
+    return [float(timedelta_seconds(moment - known[0])) for moment in known]

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.table import MAX_VALUES, Clock, Series, timedelta_seconds, uniform_clock
+from sealscope.recordings.formats.table import MAX_VALUES, Clock, Series, uniform_clock
+from sealscope.recordings.formats.timebase import timedelta_seconds
 
 #: Deepest nesting that is read, and most columns of a matrix that are series.
 _MAX_DEPTH, _MAX_COLUMNS = 8, 256
@@ -25,36 +26,46 @@ _UNIT_FIELDS = ("unit", "units", "einheit", "einheiten")
 _COLUMN_NAME_FIELDS = ("colheaders", "header", "headers", "labels", "channels", "channelnames", "columns", "varnames")
 
 
+class _Place(NamedTuple):
+    """Place of a value in the tree."""
+
+    group: str  # names of the structs around the value, with slashes between
+    name: str  # name of the value
+    clock: Clock | None = None  # sampling times of series that state none, None if unknown
+    depth: int = 0  # number of structs and cell arrays around the value
+
+    @property
+    def path(self) -> str:
+        """Group of the values in this one, if it is a struct or a table."""
+        return f"{self.group}/{self.name}" if self.group else self.name
+
+    def inner(self, name: str) -> _Place:
+        """Return the place of a value `name` inside this one."""
+        return self._replace(name=name, depth=self.depth + 1)
+
+
 def iter_series(fields: Mapping[str, Any]) -> Iterator[Series]:
     """Yield the series in the values of a MATLAB or JSON file: arrays (n,) or (n, m), structs, tables and objects."""
-    # the file counts as no struct: its depth is -1, so that its values have the depth 0 (no struct around them)
-    yield from _iter_struct(group="", name="", fields=fields, clock=None, depth=-1)
+    yield from _iter_struct(_Place(group="", name="", depth=-1), fields)  # no struct is around its values: depth 0
 
 
-def _iter_value(group: str, name: str, value: Any, clock: Clock | None, depth: int = 0) -> Iterator[Series]:
-    """Yield the series of samples in a value of any type; nothing for one that contains none, or is nested too deeply.
-
-    `name`: name of the value; `group`: names of the structs around it, with slashes between; `clock`: times of series
-    that state none, None if unknown; `depth`: number of structs and cell arrays around the value.
-    """
-    if depth > _MAX_DEPTH:
+def _iter_value(place: _Place, value: Any) -> Iterator[Series]:
+    """Yield the series of samples in a value of any type; nothing for one without samples, or nested too deeply."""
+    if place.depth > _MAX_DEPTH:
         return
     if (fields := _struct_fields(value)) is not None:
-        yield from _iter_struct(group, name, fields, clock, depth)
+        yield from _iter_struct(place, fields)
     elif hasattr(value, "columns") and hasattr(value, "index"):  # a data frame
-        yield from _iter_table(f"{group}/{name}" if group else name, value)
+        yield from _iter_table(place.path, value)
     elif isinstance(value, np.ndarray) and value.dtype == object:
         for number, member in enumerate(value.reshape(-1), start=1):
-            yield from _iter_value(group, name if value.size == 1 else f"{name}({number})", member, clock, depth + 1)
+            yield from _iter_value(place.inner(place.name if value.size == 1 else f"{place.name}({number})"), member)
     elif isinstance(value, np.ndarray):
-        yield from _iter_columns(group, name, value, unit=None, clock=clock)
+        yield from _iter_columns(place, place.name, value)
 
 
 def _struct_fields(value: Any) -> Mapping[str, Any] | None:
-    """Return the fields of a struct by name, or the structs in an array by `(1)`, `(2)`, ...; None for other values.
-
-    An array of more than `_MAX_COLUMNS` structs also gives None.
-    """
+    """Return the fields of a struct by name, or the structs in a short array by `(1)`, `(2)`, ...; None for others."""
     properties = getattr(value, "properties", value)  # those of an object of mat-io
     if isinstance(properties, Mapping):
         return properties
@@ -66,56 +77,49 @@ def _struct_fields(value: Any) -> Mapping[str, Any] | None:
     return None
 
 
-def _iter_struct(group: str, name: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
+def _iter_struct(place: _Place, fields: Mapping[str, Any]) -> Iterator[Series]:
     """Yield the series of samples in a struct: a time series, a signal, or a group of other values.
 
-    A signal has samples and a unit or, in a Simulink log, a name and `values`. `group`, `name`: names of the structs
-    around this one, and its name; `clock`: sampling times of series that state none; `depth`: number of structs around.
+    A signal has samples and a unit or, in a Simulink log, a name and `values`.
     """
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
     samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)
     # each struct's times have a key of their own, as names may repeat
     if (times := _read_struct_times(by_name)) is not None:
-        yield from _iter_time_series(group, name, by_name, Clock.of_times(object(), times), depth)
+        yield from _iter_time_series(place._replace(clock=Clock.of_times(object(), times)), by_name)
     elif samples is not None and unit is not None:
         times = by_name.get("time", by_name.get("t"))
         if isinstance(times, np.ndarray) and times.dtype.kind in "fiu" and times.size == samples.size:
-            clock = Clock.of_times(object(), times.reshape(-1).astype(np.float64))
-        yield from _iter_columns(group, _first_text(by_name, _NAME_FIELDS) or name, samples, unit or None, clock)
-    elif "values" in by_name and _single_text(by_name.get("name")):  # a signal of a Simulink log
-        yield from _iter_value(group, _single_text(by_name["name"]), by_name["values"], clock, depth + 1)
+            place = place._replace(clock=Clock.of_times(object(), times.reshape(-1).astype(np.float64)))
+        yield from _iter_columns(place, _first_text(by_name, _NAME_FIELDS) or place.name, samples, unit)
+    elif "values" in by_name and (signal_name := _single_text(by_name.get("name"))):  # a signal of a Simulink log
+        yield from _iter_value(place.inner(signal_name), by_name["values"])
     else:
-        yield from _iter_group(f"{group}/{name}" if group else name, fields, clock, depth)
+        yield from _iter_group(place._replace(group=place.path), fields)
 
 
-def _iter_time_series(group: str, name: str, by_name: Mapping[str, Any], clock: Clock, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in a struct that also contains their times; `clock` gives these times.
+def _iter_time_series(place: _Place, by_name: Mapping[str, Any]) -> Iterator[Series]:
+    """Yield the series of samples in a struct that also contains their times, the clock of its `place`.
 
     The samples are in the structs of the field `signals`, as in Simulink's structure with time, in an array `data`, as
-    in MATLAB's `timeseries`, or in another value `data`. `by_name`: name in lower case -> field of the struct; `group`,
-    `name`: names of the structs around it, and its name; `depth`: number of structs around it.
+    in MATLAB's `timeseries`, or in another value `data`. `by_name`: name in lower case -> field of the struct.
     """
     data = by_name.get("data")
     if "signals" in by_name:
         for number, signal in enumerate(_list_structs(by_name["signals"]), start=1):
-            label = _single_text(signal.get("label")) or f"{name}({number})"
-            path = f"{group}/{name}" if group else name
-            yield from _iter_columns(path, label, np.asarray(signal.get("values")), unit=None, clock=clock)
+            label = _single_text(signal.get("label")) or f"{place.name}({number})"
+            yield from _iter_columns(place._replace(group=place.path), label, np.asarray(signal.get("values")))
     elif isinstance(data, np.ndarray):
         info = _struct_fields(by_name.get("datainfo")) or {}
         unit = _single_text(info.get("Units")) or _first_text(by_name, _UNIT_FIELDS)
-        yield from _iter_columns(group, _single_text(by_name.get("name")) or name, data, unit or None, clock)
+        yield from _iter_columns(place, _single_text(by_name.get("name")) or place.name, data, unit)
     else:
-        yield from _iter_value(group, "data", data, clock, depth + 1)
+        yield from _iter_value(place.inner("data"), data)
 
 
-def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, depth: int) -> Iterator[Series]:
-    """Yield the series of samples in each field of a struct, with names and units from fields such as `units`.
-
-    `group`: names of the struct and of those around it, with slashes between; `depth`: number of the latter; `clock`:
-    sampling times of series that state none, None if unknown.
-    """
+def _iter_group(place: _Place, fields: Mapping[str, Any]) -> Iterator[Series]:
+    """Yield the series of samples in each field of a struct, whose name is part of the group of `place`."""
     units, column_names = _find_field_units(fields), _find_column_names(fields)
     for key, value in fields.items():
         # catman exports `Channel_3_Data` with `Channel_3_Header`
@@ -123,16 +127,16 @@ def _iter_group(group: str, fields: Mapping[str, Any], clock: Clock | None, dept
         header = _struct_fields(fields.get(f"{channel}_Header")) if suffix == "Data" else None
         if header is not None:
             step, values = single_number(header.get("dt")), np.asarray(value)
-            channel_clock = uniform_clock("catman", values.size, step) if step and step > 0.0 else None
-            label = _single_text(header.get("SignalName")) or key
-            yield from _iter_columns(group, label, values, _single_text(header.get("Unit")) or None, channel_clock)
+            clock = uniform_clock("catman", values.size, step) if step and step > 0.0 else None
+            label, unit = _single_text(header.get("SignalName")) or key, _single_text(header.get("Unit"))
+            yield from _iter_columns(place._replace(clock=clock), label, values, unit)
         elif column_names and isinstance(value, np.ndarray) and value.ndim == 2 and value.shape[1] == len(column_names):
             for number, label in enumerate(column_names):
-                yield from _iter_columns(group, label, value[:, number], unit=None, clock=clock)
+                yield from _iter_columns(place, label, value[:, number])
         elif key in units and isinstance(value, np.ndarray):
-            yield from _iter_columns(group, key, value, units[key], clock)
+            yield from _iter_columns(place, key, value, units[key])
         else:
-            yield from _iter_value(group, key, value, clock, depth + 1)
+            yield from _iter_value(place.inner(key), value)
 
 
 def _is_vector(value: Any) -> bool:
@@ -169,10 +173,9 @@ def _find_column_names(fields: Mapping[str, Any]) -> list[str]:
 
 
 def _read_struct_times(by_name: Mapping[str, Any]) -> NDArray[np.float64] | None:
-    """Read the times (n,) [s] of a struct with samples from its field `time` or `timeinfo`; None if it has neither.
+    """Read the times (n,) [s] of a struct with a field `signals` or `data` from its field `time` or `timeinfo`.
 
-    `timeinfo` states start, step and number of samples. A struct has samples if it has a field `signals` or `data`; for
-    others, the result is None.
+    `timeinfo` states start, step and number of samples. None for a struct without such fields.
     """
     if "signals" not in by_name and "data" not in by_name:
         return None
@@ -194,20 +197,18 @@ def _list_structs(value: Any) -> list[Mapping[str, Any]]:
     return members if members and all(key.startswith("(") for key in fields) else [fields]
 
 
-def _iter_columns(
-    group: str, name: str, value: NDArray[Any], unit: str | None, clock: Clock | None
-) -> Iterator[Series]:
+def _iter_columns(place: _Place, name: str, value: NDArray[Any], unit: str | None = None) -> Iterator[Series]:
     """Yield the series of a vector, or of each column of a matrix, called `name(:,1)` etc.; leave out other arrays."""
     if value.dtype.kind not in "fiubmMU":
         return
-    flat = np.squeeze(value)
+    flat, unit = np.squeeze(value), unit or None
     if flat.ndim == 1 and flat.size > 1:
-        yield Series(group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), clock)
+        yield Series(place.group, Label.parse(name, unit), flat.size, partial(np.asarray, flat), place.clock)
     elif flat.ndim == 2 and min(flat.shape) <= _MAX_COLUMNS:
         tall = flat if flat.shape[0] >= flat.shape[1] else flat.T  # the longer axis is that of the samples
         for number, column in enumerate(tall.T, start=1):
             label = Label(f"{name}(:,{number})", f"{name}(:,{number})", unit)
-            yield Series(group, label, column.size, partial(np.asarray, column), clock)
+            yield Series(place.group, label, column.size, partial(np.asarray, column), place.clock)
 
 
 def _iter_table(group: str, frame: Any) -> Iterator[Series]:
