@@ -38,12 +38,11 @@ from platformdirs import user_cache_path
 numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_MESSAGE_LIMITS = "monitor/sources/message_limits.py"
 #: Packages and modules with compiled code that is cached, or from which it takes constants (`units`) or the order of a
 #: record's fields (`parameters`). The code of `fmu` is compiled anew for each unit (`plain_code`).
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py", "units.py", "units.toml", "parameters"),
-    *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
+    *("physics", "signals", "control", "simulation", "diagnosis", "monitor/sources/message_limits.py"),
 )
 #: Number of cache folders that are kept, those of the current sources and of the sources used before.
 _MAX_GENERATIONS = 4
@@ -73,11 +72,9 @@ def source_hash(root: Path) -> str:
     """Compute a hash, in hex digits, over the sources in the folder `root` that compiled code depends on."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
-        files = [root / package]
-        if files[0].is_dir():
-            # .toml: numbers, such as priors, that are compiled into kernels as constants
-            files = sorted(path for path in files[0].rglob("*") if path.suffix in (".py", ".toml"))
-        for path in files:
+        # .toml: numbers, such as priors, that are compiled into kernels as constants
+        files = sorted(path for path in (root / package).rglob("*") if path.suffix in (".py", ".toml"))
+        for path in files or [root / package]:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -165,19 +162,15 @@ def cache_directory() -> Path | None:
     return None
 
 
-def kernel(function: _F, fastmath: Any = False) -> _F:
-    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code.
-
-    Arithmetic follows IEEE 754 unless `fastmath` is True or a set of LLVM's fast-math flags, as for `numba.njit`.
-    """
-    return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
+def kernel(function: _F) -> _F:
+    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code."""
+    return _compiler().compile_kernel(function, cache_directory())  # type: ignore[no-any-return]
 
 
-def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a law, a function that compiled functions call; `inlined`: True to insert its code in place of each call.
+def _compile_law(function: _F, fastmath: Any = False, inlined: bool = True) -> _F:
+    """Compile a law; `fastmath`: LLVM's fast-math flags, False for none; `inlined`: True to insert its code at calls.
 
-    `fastmath`: LLVM's fast-math flags, False for none. If numba's compilation is switched off (`NUMBA_DISABLE_JIT`),
-    `function` itself is returned.
+    If numba's compilation is switched off (`NUMBA_DISABLE_JIT`), `function` itself is returned.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -186,12 +179,12 @@ def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
 
 def law(function: _F) -> _F:
     """Compile a small function, such as a formula, for use in other compiled functions; Python runs it uncompiled."""
-    return _compile_law(function, fastmath=False)
+    return _compile_law(function)
 
 
 def large_law(function: _F) -> _F:
     """Compile a large function for calls from Python and from compiled functions; its code is not inlined in these."""
-    return _compile_law(function, fastmath=False, inlined=False)
+    return _compile_law(function, inlined=False)
 
 
 def contracted(function: _F) -> _F:
@@ -199,7 +192,7 @@ def contracted(function: _F) -> _F:
 
     The results' last digits then depend on the processor, but not on the division of samples into blocks or vectors.
     """
-    return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
+    return _compile_law(function, fastmath={"contract", "arcp"})
 
 
 class Entry:
