@@ -9,7 +9,8 @@ import numpy as np
 from sealscope.compiled import law
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
-from sealscope.physics.pump import friction_torque, pump_flow, pump_torque, turbulent_slip
+from sealscope.physics.pump import friction_torque, pump_flow, pump_torque
+from sealscope.physics.restrictors import orifice_flow
 from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
 from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
 from sealscope.units import P_ATM
@@ -39,12 +40,10 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
     `force` [N]: load against +x. If the rig has a make-up (`made_up`), the lower pressure is the charge pressure. If
-    not, the circuit contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted
-    by the oil volumes of the two sides at mid-stroke, is therefore the charge pressure.
+    not, the circuit contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted
+    by the oil volumes of the two sides at mid-stroke, is the charge pressure.
     """
     if p.made_up:
-        # each pressure balances the force with the charge pressure on the other side, or is the charge pressure if that
-        # is higher
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
@@ -63,9 +62,8 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     """Set the state `y` (14,), all 0, to standstill of a pump-controlled rig; return 0, or a code if impossible.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3); it is 0 if K_i = 0, where it has no
-    effect. The code is `BELOW_VACUUM` for a pressure below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the
-    drive's limit.
+    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3). The code is `BELOW_VACUUM` for a pressure
+    below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the drive's limit.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -107,7 +105,7 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
         p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
         dp = middle - p.p_return
-        Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - turbulent_slip(dp, p.c_slip, p.dp_0)
+        Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - orifice_flow(dp, p.c_slip, p.dp_0)
         _, _, p_1_rate, _ = valve_rates(state_of(y), Q_1, p)
         if p_1_rate > 0.0:
             low = middle
@@ -117,14 +115,11 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """Compute the state (14,) of a rig at rest with the piston at x_0 [m].
+    """Compute the state (14,) of a rig at rest with the piston at x_0 [m], under its load and `push` [N] against +x.
 
-    The rig's load and `push` [N] act against +x. The pressures carry both (`pressures_at_standstill`), and the motor
-    holds the pump against the pressures (`stand_still`). In a rig with a servo valve the valve is centred and the motor
-    runs at the supply's speed (`supply_at_standstill`). A machine with a leak or an underlapped valve creeps.
-
-    Raises InputError if a pressure is below vacuum (in a rig with a servo valve: not between those of return and
-    supply), or if the drive cannot hold the load.
+    The motor holds the pump against the pressures (`stand_still`). In a rig with a servo valve the valve is centred and
+    the motor runs at the supply's speed (`supply_at_standstill`). A machine with a leak or an underlapped valve creeps.
+    Raises InputError if the pressures or the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push
@@ -149,8 +144,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
     """Fill the state `y` (14,), all zeros, with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the force would need a chamber pressure that
-    is not between those of return and supply, or if the motor cannot drive the supply's pump.
+    `x` [m]: position; `force` [N]: load against +x.
     """
     motor = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)

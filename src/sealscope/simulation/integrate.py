@@ -1,8 +1,4 @@
-"""Integrate the rig over an experiment: compute its inputs, choose the solver's step, and check the result.
-
-The step is stated, or chosen so that an error is small enough. In both cases short windows of the run are integrated
-at half the step, too, and the run is refused if the results differ by more than the tolerances.
-"""
+"""Integrate the rig over an experiment: compute its inputs, choose the solver's step, and check the result."""
 
 from __future__ import annotations
 
@@ -52,17 +48,15 @@ LATER_STARTS = (0.5, 0.9)
 LEVELS = 4
 #: Most solver steps for which the inputs are computed at once, which bounds the memory.
 _BLOCK_STEPS = 4096
-#: Solver outputs per recorded sample that suffice for the anti-alias filter.
-_OVERSAMPLING = 4
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Result of an integration: times `t` (n,) [s] and outputs `rows` (n, 21) in the order of `physics.state.OUTPUTS`.
 
-    `trajectory[name]` gives one output (n,). `method`: rk4 or imex; `step` [s]: the solver's step; `error`: estimated
-    rms error [Pa] of the pressures, NaN if it was not checked. `volts` (n,): voltages [V] of the controller,
-    `compensated` (n,): leakage flow [m^3/s] that it compensates; None without a controller or report.
+    `trajectory[name]` gives one output (n,). `method`: rk4 or imex; `step` [s]: the solver's step; `error` [Pa]:
+    estimated rms error of the pressures, NaN if it was not checked. `volts` (n,) [V]: voltage of a controller, if any;
+    `compensated` (n,) [m^3/s]: leakage flow that it reports to compensate, if any.
     """
 
     t: Array
@@ -80,15 +74,14 @@ class Trajectory:
 
 
 class RunInputs:
-    """Inputs of a run over time: the voltage command, and the leakage coefficients summed over all leaks.
+    """Inputs of a run over time: the voltage command, and the leakage coefficients G and C summed over all leaks.
 
-    The coefficients are G [m^3/(s Pa)] of laminar leaks, Q = G dp, and C [m^3/(s Pa^0.5)] of orifices, Q = C sign(dp)
-    sqrt|dp|. `leaks`, all with coefficients, replace those of the experiment.
+    `leaks`, all with coefficients (`Leak`), replace those of the experiment.
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
         self._leaks = experiment.scale_with_viscosity(leaks)
-        # under a target the controller sets the voltage (`Feedback`), and this command is not used
+        # 0 under a target, for which the controller sets the voltage (`Feedback`)
         self._command = experiment.voltage_command if experiment.target is None else Sine(amplitude=0.0, omega=0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
@@ -96,14 +89,13 @@ class RunInputs:
         """Compute the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), for some solver steps.
 
         `start` (steps,): beginnings of the steps [s]; `offsets` (nodes,): times [s] after each at which the solver
-        needs its inputs. Raises InputError for a command beyond the converter's limit within the run. After the end of
-        the run the command is limited instead.
+        needs its inputs. Raises InputError for a command beyond the converter's limit within the run.
         """
         t = start[:, None] + offsets
         u = self._command.volts(t)
         if not np.abs(u).max(initial=0.0) <= self._limit:  # also for NaN
             check_command(self._command, t[t <= self._duration], self._limit)
-            # the solver continues after the end, because the anti-alias filter looks ahead
+            # beyond the limit only after the recording's end, where the solver runs on for the anti-alias filter
             u = np.clip(u, -self._limit, self._limit)
         return u, *self._leakage(t)
 
@@ -129,7 +121,7 @@ class RunInputs:
 def oversampling(experiment: Experiment) -> int:
     """Compute the number of solver outputs per recorded sample that the anti-alias filter and a controller need.
 
-    Without a stated step, a step that is usual for the integration method (`DEFAULT_STEP`) is assumed.
+    Without a stated step, `DEFAULT_STEP` of the integration method is assumed.
     """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
@@ -142,7 +134,7 @@ def oversampling_of(rate: float, step: float) -> int:
 
     It is 4 for the anti-alias filter, or fewer if a sample takes fewer than 4 steps.
     """
-    return min(_OVERSAMPLING, steps_per_output(rate, step))
+    return min(4, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
@@ -168,7 +160,7 @@ def integrate_run(
     if duration is None:
         duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
     if step is not None:
-        error = None  # with a step stated here the error is not checked
+        error = None
     elif error is None:
         error = experiment.error_allowed
     rate = experiment.rate * oversampling(experiment)
@@ -193,22 +185,6 @@ def integrate_run(
     )
 
 
-def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace each leak's stated mean flow by the coefficient 0, at which the search for the coefficient starts."""
-    return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
-
-
-def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the leakage coefficients that give the stated mean flows; return the leaks with these coefficients.
-
-    Leaks with a stated coefficient keep it. Without a stated mean flow > 0, nothing is simulated.
-    """
-    if not any(leak.mean for leak in experiment.leaks):
-        return _start_of_search(experiment.leaks)
-    leaks, _ = run_with_sized_leaks(experiment)
-    return leaks
-
-
 def run_with_sized_leaks(
     experiment: Experiment,
     progress: Callable[[str, float], None] | None = None,
@@ -221,7 +197,8 @@ def run_with_sized_leaks(
     leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
-    initial_leaks = _start_of_search(leaks)
+    # the search begins at the coefficient 0
+    initial_leaks = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
     if not any(leak.mean for leak in leaks):
         return initial_leaks, integrate_run(experiment, initial_leaks, progress=report_time)
     is_first_run = True  # it has the sought coefficients 0, so that these leaks do not change the pump's flow
@@ -284,41 +261,40 @@ def integrate(
     A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
     tried until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
     `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of the run
-    (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and the RMS
-    of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
+    (`comparison_windows`) at half the step as well, and allows changes of the pressures up to `error` [Pa rms]
+    (`StepErrorCheck`). A stated step is not checked if `error` is None.
 
-    Raises InputError for a step or an error that is not positive. Raises SimulationFailed if
+    Raises InputError for a step or an error that is not positive. Raises SimulationFailed if a state is not finite and,
+    without `allow_unresolved`, if
 
-    - a state is not finite;
     - a pressure falls below vacuum;
     - the step cannot resolve the rig, the leak or an end stop that was hit;
     - a stated step fails the check, unless it is as short as the last step that would be tried.
-
-    `allow_unresolved` permits all of these but a state that is not finite.
     """
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS
 
-    base = loaded_rig_numbers(rig, load)
-    start_state = loaded_standstill_state(rig, load, x_0)
     if step is not None and not (math.isfinite(step) and step > 0):
         raise InputError(f"step must be > 0 s, got {step}")
     if error is not None and not (math.isfinite(error) and error > 0):
         raise InputError(f"error must be > 0 Pa, got {error}")
     n_out = round(duration * rate)
-    schedule = Schedule(effects, base, n_out, rate)
+    start_state = loaded_standstill_state(rig, load, x_0)
+    schedule = Schedule(effects, loaded_rig_numbers(rig, load), n_out, rate)
     chosen_method, euler = choose_method(rig, method), rig.motor.integrator == "euler"
     run = _Integration(inputs, schedule, rate, chosen_method, euler, allow_unresolved, progress, load, feedback)
     windows = [] if error is None else comparison_windows(n_out, rate)
     bounds = {0, n_out}  # outputs at which the run stops
-    max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # most steps per output that are tried
-    if step is None:  # the run stops at the end of each window, so that a step that fails is abandoned at once
+    shortest_step = LONGEST_STEP / MAX_STEP_REFINEMENT
+    max_steps = steps_per_output(rate, shortest_step)  # most steps per output that are tried
+    first_step = step
+    if first_step is None:
+        # the run stops at the end of each window, so that a step that fails is abandoned at once
         bounds |= {bound for window in windows for bound in window}
         max_G, max_C = inputs.max_leakage(np.arange(n_out) / rate)
-        first_step = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in schedule.numbers))
-        n_steps = steps_per_output(rate, max(first_step, LONGEST_STEP / MAX_STEP_REFINEMENT))
-    else:
-        n_steps = steps_per_output(rate, step)
+        longest = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in schedule.numbers))
+        first_step = max(longest, shortest_step)
+    n_steps = steps_per_output(rate, first_step)
     while True:
         h = 1.0 / (rate * n_steps)
         if not allow_unresolved:  # leaks and end stops are checked during the run
@@ -347,8 +323,8 @@ def integrate(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves "
                 f"{check.describe_worst()}; take a smaller step, or state an error instead of a step"
             )
-        # the error goes with h^4, here with a margin of 10 %; at most twice the steps, because the error that is found
-        # at a step far too long is unreliable
+        # the error goes with h^4, here with a margin of 10 %; at most twice the steps, because the error found at a
+        # step far too long is unreliable
         refinement = min(2.0, (1.1 * excess) ** 0.25) if math.isfinite(excess) else 2.0
         n_steps = min(max(n_steps + 1, math.ceil(n_steps * refinement)), max_steps)
 
@@ -357,9 +333,8 @@ def integrate(
 class _Integration:
     """The integration of one run, with inputs and settings as in `integrate`.
 
-    `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: True to advance the
-    integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`); `reached` [s]: time last
-    reported to `progress`, which parts of the run that are integrated again do not report.
+    `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: `euler_integral` of
+    `rk4_step`; `reached` [s]: time last reported to `progress`, so that no time is reported again.
     """
 
     inputs: RunInputs
@@ -383,7 +358,6 @@ class _Integration:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
 
-        unloaded = np.zeros((0, 0))  # stands for no load
         h = 1.0 / (self.rate * n_steps)
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
@@ -391,9 +365,8 @@ class _Integration:
         for first in range(start, stop, max_outputs):
             last = min(first + max_outputs, stop)
             step_numbers = np.arange(first * n_steps, last * n_steps, dtype=np.float64)
-            # command, conductance of a laminar leak and coefficient of an orifice
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(step_numbers * h, nodes))
-            F = unloaded  # force of the load
+            F = np.zeros((0, 0))  # stands for no load
             if self.load is not None:
                 F = np.ascontiguousarray(self.load.value_at(step_numbers[:, None] * h + nodes))
             max_G, max_C = float(G.max()), float(C.max())
@@ -420,7 +393,6 @@ class _Integration:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
         `rows`: outputs of the run, with `n_steps` steps between them; the window has the outputs first <= k < end.
-        `check` computes the errors and keeps the largest ones.
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
@@ -431,10 +403,10 @@ class _Integration:
         return check.add_window(rows[first:end, pressures], fine[:, pressures])
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Raise SimulationFailed if one of successive outputs of the solver has diverged.
+        """Raise SimulationFailed if the solver's outputs `rows` (n, 21) have diverged.
 
-        Unless unresolved runs are allowed, a pressure below vacuum or a step too long for an end stop that was hit
-        raises it, too. `rows` (n, 21): outputs; `first`: number of rows[0] in the run; `h` [s]: step; `p`: parameters.
+        Unless unresolved runs are allowed, a pressure below vacuum or a step h [s] too long for an end stop that was
+        hit raises it, too. `first`: number of rows[0] in the run; `p`: parameters.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
@@ -468,8 +440,7 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if steps of h [s] by `method` are too long for a rig `p` without its leaks.
 
-    The limit is `longest_step` without leaks, which excludes throttles and end stops, and 2.785/lambda for throttles
-    with rk4: lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
+    The limits are `longest_step` and, for throttles with rk4, 2.785/lambda with lambda of `stiffest_rate`.
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -488,7 +459,7 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
     They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless this would overlap the window before
-    or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz]: rate of the outputs.
+    or exceed the run. The run has `n_out` outputs at `rate` [Hz].
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -509,7 +480,7 @@ class StepErrorCheck:
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
         self._tolerance = tolerance
-        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # solver outputs per sample
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
         # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
@@ -522,9 +493,9 @@ class StepErrorCheck:
 
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
         the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
-        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long
-        enough for the wavelet, at the recording's sampling rate (without its anti-alias filter) and with the variance
-        of the sensors' noise added, which white noise has in each detail.
+        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too, over all windows so far that are long
+        enough for the wavelet. They are those at the recording's sampling rate, without its anti-alias filter, and with
+        the variance of the sensors' noise, which white noise has in each detail.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)

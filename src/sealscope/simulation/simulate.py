@@ -54,7 +54,7 @@ class Truth:
 
     `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first of them opens, None
     if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`: noise-free outputs by
-    name, at the times `t` [s] of the recording's samples.
+    name, at the recording's sample times `t` [s].
     """
 
     leaks: tuple[Leak, ...]
@@ -83,7 +83,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Proof:
-    """Comparison of a run at a `step` [s] with one at the step `halved` [s], by `method` (rk4 or imex)."""
+    """Comparison of a run at `step` [s] with one at the step `halved` [s], by `method` (rk4 or imex)."""
 
     method: str
     step: float
@@ -96,7 +96,7 @@ class Proof:
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
-        """Format the proof as text, one line for each difference and its tolerance."""
+        """Format the proof as text, with a line for each difference."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
         for row in self.differences:
             limit = "" if row.tolerance is None else f" (at most {row.tolerance:.3g})"
@@ -112,7 +112,7 @@ class Proof:
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, the truth about it, and the proof of its step if one was requested."""
+    """A simulated experiment: the recording, the truth about it, and, if requested, the proof of its step."""
 
     recording: Recording
     truth: Truth
@@ -162,7 +162,7 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
 
     def report(task: str, time: float) -> None:
-        """Report the completed fraction of a task at the simulated time `time` [s]."""
+        """Report the progress of a task by the simulated time [s]."""
         if progress is not None:
             progress(task, min(1.0, time / experiment.duration))
 
@@ -192,8 +192,8 @@ def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
     """Record an integrated run with the rig's instruments, and state its origin in the recording's provenance."""
     at_samples = _sample_outputs(experiment)
     times = experiment.sample_times()
-    volts = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
-    readings = record(experiment.rig, run, volts, at_samples.step, experiment.seed, experiment.readings())
+    command = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
+    readings = record(experiment.rig, run, command, at_samples.step, experiment.seed, experiment.readings())
     solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed
@@ -212,10 +212,7 @@ def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
 
 
 def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Trajectory) -> Truth:
-    """Collect the truth about a simulated run: leaks, onset, mean leakage, noise-free outputs, powers and faults.
-
-    `leaks`: those of the experiment, with the coefficients that were found for their stated flows.
-    """
+    """Collect the truth about a simulated run; `leaks`: those of the experiment, all with coefficients."""
     at_samples, times = _sample_outputs(experiment), experiment.sample_times()
     outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
@@ -223,9 +220,10 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
         outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(times.size)}
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
-    flows = (leak_flow(leak, run.t, dp, dp_0) for leak in experiment.scale_with_viscosity(leaks))
-    # the mean is weighted by the opening 0..1 of `leak`, without the viscosity
-    mean_leak = sum(mean_while_open(leak, run.t, flow) for leak, flow in zip(leaks, flows, strict=True))
+    mean_leak = 0.0
+    for leak, thinned in zip(leaks, experiment.scale_with_viscosity(leaks), strict=True):
+        # the mean is weighted by the opening 0..1 of `leak`, without the viscosity
+        mean_leak += mean_while_open(leak, run.t, leak_flow(thinned, run.t, dp, dp_0))
     mean_leak_lpm = mean_leak / LITRE_PER_MINUTE
     return Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
 
@@ -233,8 +231,8 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
     """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
-    `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). Returns arrays by the names P_electric, P_hydraulic and
-    P_mechanical. In a rig with a servo valve, the first two belong to the motor and pump of the supply.
+    `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). In a rig with a servo valve, the first two powers belong to
+    the motor and pump of the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
@@ -334,7 +332,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Describe a drift over times t [s] for JSON: its range (maximum minus minimum), and its change from start to end.
+    """Describe a drift for JSON: its range (maximum minus minimum) over the times t [s], and its change over all of t.
 
     Both are in per cent of the parameter for a relative drift, else in the parameter's SI unit.
     """
