@@ -1,11 +1,10 @@
 """Compile functions by numba, with a cache that never returns code of outdated sources.
 
-Numba's ``cache=True`` stores the machine code of a function by the source of its own file only. After an edit to
-another file, with a function that it calls, it would silently return the old machine code. Here the name of the cache
-folder is a hash over the sources of all packages with compiled code and of the modules from which these take constants,
-the versions of numba and Python, and the processor. It is in the user's cache folder, unless `SEALSCOPE_CACHE_DIR`
-moves it; an empty value turns caching off. Compiled code is unpickled, which can run any command: only folders that no
-other user can write are used.
+After an edit to another file, with a function that it calls, numba's ``cache=True`` would return the old machine code
+of a function. Here the name of the cache folder is a hash over the sources of all packages with compiled code and of
+the modules from which these take constants, the versions of numba and Python, and the processor. It is in the user's
+cache folder, unless `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off. Compiled code is unpickled, which
+can run any command: only folders that no other user can write are used.
 
 Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call.
 """
@@ -104,11 +103,7 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a directory, not a link, that belongs to this user alone.
-
-    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows only the
-    existence of the folder is checked.
-    """
+    """Raise PermissionError unless `folder` is a directory, not a link, of this user, without the `forbidden` bits."""
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
         return
@@ -120,8 +115,7 @@ def _make_private(folder: Path) -> None:
     """Create a folder for this user only, or restrict an existing one; raise OSError if others could write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_owner(folder, forbidden=0o022)  # others cannot write
-    if folder.lstat().st_mode & 0o077:
-        folder.chmod(0o700)
+    folder.chmod(0o700)
     _check_owner(folder, forbidden=0o077)  # others cannot read, either
 
 
@@ -129,9 +123,8 @@ def _make_private(folder: Path) -> None:
 def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
-    The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary files
-    is used. Older folders are removed (`_prune`). Returns None if `_user_cache_folder` does, or after a warning if no
-    folder is usable.
+    If the user's cache folder is not safe or not writable, a private folder among the temporary files is used. Returns
+    None if caching is turned off, or after a warning if no folder is usable.
     """
     base = _user_cache_folder()
     if base is None:

@@ -39,8 +39,7 @@ class Feedback:
 
     The controller measures position and angle in whole counts of the rig's encoders, and pressures with each
     transducer's own noise. Other errors of the sensors, also those by faults and drifts, change the recording but not
-    the control. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate` [Hz]:
-    rate of the solver's outputs; `seed`: seed of the noise.
+    the control. `rate` [Hz]: rate of the solver's outputs; `seed`: seed of the noise.
     """
 
     def __init__(
