@@ -111,9 +111,8 @@ def stops(drive):
     def run(ramp):
         words = [f"shut-off {side} to 0 % from 0.6 s within {ramp} s" for side in "AB"]
         words.append(f"circulation from 0.6 s within {ramp} s")
-        effects = [effect for text in words for effect in parse_fault(text).effects(rig)]
         u = {"u": lambda t: 3.0 - 3.0 * np.cos(np.pi * np.minimum(t / 0.5, 1.0))}
-        return drive(rig, 1.2, **u, rate=4000.0, effects=effects)
+        return drive(rig, 1.2, **u, rate=4000.0, faults=tuple(map(parse_fault, words)))
 
     return rig, run(0.0), run(0.4)
 
@@ -147,11 +146,15 @@ def flows(rig, run):
 def finely(drive):
     """All parts, with fixed volumes and a leak, while line A shuts and opens again, at a step of 10 us."""
     rig = rig_with(**PARTS)
-    effects = [effect for text in OPERATED for effect in parse_fault(text).effects(rig)]
-    effects = [replace(effect, min_block=1e-3) for effect in effects]  # outputs have the flows of their steps
-    step = 1e-5
+
+    class Operated(Experiment):
+        def effects(self):
+            """Outputs have the flows of their steps."""
+            return tuple(replace(effect, min_block=1e-3) for effect in super().effects())
+
+    step, faults = 1e-5, tuple(map(parse_fault, OPERATED))
     u = {"u": lambda t: 4.0 * np.sin(3.0 * t)}
-    return rig, drive(rig, 2.0 + step, **u, G=1e-12, rate=1e5, step=step, effects=effects)
+    return rig, drive(rig, 2.0 + step, **u, G=1e-12, rate=1e5, step=step, faults=faults, kind=Operated)
 
 
 @pytest.mark.slow

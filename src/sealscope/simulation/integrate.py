@@ -4,24 +4,23 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.arguments import Method
-from sealscope.simulation.changes import Effect, Schedule
+from sealscope.simulation.changes import Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, choose_method
+from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
 from sealscope.simulation.instruments import FILTER_REACH
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open, size_leaks
-from sealscope.simulation.targets_and_loads import Force, loaded_rig_numbers, loaded_standstill_state
+from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
 from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 if TYPE_CHECKING:
@@ -142,49 +141,6 @@ def steps_per_output(rate: float, step: float) -> int:
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))  # 1e-9: a quotient just above a whole number is whole
 
 
-def integrate_run(
-    experiment: Experiment,
-    leaks: tuple[Leak, ...],
-    *,
-    step: float | None = None,
-    error: float | None = None,
-    duration: float | None = None,
-    progress: Progress | None = None,
-) -> Trajectory:
-    """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
-
-    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
-    experiment's unless None; with a `step` stated here the error is not checked. `duration` [s]: by default that of the
-    recording plus the reach of the anti-alias filter.
-    """
-    if duration is None:
-        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
-    if step is not None:
-        error = None
-    elif error is None:
-        error = experiment.error_allowed
-    rate = experiment.rate * oversampling(experiment)
-    feedback = None
-    target, controller = experiment.target, experiment.active_controller
-    if target is not None and controller is not None:
-        feedback = Feedback(experiment.rig, target, controller, duration=duration, rate=rate, seed=experiment.seed)
-    return integrate(
-        experiment.rig,
-        RunInputs(experiment, leaks),
-        duration,
-        rate,
-        load=experiment.load,
-        feedback=feedback,
-        x_0=experiment.x_0,
-        method=experiment.method,
-        step=step or experiment.step,
-        error=error,
-        allow_unresolved=experiment.allow_unresolved,
-        progress=progress,
-        effects=experiment.effects(),
-    )
-
-
 def run_with_sized_leaks(
     experiment: Experiment,
     progress: Callable[[str, float], None] | None = None,
@@ -236,36 +192,30 @@ def run_with_sized_leaks(
     return leaks_and_run
 
 
-def integrate(
-    rig: Rig,
-    inputs: RunInputs,
-    duration: float,
-    rate: float,
+def integrate_run(
+    experiment: Experiment,
+    leaks: tuple[Leak, ...],
     *,
-    x_0: float = 0.0,
-    method: Method = "auto",
     step: float | None = None,
-    error: float | None = PRESSURE_TOLERANCE,
-    allow_unresolved: bool = False,
+    error: float | None = None,
+    duration: float | None = None,
+    rate: float | None = None,
     progress: Progress | None = None,
-    effects: Sequence[Effect] = (),
-    load: Force | None = None,
-    feedback: Feedback | None = None,
 ) -> Trajectory:
-    """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
+    """Integrate an experiment from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    `inputs`: command and leakage over time; `x_0` [m]: position at the start; `load`: load in addition to the rig's
-    own; `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters
-    within the run.
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
+    experiment's unless None; with a `step` stated here the error is not checked. By default the duration is that of the
+    recording plus the reach of the anti-alias filter, and the rate is the one that the instruments need.
 
-    A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
-    tried until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
+    A stated step is rounded down to a divisor of the output interval. If none is stated, ever shorter steps are tried
+    until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
     `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of the run
     (`comparison_windows`) at half the step as well, and allows changes of the pressures up to `error` [Pa rms]
-    (`StepErrorCheck`). A stated step is not checked if `error` is None.
+    (`StepErrorCheck`).
 
     Raises InputError for a step or an error that is not positive. Raises SimulationFailed if a state is not finite and,
-    without `allow_unresolved`, if
+    unless the experiment allows an unresolved run, if
 
     - a pressure falls below vacuum;
     - the step cannot resolve the rig, the leak or an end stop that was hit;
@@ -274,16 +224,19 @@ def integrate(
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS
 
-    if step is not None and not (math.isfinite(step) and step > 0):
-        raise InputError(f"step must be > 0 s, got {step}")
-    if error is not None and not (math.isfinite(error) and error > 0):
-        raise InputError(f"error must be > 0 Pa, got {error}")
+    if duration is None:
+        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
+    rate = rate or experiment.rate * oversampling(experiment)
+    allowed_error = experiment.error_allowed if error is None else error
+    is_checked = step is None
+    step = experiment.step if step is None else step
+    for name, value, unit in (("step", step, "s"), ("error", allowed_error, "Pa")):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be > 0 {unit}, got {value}")
     n_out = round(duration * rate)
-    start_state = loaded_standstill_state(rig, load, x_0)
-    schedule = Schedule(effects, loaded_rig_numbers(rig, load), n_out, rate)
-    chosen_method, euler = choose_method(rig, method), rig.motor.integrator == "euler"
-    run = _Integration(inputs, schedule, rate, chosen_method, euler, allow_unresolved, progress, load, feedback)
-    windows = [] if error is None else comparison_windows(n_out, rate)
+    run = _Integration(experiment, leaks, n_out, rate, progress)
+    start_state = loaded_standstill_state(experiment.rig, experiment.load, experiment.x_0)
+    windows = comparison_windows(n_out, rate) if is_checked else []
     bounds = {0, n_out}  # outputs at which the run stops
     shortest_step = LONGEST_STEP / MAX_STEP_REFINEMENT
     max_steps = steps_per_output(rate, shortest_step)  # most steps per output that are tried
@@ -291,21 +244,21 @@ def integrate(
     if first_step is None:
         # the run stops at the end of each window, so that a step that fails is abandoned at once
         bounds |= {bound for window in windows for bound in window}
-        max_G, max_C = inputs.max_leakage(np.arange(n_out) / rate)
-        longest = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in schedule.numbers))
+        max_G, max_C = run.inputs.max_leakage(np.arange(n_out) / rate)
+        longest = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in run.schedule.numbers))
         first_step = max(longest, shortest_step)
     n_steps = steps_per_output(rate, first_step)
     while True:
         h = 1.0 / (rate * n_steps)
-        if not allow_unresolved:  # leaks and end stops are checked during the run
-            for p in schedule.numbers:
+        if not experiment.allow_unresolved:  # leaks and end stops are checked during the run
+            for p in run.schedule.numbers:
                 refuse_unresolved(p, h, run.method)
-        check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)  # without `error` nothing is checked
+        check = StepErrorCheck(experiment.rig, rate, allowed_error)
         excess = 0.0  # largest ratio of an error to its tolerance
         rows = np.empty((n_out, len(OUTPUTS)))
         y = start_state.copy()
-        if feedback is not None:
-            feedback.restart()
+        if run.feedback is not None:
+            run.feedback.restart()
         for start, stop in itertools.pairwise(sorted(bounds)):
             run.advance(y, start, stop, n_steps, rows)
             for first, end in windows:
@@ -313,9 +266,9 @@ def integrate(
                     excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break  # a shorter step is tried at once
-        if excess <= 1.0 or n_steps >= max_steps or (step is not None and allow_unresolved):
-            volts = None if feedback is None else feedback.volts(n_out)
-            compensated = None if feedback is None else feedback.compensated_flow(n_out)
+        if excess <= 1.0 or n_steps >= max_steps or (step is not None and experiment.allow_unresolved):
+            volts = None if run.feedback is None else run.feedback.volts(n_out)
+            compensated = None if run.feedback is None else run.feedback.compensated_flow(n_out)
             found_error = check.pressure_error if windows else math.nan
             return Trajectory(np.arange(n_out) / rate, rows, run.method, h, found_error, volts, compensated)
         if step is not None:
@@ -329,24 +282,24 @@ def integrate(
         n_steps = min(max(n_steps + 1, math.ceil(n_steps * refinement)), max_steps)
 
 
-@dataclass
 class _Integration:
-    """The integration of one run, with inputs and settings as in `integrate`.
+    """The integration of an experiment with `leaks` over `n_out` outputs at `rate` [Hz], at any step.
 
-    `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: `euler_integral` of
-    `rk4_step`; `reached` [s]: time last reported to `progress`, so that no time is reported again.
+    `schedule`: the model's parameters over time; `feedback`: the controller of a position target, None without one;
+    `reached` [s]: time last reported to `progress`, so that no time is reported again.
     """
 
-    inputs: RunInputs
-    schedule: Schedule
-    rate: float
-    method: Literal["rk4", "imex"]
-    euler: bool
-    allow_unresolved: bool
-    progress: Progress | None
-    load: Force | None = None
-    feedback: Feedback | None = None
-    reached: float = 0.0
+    def __init__(
+        self, experiment: Experiment, leaks: tuple[Leak, ...], n_out: int, rate: float, progress: Progress | None
+    ) -> None:
+        rig, target, controller = experiment.rig, experiment.target, experiment.active_controller
+        self.experiment, self.rate, self.progress, self.reached = experiment, rate, progress, 0.0
+        self.inputs = RunInputs(experiment, leaks)
+        self.method = choose_method(rig, experiment.method)
+        self.schedule = Schedule(experiment.effects(), loaded_rig_numbers(rig, experiment.load), n_out, rate)
+        self.feedback: Feedback | None = None
+        if target is not None and controller is not None:
+            self.feedback = Feedback(rig, target, controller, duration=n_out / rate, rate=rate, seed=experiment.seed)
 
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
         """Integrate the state `y` (14,) in place from output `start` to `stop`, with `n_steps` steps per output.
@@ -358,7 +311,8 @@ class _Integration:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
 
-        h = 1.0 / (self.rate * n_steps)
+        h, load = 1.0 / (self.rate * n_steps), self.experiment.load
+        euler = self.experiment.rig.motor.integrator == "euler"  # `euler_integral` of `rk4_step`
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
         max_outputs = max(1, _BLOCK_STEPS // n_steps)
@@ -367,16 +321,16 @@ class _Integration:
             step_numbers = np.arange(first * n_steps, last * n_steps, dtype=np.float64)
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(step_numbers * h, nodes))
             F = np.zeros((0, 0))  # stands for no load
-            if self.load is not None:
-                F = np.ascontiguousarray(self.load.value_at(step_numbers[:, None] * h + nodes))
+            if load is not None:
+                F = np.ascontiguousarray(load.value_at(step_numbers[:, None] * h + nodes))
             max_G, max_C = float(G.max()), float(C.max())
             for k, end, p in self.schedule.blocks_between(first, last):
-                if not self.allow_unresolved and max(max_G, max_C) > 0.0:
+                if not self.experiment.allow_unresolved and max(max_G, max_C) > 0.0:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
                 # the arguments that `advance` and `advance_closed` share, in their order
-                arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
+                arguments = G[steps], C[steps], F[steps], pack_numbers(p), euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
                     self._check_rows(p, h, out, k)
@@ -411,7 +365,7 @@ class _Integration:
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
 
-        if not self.allow_unresolved and (np.abs(rows[:, POSITION]) > 0.5 * p.L).any():
+        if not self.experiment.allow_unresolved and (np.abs(rows[:, POSITION]) > 0.5 * p.L).any():
             refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
         diverged = ~np.isfinite(rows)
         if diverged.any():
@@ -421,7 +375,7 @@ class _Integration:
                 "smaller step or smaller gains"
             )
         below_vacuum = rows[:, P_A : P_2 + 1] < VACUUM
-        if below_vacuum.any() and not self.allow_unresolved:
+        if below_vacuum.any() and not self.experiment.allow_unresolved:
             k, column = np.unravel_index(int(np.argmax(below_vacuum)), below_vacuum.shape)
             raise SimulationFailed(
                 f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does not boil), "
