@@ -11,7 +11,8 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting.page import report
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Progress, Truth, simulate_experiment
+from sealscope.simulation.integrate import Progress
+from sealscope.simulation.simulate import Truth, simulate_experiment
 from sealscope.storage.folders import make_folder
 
 #: The command of the demo, on the thesis's rig.

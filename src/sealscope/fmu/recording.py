@@ -26,7 +26,7 @@ from sealscope.simulation.integrate import RunInputs, steps_per_output
 from sealscope.units import from_si, to_si
 
 if TYPE_CHECKING:
-    from sealscope.simulation.simulate import Progress
+    from sealscope.simulation.integrate import Progress
 
 #: Longest communication step [s], during which the inputs are constant, and as a fraction of the sampling interval: the
 #: anti-alias filter needs several outputs for each sample.

@@ -62,11 +62,9 @@ class Feedback:
         theta_count = 2.0 * math.pi / sensors.theta.counts  # [rad]
         # `Loop.numbers`; the last is the controller's last voltage, 0 at the start
         self._loop_numbers = sensors.x.resolution, theta_count, min_pressure, rig.daq.u_max, 0.0
-        self.loop: Loop
-        self.restart()
 
     def restart(self) -> None:
-        """Reset the controller, its memory and its outputs to the start of the run."""
+        """Set the controller, its memory and its outputs (`loop`) to the start of the run."""
         controller, samples = self._controller, len(self._inputs)
         measured = np.empty(len(Measured._fields))
         self._law = start_law(controller)

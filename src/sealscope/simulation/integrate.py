@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -27,8 +28,8 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
-#: Called with the simulated time reached [s].
-Progress = Callable[[float], None]
+#: Called with the name of the current task and its completed fraction, 0..1.
+Progress = Callable[[str, float], None]
 #: Step [s] that suits the thesis's rig: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: The shortest step that is chosen by error is `LONGEST_STEP` over this.
@@ -142,21 +143,18 @@ def steps_per_output(rate: float, step: float) -> int:
 
 
 def run_with_sized_leaks(
-    experiment: Experiment,
-    progress: Callable[[str, float], None] | None = None,
-    report_time: Callable[[float], None] | None = None,
+    experiment: Experiment, progress: Progress | None = None
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    The search for the coefficients (`size_leaks`) calls `progress` with the name of a task and its completed fraction.
-    Without a stated mean flow, the only run calls `report_time` with the simulated time [s]. Raises InputError for a
-    leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
+    Raises InputError for a leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the
+    search for the coefficients (`size_leaks`) does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
     # the search begins at the coefficient 0
     initial_leaks = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
     if not any(leak.mean for leak in leaks):
-        return initial_leaks, integrate_run(experiment, initial_leaks, progress=report_time)
+        return initial_leaks, integrate_run(experiment, initial_leaks, progress=progress)
     is_first_run = True  # it has the sought coefficients 0, so that these leaks do not change the pump's flow
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
@@ -201,12 +199,14 @@ def integrate_run(
     duration: float | None = None,
     rate: float | None = None,
     progress: Progress | None = None,
+    task: str = "simulating",
 ) -> Trajectory:
     """Integrate an experiment from standstill over `duration` [s], with outputs at `rate` [Hz].
 
     `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
     experiment's unless None; with a `step` stated here the error is not checked. By default the duration is that of the
-    recording plus the reach of the anti-alias filter, and the rate is the one that the instruments need.
+    recording plus the reach of the anti-alias filter, and the rate is the one that the instruments need. `progress` is
+    called with the name of the `task`.
 
     A stated step is rounded down to a divisor of the output interval. If none is stated, ever shorter steps are tried
     until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
@@ -234,7 +234,7 @@ def integrate_run(
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(f"{name} must be > 0 {unit}, got {value}")
     n_out = round(duration * rate)
-    run = _Integration(experiment, leaks, n_out, rate, progress)
+    run = _Integration(experiment, leaks, n_out, rate, progress and partial(progress, task))
     start_state = loaded_standstill_state(experiment.rig, experiment.load, experiment.x_0)
     windows = comparison_windows(n_out, rate) if is_checked else []
     bounds = {0, n_out}  # outputs at which the run stops
@@ -286,14 +286,20 @@ class _Integration:
     """The integration of an experiment with `leaks` over `n_out` outputs at `rate` [Hz], at any step.
 
     `schedule`: the model's parameters over time; `feedback`: the controller of a position target, None without one;
-    `reached` [s]: time last reported to `progress`, so that no time is reported again.
+    `reported`: outputs last reported to `progress`, so that no fraction of the run is reported again.
     """
 
     def __init__(
-        self, experiment: Experiment, leaks: tuple[Leak, ...], n_out: int, rate: float, progress: Progress | None
+        self,
+        experiment: Experiment,
+        leaks: tuple[Leak, ...],
+        n_out: int,
+        rate: float,
+        progress: Callable[[float], None] | None,
     ) -> None:
         rig, target, controller = experiment.rig, experiment.target, experiment.active_controller
-        self.experiment, self.rate, self.progress, self.reached = experiment, rate, progress, 0.0
+        self.experiment, self.n_out, self.rate = experiment, n_out, rate
+        self.progress, self.reported = progress, 0
         self.inputs = RunInputs(experiment, leaks)
         self.method = choose_method(rig, experiment.method)
         self.schedule = Schedule(experiment.effects(), loaded_rig_numbers(rig, experiment.load), n_out, rate)
@@ -339,9 +345,9 @@ class _Integration:
                 self._check_rows(p, h, out[:n_completed], k)
                 if n_completed < end - k:  # the controller failed
                     self.feedback.raise_failure()
-            if self.progress is not None and last / self.rate > self.reached:
-                self.reached = last / self.rate
-                self.progress(self.reached)
+            if self.progress is not None and last > self.reported:
+                self.reported = last
+                self.progress(last / self.n_out)
 
     def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.

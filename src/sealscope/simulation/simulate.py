@@ -6,9 +6,8 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import (
     DETAIL_TOLERANCE,
+    Progress,
     Trajectory,
     integrate_run,
     oversampling,
@@ -37,8 +37,6 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Called with the name of the current task and its completed fraction, 0..1.
-Progress = Callable[[str, float], None]
 #: Outputs in the truth of a run at each sample, in addition to the powers (`powers`).
 TRUE_OUTPUTS = (
     *("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up"),
@@ -160,17 +158,10 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     """
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
-
-    def report(task: str, time: float) -> None:
-        """Report the progress of a task by the simulated time [s]."""
-        if progress is not None:
-            progress(task, min(1.0, time / experiment.duration))
-
-    leaks, run = run_with_sized_leaks(experiment, progress, partial(report, "simulating"))
+    leaks, run = run_with_sized_leaks(experiment, progress)
     proof = None
     if prove:
-        report_proof = partial(report, "proving: half the step")
-        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=report_proof)
+        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=progress, task="proving: half the step")
         proof = Proof(run.method, run.step, fine.step, compare_trajectories(experiment, run, fine))
         if not (proof.resolved or experiment.allow_unresolved):
             worst = proof.worst()
