@@ -22,7 +22,9 @@ def was_interrupted(done) -> bool:
     return (done.status, done.err.removeprefix("\n")) == (130, "sealscope: interrupted\n")
 
 
-@pytest.mark.parametrize("where", ["sealscope.simulation.integrate.integrate_run", "sealscope.simulation.simulate.record"])
+@pytest.mark.parametrize(
+    "where", ["sealscope.simulation.integrate.integrate_run", "sealscope.simulation.simulate.record"]
+)
 @pytest.mark.parametrize("words", [("simulate", "-o", "run.nc", "--duration", "2"), ("demo", "-o", ".")])
 def test_an_interrupt_while_simulating(where, words, call, untouched, monkeypatch):
     monkeypatch.setattr(where, interrupt)

@@ -108,7 +108,7 @@ def record_fmu(
     volts = experiment.voltage_command.volts(t[: n * factor : factor])
     # zeros stand for channels that the unit lacks, which are not recorded
     all_outputs = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED_NAMES}
-    recorded = record(experiment.rig, all_outputs, volts, factor, experiment.seed, experiment.readings())
+    recorded = record(experiment, all_outputs, volts, factor)
     recorded_names = {"u", *measured} | ({"omega"} if "theta" in measured else set())
     channels = {name: values for name, values in recorded.channels.items() if name in recorded_names}
     channels |= {name: outputs[name][: n * factor : factor] for name in _WITHOUT_INSTRUMENT if name in outputs}

@@ -76,33 +76,24 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else BEYOND_DRIVE
 
 
-@law
-def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
-    """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest behind a centred servo valve.
-
-    `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
-    p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
-    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
-    at other pressures.
-    """
-    p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
-    return p_A, p_1 + p_2 - p_A
-
-
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
     `force` [N]: load against +x; `x` [m]: position. At rest dp_1/dt = 0. As dp_1/dt falls with rising p_1, bisection
     finds this p_1 between the return's pressure and one at which the relief valve takes more than the pump delivers.
+    p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
+    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
+    at other pressures.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
-    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve takes more than the pump delivers
+    high = low + p.p_set + p.q_b * p.omega_P / p.G_set
     p_A, p_B = low, low  # overwritten in the loop
     for _ in range(200):  # more halvings than doubles resolve: `low` and `middle` then agree
         middle = 0.5 * (low + high)
-        p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
+        p_A = (force + p.A_B * (middle + p.p_return)) / (p.A_A + p.A_B)
+        p_B = middle + p.p_return - p_A
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
         dp = middle - p.p_return
         Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - orifice_flow(dp, p.c_slip, p.dp_0)

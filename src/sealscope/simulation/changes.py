@@ -184,39 +184,6 @@ class Schedule:
 
 
 @dataclass(frozen=True)
-class Hold:
-    """A span of time in which a channel is stuck: from `start` to `stop` [s] it repeats its reading at `start`."""
-
-    channel: str
-    start: float
-    stop: float
-
-
-@dataclass(frozen=True)
-class Readings:
-    """All changes of the instruments within a run: changed parameters, and spans in which a channel is stuck."""
-
-    effects: tuple[Effect, ...] = ()
-    holds: tuple[Hold, ...] = ()
-
-    def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute a parameter, such as "sensors.p_A.noise", at times t [s]; `rig_value`: its value without changes."""
-        return apply_effects(rig_value, self.effects, parameter, t)
-
-    def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Replace the readings in each span in which the channel is stuck by the first reading of that span.
-
-        `values` (n,): readings at times `t` (n,) [s]. They are copied before a change.
-        """
-        for hold in self.holds:
-            samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
-            if hold.channel == channel and samples.size:
-                values = values.copy()
-                values[samples] = values[samples[0]]
-        return values
-
-
-@dataclass(frozen=True)
 class Wander:
     """A smooth random walk over `duration` T [s]: slope t / T + sum of w_k sin((k - 1/2) pi t / T), k = 1, 2, ...
 

@@ -15,7 +15,7 @@ from sealscope.calls import take_fields_of
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.arguments import Arguments, Method
-from sealscope.simulation.changes import Effect, ParameterDrift, Readings
+from sealscope.simulation.changes import Effect, ParameterDrift
 from sealscope.simulation.commands import DEFAULT_COMMAND, Command, Sine, check_command
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import Leak, Thinned, parse_leak
@@ -285,10 +285,9 @@ class Experiment:
                 )
         return leaks
 
-    def readings(self) -> Readings:
-        """Collect the changes of instruments within the run, and the spans in which a sensor is stuck."""
-        effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
-        return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
+    def instrument_effects(self) -> tuple[Effect, ...]:
+        """Collect the changes over time of the instruments' parameters by drifts and faults."""
+        return tuple(effect for effect in self._all_effects() if effect.changes_instrument)
 
     @property
     def error_allowed(self) -> float:

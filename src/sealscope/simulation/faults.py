@@ -24,7 +24,6 @@ from sealscope.simulation.changes import (
     SHORTEST_BLOCK,
     THROTTLES,
     Effect,
-    Hold,
     model_parameters_derived_from,
 )
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, Polyline, format_number, normalize_blanks
@@ -205,13 +204,12 @@ class Fault:
             for name in row.parameters
         )
 
-    def holds(self) -> tuple[Hold, ...]:
-        """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
+    def stuck_span(self) -> tuple[float, float] | None:
+        """Find the time span [s] over which a stuck sensor repeats its reading; None for any other fault."""
         if self.name != "sensor stuck":
-            return ()
+            return None
         never_ends = self.opening.y[-1] > 0  # the opening stays as at its last point
-        stop = math.inf if never_ends else float(self.opening.t[-1])
-        return (Hold(self.at, self.onset(), stop),)
+        return self.onset(), math.inf if never_ends else float(self.opening.t[-1])
 
     def change_command(self, command: Command) -> Command:
         """Apply a fault of the duty to a command's amplitude and frequency; return it unchanged for any other fault."""

@@ -11,10 +11,11 @@ import numpy as np
 from sealscope.physics.solvers.loop import quantize
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.simulation.changes import Readings
+from sealscope.simulation.changes import apply_effects
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Daq, PressureTransducer, Rig
+    from sealscope.parameters import Daq, PressureTransducer
+    from sealscope.simulation.experiment import Experiment
 
 #: Half length of the anti-alias filter, in samples of the recording.
 FILTER_REACH = 16
@@ -151,30 +152,28 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
     return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * cycles))
 
 
-def record(rig: Rig, trajectory: Any, u: Array, factor: int, seed: int, readings: Readings | None = None) -> Recording:
-    """Record a simulated run with the rig's instruments.
+def record(experiment: Experiment, trajectory: Any, u: Array, factor: int) -> Recording:
+    """Record a simulated run of an experiment with the rig's instruments.
 
     `trajectory[name]`: values of an output over time, `factor` per sample, which continue for FILTER_REACH samples
-    after the end of the recording; `u` (n,): command [V] at the samples; `readings`: changes of the instruments within
-    the run.
+    after the end of the recording; `u` (n,): command [V] at the samples.
 
     The analog channels (pressures, flow meter) pass the anti-alias filter; the encoders are read without a filter. The
-    clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so
-    that its noise does not depend on the settings of other channels.
+    clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from the
+    experiment's seed, so that its noise does not depend on the settings of other channels.
     """
+    rig, sensors, effects = experiment.rig, experiment.rig.sensors, experiment.instrument_effects()
     n = u.size
     rate = rig.daq.sample_rate
     names = ("common", *PRESSURES, "x", "q_leak", "clock")
-    streams = np.random.SeedSequence(seed).spawn(len(names))
+    streams = np.random.SeedSequence(experiment.seed).spawn(len(names))
     random = {name: np.random.default_rng(stream) for name, stream in zip(names, streams, strict=True)}
-    sensors = rig.sensors
     at_samples = slice(0, n * factor, factor)
     t = np.arange(n) / rate
-    readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
         """Build the function that computes a parameter of the channel's sensor over time, from its symbol and value."""
-        return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
+        return lambda symbol, rig_value: apply_effects(rig_value, effects, f"sensors.{channel}.{symbol}", t)
 
     jitter_steps = None
     if rig.daq.jitter > 0:
@@ -194,7 +193,7 @@ def record(rig: Rig, trajectory: Any, u: Array, factor: int, seed: int, readings
     scale = 1.0 + x_parameter("scale_error", sensors.x.scale_error)
     x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)  # the rig has no such offset, a fault may
     x = x + x_parameter("noise", sensors.x.noise) * random["x"].standard_normal(n)
-    common_noise_sd = readings.value("sensors.common_noise", sensors.common_noise, t)
+    common_noise_sd = apply_effects(sensors.common_noise, effects, "sensors.common_noise", t)
     common_noise = common_noise_sd * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
@@ -214,5 +213,8 @@ def record(rig: Rig, trajectory: Any, u: Array, factor: int, seed: int, readings
     channels["q_leak"] = q if meter.resolution == 0 else np.rint(q / meter.resolution) * meter.resolution
     if not rig.circuit.pump_is_measured:  # the supply's motor has no encoder
         del channels["omega"], channels["theta"]
-    channels = {name: readings.hold_readings(name, values, t) for name, values in channels.items()}
+    for fault in experiment.faults:
+        if (span := fault.stuck_span()) is not None:
+            stuck = np.flatnonzero((t >= span[0]) & (t < span[1]))
+            channels[fault.at][stuck] = channels[fault.at][stuck[:1]]
     return Recording(t, channels, CHANNEL_UNITS, rate)

@@ -184,7 +184,7 @@ def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
     at_samples = _sample_outputs(experiment)
     times = experiment.sample_times()
     command = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
-    readings = record(experiment.rig, run, command, at_samples.step, experiment.seed, experiment.readings())
+    readings = record(experiment, run, command, at_samples.step)
     solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed

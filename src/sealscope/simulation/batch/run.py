@@ -16,7 +16,13 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect, Readings, add_needed_laws, build_blocks, step_limiting_parameters
+from sealscope.simulation.changes import (
+    Effect,
+    add_needed_laws,
+    apply_effects,
+    build_blocks,
+    step_limiting_parameters,
+)
 from sealscope.simulation.commands import Command, Sine
 from sealscope.simulation.experiment import Experiment, choose_method, identity_values
 from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps, volts_per_pascal
@@ -25,7 +31,6 @@ from sealscope.simulation.leaks import Leak
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
 #: Slope [1/s] of the opening (0 to 1) of a leak that opens abruptly.
@@ -226,7 +231,7 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     ends = np.array([first, last]) / members[0].experiment.rate
     experiments = [member.experiment for member in members]
     samples = last - first
-    rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
+    rows = np.array([_pressure_instruments(experiment, ends, samples) for experiment in experiments])
     for row, experiment in zip(rows, experiments, strict=True):
         if row[:, HUM].any():
             random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
@@ -234,13 +239,14 @@ def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> A
     return rows
 
 
-def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
+def _pressure_instruments(experiment: Experiment, ends: Array, samples: int) -> Array:
     """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments, but for the phase of the hum, which is 0.
 
-    `readings`: changes of the instruments within the run; `ends` (2,): start and end [s] of the `samples` samples.
+    `ends` (2,): start and end [s] of the `samples` samples.
     """
     from sealscope.simulation.batch import signals
 
+    rig, effects = experiment.rig, experiment.instrument_effects()
     rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
     for row, name in zip(rows, CHAMBERS, strict=True):
         sensor = getattr(rig.sensors, name)
@@ -251,7 +257,7 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
             (signals.HUM, signals.HUM_RISE, f"sensors.{name}.hum", sensor.hum, 0.0),
             (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
-            start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            start_value, end_value = np.broadcast_to(apply_effects(value, effects, parameter, ends), (2,))
             # `addend`: the gain is 1 plus the gain error
             row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
@@ -474,7 +480,7 @@ class SetRun:
     @cached_property
     def _constant_sensors(self) -> Array | None:
         """The instruments' parameters of all groups, as in `_sensors`; None if any of them change within a run."""
-        if any(member.experiment.readings().effects for member in self.experiment_set.members):
+        if any(member.experiment.instrument_effects() for member in self.experiment_set.members):
             return None
         return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
 
