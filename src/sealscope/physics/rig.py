@@ -22,7 +22,7 @@ from collections import namedtuple
 from collections.abc import Callable, Mapping
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -114,23 +114,13 @@ LAWS: Mapping[str, Callable[[Rig], bool]] = {
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, *LAWS)
 
+#: `RigNumbers`: a rig's parameters, and the numbers derived from them, as the compiled laws take them: SI floats, truth
+#: values, and for each optional law a tuple, empty if the rig lacks it. `RigValues`: the parameters of `VALUES` only.
+#: They are plain named tuples, which numba takes apart into their fields.
 if TYPE_CHECKING:
-
-    class RigNumbers(tuple[Any, ...]):
-        """A rig's parameters, and the numbers derived from them, as the compiled laws take them.
-
-        The numbers are SI floats, the choices truth values, each optional law a tuple, empty if the rig lacks it.
-        """
-
-        _fields: tuple[str, ...]
-
-        def __init__(self, *values: Any, **fields: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-        def _replace(self, **fields: Any) -> RigNumbers: ...
-        def _asdict(self) -> dict[str, Any]: ...
-
-    RigValues = RigNumbers
-else:  # plain named tuples, which numba takes apart into their fields; `RigValues` has the parameters of `VALUES` only
+    RigNumbers: TypeAlias = Any  # type checkers cannot know the fields
+    RigValues: TypeAlias = Any
+else:
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
     RigValues = namedtuple("RigValues", VALUES)
 

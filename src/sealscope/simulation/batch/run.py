@@ -220,33 +220,16 @@ def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experim
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
 
 
-def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the parameters (runs, 2, INSTRUMENT_ROWS) of the instruments of p_A and p_B for first <= sample < last.
+def build_instrument_rows(experiment: Experiment, first: int, last: int) -> Array:
+    """Build the parameters (2, INSTRUMENT_ROWS) of a run's instruments of p_A and p_B for first <= sample < last.
 
     Constants of `batch.signals` index the last axis. Gain, offset, hum and noises may change within a run; they are
     stored as the value at sample `first` (such as `GAIN`) and the mean change per sample (such as `GAIN_RISE`).
     """
-    from sealscope.simulation.batch.signals import HUM, HUM_PHASE
-
-    ends = np.array([first, last]) / members[0].experiment.rate
-    experiments = [member.experiment for member in members]
-    samples = last - first
-    rows = np.array([_pressure_instruments(experiment, ends, samples) for experiment in experiments])
-    for row, experiment in zip(rows, experiments, strict=True):
-        if row[:, HUM].any():
-            random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
-            row[:, HUM_PHASE] = random.random(len(CHAMBERS))
-    return rows
-
-
-def _pressure_instruments(experiment: Experiment, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments, but for the phase of the hum, which is 0.
-
-    `ends` (2,): start and end [s] of the `samples` samples.
-    """
     from sealscope.simulation.batch import signals
 
     rig, effects = experiment.rig, experiment.instrument_effects()
+    ends = np.array([first, last]) / experiment.rate
     rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
     for row, name in zip(rows, CHAMBERS, strict=True):
         sensor = getattr(rig.sensors, name)
@@ -259,13 +242,16 @@ def _pressure_instruments(experiment: Experiment, ends: Array, samples: int) -> 
         ):
             start_value, end_value = np.broadcast_to(apply_effects(value, effects, parameter, ends), (2,))
             # `addend`: the gain is 1 plus the gain error
-            row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
+            row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / (last - first)
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
         row[signals.HUM_CYCLES] = sensor.hum_frequency / daq.sample_rate
         row[signals.RANGE_MIN], row[signals.RANGE_MAX] = sensor.range_lo, sensor.range_hi
         row[signals.VOLTS_AT_MIN] = daq.sensor_volts_lo
         row[signals.VOLTS_PER_PASCAL] = volts_per_pascal(sensor, daq)
         row[signals.VOLTS_PER_CODE], row[signals.MAX_CODE] = daq.step, 2.0 ** (daq.bits - 1)
+    if rows[:, signals.HUM].any():
+        random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
+        rows[:, signals.HUM_PHASE] = random.random(len(CHAMBERS))
     return rows
 
 
@@ -475,14 +461,17 @@ class SetRun:
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
         members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]
-        return pack_lanes(build_instrument_rows(members, first, last), self.width)
+        rows = [build_instrument_rows(member.experiment, first, last) for member in members]
+        return pack_lanes(np.array(rows), self.width)
 
     @cached_property
     def _constant_sensors(self) -> Array | None:
         """The instruments' parameters of all groups, as in `_sensors`; None if any of them change within a run."""
-        if any(member.experiment.instrument_effects() for member in self.experiment_set.members):
+        experiments = [member.experiment for member in self.experiment_set.members]
+        if any(experiment.instrument_effects() for experiment in experiments):
             return None
-        return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
+        rows = [build_instrument_rows(experiment, 0, self.n_samples) for experiment in experiments]
+        return pack_lanes(np.array(rows), self.width)
 
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
