@@ -66,7 +66,7 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 
 
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
-    """Build the experiment that simulates an actuator, with at most as many blocks as the monitor can tell apart."""
+    """Build the experiment that simulates an actuator, with no more blocks than the monitor can tell apart."""
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
         if experiment.duration / BLOCK_S > MAX_IDENTITIES:

@@ -9,8 +9,8 @@ from sealscope.parameters import load_rig
 from sealscope.physics.rig import OUTPUTS
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.signals.details import details
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import FILTER_REACH, decimate, record
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
+from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import simulate
 

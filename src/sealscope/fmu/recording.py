@@ -20,8 +20,8 @@ from sealscope.fmu.variables import INPUTS
 from sealscope.parameters.instruments import Sensors
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import FILTER_REACH, record
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
+from sealscope.simulation.instruments import record
 from sealscope.simulation.integrate import RunInputs, steps_per_output
 from sealscope.units import from_si, to_si
 

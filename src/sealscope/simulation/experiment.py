@@ -32,6 +32,8 @@ MAX_SAMPLES = 20_000_000
 MAX_STEPS = 1_000_000_000
 #: Times at which a drift is checked.
 _N_DRIFT_CHECKS = 2001
+#: Half length of the instruments' anti-alias filter, in samples of the recording.
+FILTER_REACH = 16
 #: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md).
 LONGEST_STEP = 1e-3
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).

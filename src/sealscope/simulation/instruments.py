@@ -12,13 +12,11 @@ from sealscope.physics.solvers.loop import quantize
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.changes import apply_effects
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
 
 if TYPE_CHECKING:
     from sealscope.parameters import Daq, PressureTransducer
-    from sealscope.simulation.experiment import Experiment
 
-#: Half length of the anti-alias filter, in samples of the recording.
-FILTER_REACH = 16
 #: Highest harmonic of the mains hum.
 HUM_HARMONICS = 5
 _KAISER_BETA = 8.0

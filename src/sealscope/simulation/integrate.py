@@ -17,8 +17,7 @@ from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.experiment import LONGEST_STEP, Experiment, choose_method
-from sealscope.simulation.instruments import FILTER_REACH
+from sealscope.simulation.experiment import FILTER_REACH, LONGEST_STEP, Experiment, choose_method
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open, size_leaks
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state

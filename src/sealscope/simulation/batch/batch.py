@@ -173,21 +173,17 @@ def simulate_batch(
     rms = np.empty((n, len(CHAMBERS), edges.size - 1, len(QUANTITIES)))
     # the sets of runs fill the arrays one by one
     batch = Batch(rms, edges, mean_leak_lpm=np.empty(n), coefficients=np.empty(n), steps=np.empty(n))
-    completed = 0.0
+    completed_runs = 0
+
+    def report(fraction: float) -> None:
+        """Report the batch's progress, given the completed `fraction` of the current set."""
+        if progress is not None:
+            progress(min(1.0, (completed_runs + fraction * len(experiment_set.members)) / n))
+
     for experiment_set in sets:
-        set_fraction = len(experiment_set.members) / n
-
-        def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the batch's progress, given the completed `fraction` of this set.
-
-            `before`: fraction of the batch in the sets before. Default values bind the values of this pass of the loop.
-            """
-            if progress is not None:
-                progress(min(1.0, before + fraction * set_fraction))
-
         set_error = error if experiment_set.experiment.error is None else experiment_set.experiment.error
         _run_set(experiment_set, batch, set_error, threads or os.cpu_count() or 1, report)
-        completed += set_fraction
+        completed_runs += len(experiment_set.members)
     return batch
 
 

@@ -24,8 +24,8 @@ from sealscope.simulation.changes import (
     step_limiting_parameters,
 )
 from sealscope.simulation.commands import Command, Sine
-from sealscope.simulation.experiment import Experiment, choose_method, identity_values
-from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps, volts_per_pascal
+from sealscope.simulation.experiment import FILTER_REACH, Experiment, choose_method, identity_values
+from sealscope.simulation.instruments import anti_alias_taps, volts_per_pascal
 from sealscope.simulation.integrate import VACUUM, oversampling_of, refuse_long, refuse_unresolved, steps_per_output
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
@@ -364,9 +364,9 @@ class SetRun:
         def add_progress(fraction: float) -> None:
             """Add `fraction` to the completed fraction of the set, and report the sum; called by all threads."""
             nonlocal completed
-            if progress is not None:
-                with lock:
-                    completed += fraction
+            with lock:
+                completed += fraction
+                if progress is not None:
                     progress(completed)
 
         with ThreadPoolExecutor(threads) as pool:
