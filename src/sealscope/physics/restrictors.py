@@ -82,10 +82,9 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Compute the flow Q [m^3/s] of a one-way throttle at the end of an implicit stage of the solver.
 
-    Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`orifice_flow`) under the pressure difference d
+    Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`one_way_flow`) under the pressure difference d
     [Pa] at the end of the stage. `total` [Pa]: d if nothing flowed in the stage; `g` >= 0 [Pa s/m^3]: fall of d over
-    the stage per unit flow. The root is unique and has the sign of `total`. `c_forward`, `c_reverse`
-    [m^3/(s Pa^0.5)]: flow coefficients for d > 0 and d < 0; `dp_0` [Pa]: difference below which the flow is laminar.
+    the stage per unit flow. The root is unique and has the sign of `total`.
     """
     c = select(total > 0.0, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)

@@ -223,11 +223,11 @@ class Wander:
         return self.times(size / path_range) if path_range > 0 else self
 
     def times(self, factor: float) -> Wander:
-        """Return this random walk multiplied by `factor`."""
+        """Multiply the walk by a factor."""
         return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
 
     def plus(self, other: Wander) -> Wander:
-        """Return the sum of this random walk and another one over the same duration."""
+        """Add another walk over the same duration."""
         pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 

@@ -127,9 +127,8 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
     try:
         return parse_command(in_si)
     except InputError as error:  # let the message name this quantity, and quote the text with its units
-        raise InputError(
-            str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
-        ) from None
+        message = str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
+        raise InputError(message) from None
 
 
 def parse_position(text: str) -> Position | None:

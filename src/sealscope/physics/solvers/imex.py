@@ -114,10 +114,9 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
     """Integrate the state `y` over one step of h [s] by the implicit-explicit method; return the new state.
 
-    The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G` [m^3/(s
-    Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage 1 is explicit: its state is `y`, at which both rates are
-    evaluated. Stage k >= 2 solves for its state z and its implicit rates s_k, then evaluates its explicit rates f_k.
-    E_k and I_k are the rows of the tableaus, W the weights.
+    The tuples hold the inputs of `rates` at the six `IMEX_NODES` of the step. Stage 1 is explicit: its state is `y`, at
+    which both rates are evaluated. Stage k >= 2 solves for its state z and its implicit rates s_k, then evaluates its
+    explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)

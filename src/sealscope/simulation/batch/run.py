@@ -276,9 +276,8 @@ class SetRun:
     ) -> None:
         """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
-        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those of the
-        leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments for the RMS of the
-        wavelet details, None for mean flows only. Raises SimulationFailed if the step is too long for a run.
+        `coefficients`, `flow_coefficients`: as in `build_leak_rows`; `bounds` [s]: limits of the segments for the RMS
+        of the wavelet details, None for mean flows only. Raises SimulationFailed if the step is too long for a run.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -390,10 +389,9 @@ class SetRun:
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
         """Simulate the groups of runs groups[0] <= g < groups[1], chunk by chunk from standstill to the end.
 
-        A group of runs fills a vector register. If segments of time are defined (`bounds`), the pressures are sampled
-        after each chunk as the sensors read them, and the squares of their wavelet details are added to the sums of the
-        segments. `add_progress` is called after each chunk with its share of the whole set's work. A cell is a span of
-        outputs with constant parameters (`Cells`); `table` has the parameters of the chunk's cells.
+        If segments of time are defined (`bounds`), the pressures are sampled after each chunk as the sensors read them,
+        and the squares of their wavelet details are added to the sums of the segments. `add_progress` is called after
+        each chunk with its share of the whole set's work. `table` has the parameters of the chunk's cells (`Cells`).
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
