@@ -91,3 +91,9 @@ def test_an_error_must_be_a_pressure(check_rig, drive):
     for error in (0.0, -1.0, float("nan"), float("inf")):
         with refusal("error", "0 Pa"):
             drive(check_rig(), 1.0, error=error)
+
+
+def test_a_step_must_be_a_time(check_rig, drive):
+    for step in (0.0, -1e-4, float("nan"), float("inf")):
+        with refusal("step", "0 s"):
+            drive(check_rig(), 1.0, step=step)
