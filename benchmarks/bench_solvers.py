@@ -32,7 +32,7 @@ import numpy as np
 
 from sealscope.parameters import Rig, load_rig
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import RunInputs, integrate
+from sealscope.simulation.integrate import integrate_run
 
 PEERS = Path(__file__).parent / "peers"
 RATE = 500.0
@@ -92,22 +92,17 @@ CASES = (
 def ours(case: Case, method: str, step: float | None, duration: float) -> Solve:
     """Our solver, at a step or (None) at the one it chooses: seconds and (n, 3) x [m], p_A, p_B [Pa]."""
     rig = case.rig()
-    experiment = Experiment.of(rig=rig, command=f"{case.amplitude} sin({FREQUENCY}t)", duration=duration)
-    refused = step is not None and step >= REFUSED
+    experiment = Experiment.of(
+        rig=rig,
+        command=f"{case.amplitude} sin({FREQUENCY}t)",
+        duration=duration,
+        method=method,
+        allow_unresolved=step is not None and step >= REFUSED,
+    )
 
     def solve() -> tuple[float, Rows]:
         start = time.process_time()
-        inputs = RunInputs(experiment, ())
-        run = integrate(
-            rig,
-            inputs,
-            duration,
-            RATE,
-            method=method,
-            step=step,
-            error=None if step else 100.0,
-            allow_unresolved=refused,
-        )  # type: ignore[arg-type]
+        run = integrate_run(experiment, (), step=step, duration=duration, rate=RATE)
         took = time.process_time() - start
         return took, np.column_stack([run["x"], run["p_A"], run["p_B"]])
 

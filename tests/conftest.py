@@ -19,7 +19,9 @@ from sealscope.diagnosis.detectors import registry
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import Recording
 from sealscope.signals.details import details
-from sealscope.simulation.integrate import Trajectory, integrate
+from sealscope.simulation.experiment import Experiment
+from sealscope.simulation.integrate import Trajectory, integrate_run
+from sealscope.simulation.leaks import Leak
 
 #: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
 CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
@@ -117,18 +119,9 @@ def check_rig() -> Callable[..., Rig]:
 
 @dataclass(frozen=True)
 class Driven:
-    """A command as a function of time, and constant leakage coefficients."""
+    """A command as a function of time."""
 
     volts: Callable[[np.ndarray], np.ndarray]
-    G: float = 0.0
-    C: float = 0.0
-
-    def at_nodes(self, start: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        t = start[:, None] + offsets
-        return np.ascontiguousarray(self.volts(t)), np.full_like(t, self.G), np.full_like(t, self.C)
-
-    def max_leakage(self, t: np.ndarray) -> tuple[float, float]:
-        return self.G, self.C
 
 
 @pytest.fixture(scope="session")
@@ -161,11 +154,13 @@ def drive() -> Callable[..., Trajectory]:
         G: float = 0.0,
         C: float = 0.0,
         rate: float = 500.0,
+        step: float | None = None,
+        kind: type[Experiment] = Experiment,
         **options: Any,
     ) -> Trajectory:
-        if "step" in options:
-            options.setdefault("error", None)  # a test's own step may be as coarse as it likes
         volts = u if callable(u) else lambda t: u * np.sin(4.0 * t)
-        return integrate(rig, Driven(volts, G, C), duration, rate, **options)
+        experiment = kind(rig, Driven(volts), duration, **options)
+        leaks = (Leak("laminar", coefficient=G), Leak("orifice", coefficient=C))
+        return integrate_run(experiment, leaks, step=step, duration=duration, rate=rate)
 
     return run

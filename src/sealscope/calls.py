@@ -22,10 +22,7 @@ _MAX_WORD = 200
 
 
 def nearest(word: str, known: Iterable[str], count: int = 1, share: float = 0.5) -> list[str]:
-    """Find up to `count` words of `known` that resemble `word`, the most similar first.
-
-    `share` (0 to 1): lowest similarity, by the `ratio` of difflib. A `word` over 200 characters gets no suggestion.
-    """
+    """Find up to `count` words of `known` that resemble `word`; `share` (0 to 1): lowest similarity (`difflib`)."""
     return difflib.get_close_matches(word, known, n=count, cutoff=share) if len(word) <= _MAX_WORD else []
 
 
@@ -73,8 +70,7 @@ def checked_call(function: Callable[P, R]) -> Callable[P, R]:
 def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
     """Declare an argument of a function as a dataclass field with a default value and documentation.
 
-    `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number. The
-    decorator `take_fields_of` makes the function's signature and docstring from such fields.
+    `kind`: type of the argument in words, such as "float"; `text`: its meaning; `unit`: SI unit of a number.
     """
     full_text = f"{text} [{unit}]." if unit else f"{text}."
     return field(default=default, metadata={"kind": kind, "text": full_text, "unit": unit})
@@ -83,10 +79,9 @@ def argument(default: Any, kind: str, text: str, *, unit: str = "") -> Any:
 def take_fields_of(arguments_class: Callable[P, V]) -> Callable[[Callable[[V], R]], Callable[P, R]]:
     """Build a decorator that makes the fields of a dataclass the parameters of a function.
 
-    `arguments_class`: the dataclass, whose fields are declared by `argument`; it is annotated as a callable, from which
-    type checkers take the parameters. The function is written with one parameter, an instance of this dataclass; its
-    callers pass the fields. The decorator describes the fields in a section "Parameters" of the docstring, before the
-    section "Returns". Wrong arguments raise InputError (`checked_call`).
+    `arguments_class`: the dataclass, whose fields are declared by `argument`. The function is written with one
+    parameter, an instance of it; its callers pass the fields. The decorator describes these in a section "Parameters"
+    of the docstring. Wrong arguments raise InputError (`checked_call`).
     """
     lines: list[str] = []
     for declared_field in fields(arguments_class):  # type: ignore[arg-type]

@@ -1,11 +1,10 @@
 """Compile functions by numba, with a cache that never returns code of outdated sources.
 
-Numba's ``cache=True`` stores the machine code of a function by the source of its own file only. After an edit to
-another file, with a function that it calls, it would silently return the old machine code. Here the name of the cache
-folder is a hash over the sources of all packages with compiled code and of the modules from which these take constants,
-the versions of numba and Python, and the processor. It is in the user's cache folder, unless `SEALSCOPE_CACHE_DIR`
-moves it; an empty value turns caching off. Compiled code is unpickled, which can run any command: only folders that no
-other user can write are used.
+After an edit to another file, with a function that it calls, numba's ``cache=True`` would return the old machine code
+of a function. Here the name of the cache folder is a hash over the sources of all packages with compiled code and of
+the modules from which these take constants, the versions of numba and Python, and the processor. It is in the user's
+cache folder, unless `SEALSCOPE_CACHE_DIR` moves it; an empty value turns caching off. Compiled code is unpickled, which
+can run any command: only folders that no other user can write are used.
 
 Kernels are functions that Python calls; laws are functions, such as a formula of physics, that kernels call.
 """
@@ -38,12 +37,11 @@ from platformdirs import user_cache_path
 numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
-_MESSAGE_LIMITS = "monitor/sources/message_limits.py"
 #: Packages and modules with compiled code that is cached, or from which it takes constants (`units`) or the order of a
 #: record's fields (`parameters`). The code of `fmu` is compiled anew for each unit (`plain_code`).
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py", "units.py", "units.toml", "parameters"),
-    *("physics", "signals", "control", "simulation", "diagnosis", _MESSAGE_LIMITS),
+    *("physics", "signals", "control", "simulation", "diagnosis", "monitor/sources/message_limits.py"),
 )
 #: Number of cache folders that are kept, those of the current sources and of the sources used before.
 _MAX_GENERATIONS = 4
@@ -73,11 +71,9 @@ def source_hash(root: Path) -> str:
     """Compute a hash, in hex digits, over the sources in the folder `root` that compiled code depends on."""
     digest = hashlib.sha256()
     for package in _COMPILED_PACKAGES:
-        files = [root / package]
-        if files[0].is_dir():
-            # .toml: numbers, such as priors, that are compiled into kernels as constants
-            files = sorted(path for path in files[0].rglob("*") if path.suffix in (".py", ".toml"))
-        for path in files:
+        # .toml: numbers, such as priors, that are compiled into kernels as constants
+        files = sorted(path for path in (root / package).rglob("*") if path.suffix in (".py", ".toml"))
+        for path in files or [root / package]:
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -107,11 +103,7 @@ def _prune(kernels: Path, current: str) -> None:
 
 
 def _check_owner(folder: Path, forbidden: int) -> None:
-    """Raise PermissionError unless `folder` is a directory, not a link, that belongs to this user alone.
-
-    `forbidden`: permission bits that must not be set, such as 0o022, with which others could write. On Windows only the
-    existence of the folder is checked.
-    """
+    """Raise PermissionError unless `folder` is a directory, not a link, of this user, without the `forbidden` bits."""
     status = folder.lstat()
     if not hasattr(os, "getuid"):  # on Windows the folders of a user are private
         return
@@ -123,8 +115,7 @@ def _make_private(folder: Path) -> None:
     """Create a folder for this user only, or restrict an existing one; raise OSError if others could write to it."""
     folder.mkdir(mode=0o700, exist_ok=True)
     _check_owner(folder, forbidden=0o022)  # others cannot write
-    if folder.lstat().st_mode & 0o077:
-        folder.chmod(0o700)
+    folder.chmod(0o700)
     _check_owner(folder, forbidden=0o077)  # others cannot read, either
 
 
@@ -132,9 +123,8 @@ def _make_private(folder: Path) -> None:
 def cache_directory() -> Path | None:
     """Create the folder for the compiled code of these sources, and return its path.
 
-    The user's cache folder is preferred; if it is not safe or not writable, a private folder among the temporary files
-    is used. Older folders are removed (`_prune`). Returns None if `_user_cache_folder` does, or after a warning if no
-    folder is usable.
+    If the user's cache folder is not safe or not writable, a private folder among the temporary files is used. Returns
+    None if caching is turned off, or after a warning if no folder is usable.
     """
     base = _user_cache_folder()
     if base is None:
@@ -165,19 +155,15 @@ def cache_directory() -> Path | None:
     return None
 
 
-def kernel(function: _F, fastmath: Any = False) -> _F:
-    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code.
-
-    Arithmetic follows IEEE 754 unless `fastmath` is True or a set of LLVM's fast-math flags, as for `numba.njit`.
-    """
-    return _compiler().compile_kernel(function, fastmath, cache_directory())  # type: ignore[no-any-return]
+def kernel(function: _F) -> _F:
+    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code."""
+    return _compiler().compile_kernel(function, cache_directory())  # type: ignore[no-any-return]
 
 
-def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
-    """Compile a law, a function that compiled functions call; `inlined`: True to insert its code in place of each call.
+def _compile_law(function: _F, fastmath: Any = False, inlined: bool = True) -> _F:
+    """Compile a law; `fastmath`: LLVM's fast-math flags, False for none; `inlined`: True to insert its code at calls.
 
-    `fastmath`: LLVM's fast-math flags, False for none. If numba's compilation is switched off (`NUMBA_DISABLE_JIT`),
-    `function` itself is returned.
+    If numba's compilation is switched off (`NUMBA_DISABLE_JIT`), `function` itself is returned.
     """
     if numba.config.DISABLE_JIT:
         return function
@@ -186,12 +172,12 @@ def _compile_law(function: _F, fastmath: Any, inlined: bool = True) -> _F:
 
 def law(function: _F) -> _F:
     """Compile a small function, such as a formula, for use in other compiled functions; Python runs it uncompiled."""
-    return _compile_law(function, fastmath=False)
+    return _compile_law(function)
 
 
 def large_law(function: _F) -> _F:
     """Compile a large function for calls from Python and from compiled functions; its code is not inlined in these."""
-    return _compile_law(function, fastmath=False, inlined=False)
+    return _compile_law(function, inlined=False)
 
 
 def contracted(function: _F) -> _F:
@@ -199,7 +185,7 @@ def contracted(function: _F) -> _F:
 
     The results' last digits then depend on the processor, but not on the division of samples into blocks or vectors.
     """
-    return _compile_law(function, fastmath={"contract", "arcp"})  # fused multiply-adds, reciprocals
+    return _compile_law(function, fastmath={"contract", "arcp"})
 
 
 class Entry:

@@ -11,7 +11,8 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.recordings import read, write
 from sealscope.reporting.page import report
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.simulate import Progress, Truth, simulate_experiment
+from sealscope.simulation.integrate import Progress
+from sealscope.simulation.simulate import Truth, simulate_experiment
 from sealscope.storage.folders import make_folder
 
 #: The command of the demo, on the thesis's rig.
@@ -42,8 +43,7 @@ class Demo:
 def run_demo(folder: Path, seed: int = 1, progress: Progress | None = None) -> Demo:
     """Simulate recordings, commission a machine on healthy ones, and diagnose a healthy and a leaking one.
 
-    All files are written into `folder`. `seed` sets the random numbers, which differ from recording to recording.
-    `progress` is called with the name of a task and its completed fraction.
+    All files are written into `folder`. `progress` is called with the name of a task and its completed fraction.
     """
     report_progress = progress or (lambda task, share: None)
     names = [*(f"healthy/run{k + 1}.nc" for k in range(N_HEALTHY)), "healthy.nc"]

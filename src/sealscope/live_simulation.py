@@ -56,8 +56,7 @@ _simulation_lock = Lock()
 def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]) -> list[Source]:
     """Build a source of samples for each actuator whose settings contain `simulate`.
 
-    `say`: called with a message when a simulation begins, and when all its samples are delivered. Raises InputError
-    for invalid settings (`_make_experiment`).
+    `say`: called with a message when a simulation begins, and when all its samples are delivered.
     """
     return [
         _make_source(actuator.name, _make_experiment(actuator, actuator.simulate), actuator.simulate, say)
@@ -67,10 +66,7 @@ def make_simulated_sources(settings: MonitorSettings, say: Callable[[str], None]
 
 
 def _make_experiment(actuator: ActuatorSettings, settings: SimulateSettings) -> Experiment:
-    """Build the experiment that simulates an actuator.
-
-    Raises InputError for invalid settings, and if the run has more blocks of data than the monitor can tell apart.
-    """
+    """Build the experiment that simulates an actuator, with no more blocks than the monitor can tell apart."""
     try:
         experiment = Experiment.of(rig=actuator.rig, **settings.model_dump(exclude={"speed"}))
         if experiment.duration / BLOCK_S > MAX_IDENTITIES:
@@ -84,7 +80,7 @@ def _make_source(name: str, experiment: Experiment, settings: SimulateSettings, 
     """Build a source that simulates the actuator `name` and submits its samples to the monitor in blocks of 1 s.
 
     The blocks arrive at `settings.speed` times real time. Those that the monitor has already stored are left out, and
-    so is the rest after the last whole block. `say`: called with a message at the start and at the end.
+    so is the rest after the last whole block.
     """
 
     def play(receiver: BlockReceiver) -> None:

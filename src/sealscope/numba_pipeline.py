@@ -21,19 +21,6 @@ from numba.core.ir_utils import get_definition, guard
 from numba.core.untyped_passes import RewriteSemanticConstants
 from numba.extending import register_jitable
 
-#: Names of numba, by module, that its manual lacks but this module, `numba_private`, `physics.lanes` or `fmu` uses.
-EXTENSION_NAMES = {
-    "numba.core": ("cgutils", "config", "ir"),
-    "numba.core.compiler": ("CompilerBase", "DefaultPassBuilder"),
-    "numba.core.compiler_machinery": ("FunctionPass", "register_pass"),
-    "numba.core.ir_utils": ("get_definition", "guard"),
-    "numba.core.typeconv": ("Conversion",),
-    "numba.core.typing.templates": ("AbstractTemplate", "infer_global", "signature"),
-    "numba.core.untyped_passes": ("RewriteSemanticConstants",),
-    "numba.cpython.unsafe.tuple": ("tuple_setitem",),
-    "numba.np.unsafe.ndarray": ("to_fixed_tuple",),
-}
-
 
 @register_pass(mutates_CFG=False, analysis_only=False)  # type: ignore[untyped-decorator]
 class ConstantLengths(FunctionPass):  # type: ignore[misc]
@@ -104,20 +91,19 @@ class _FullCompiler(CompilerBase):  # type: ignore[misc]
 _OPTIONS = {"nogil": True, "error_model": "numpy", "pipeline_class": _FullCompiler}
 
 
-def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Prepare a function for compilation at Python's first call; `fastmath` as for `numba.njit`; `folder`: unused."""
-    return numba.njit(fastmath=fastmath, **_OPTIONS)(function)
+def compile_kernel(function: Callable[..., Any], folder: Path | None) -> Any:
+    """Prepare a function for compilation at Python's first call; `folder`: unused."""
+    return numba.njit(**_OPTIONS)(function)
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Compile a function for calls from other compiled functions; `folder` is not used.
+    """Compile a law, a function that compiled functions call; `folder`: unused.
 
-    `fastmath`: as for `numba.njit`; `inlined`: True if numba may insert the function's code in place of a call, and
-    Python is to run the uncompiled function.
+    `fastmath`: as for `numba.njit`; `inlined`: True if Python is to run the uncompiled function.
     """
     if inlined:
         return register_jitable(fastmath=fastmath, **_OPTIONS)(function)
-    return compile_kernel(function, fastmath, folder)
+    return compile_kernel(function, folder)
 
 
 def compile_at_address(function: Callable[..., Any], signature: Any, folder: Path | None) -> Callable[[], int]:

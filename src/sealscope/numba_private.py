@@ -1,8 +1,7 @@
 """Compile by numba's private classes: fewer passes, and a cache that treats damaged files as cache misses.
 
 A law is a function that only other compiled functions call. This module is imported only for numba versions within
-`compiled.KNOWN_VERSIONS`; others use `numba_pipeline`. `NAMES` and `ATTRIBUTES` list all private names in this
-module, which `tests/physics/test_numba_names.py` checks.
+`compiled.KNOWN_VERSIONS`; others use `numba_pipeline`. `tests/physics/test_numba_names.py` checks all private names.
 """
 
 from __future__ import annotations
@@ -44,35 +43,6 @@ from numba.core.untyped_passes import (
 from sealscope.numba_pipeline import ConstantLengths
 
 _log = logging.getLogger(__name__)
-#: Imported private names, by module.
-NAMES = {
-    "numba.core.caching": ("FunctionCache",),
-    "numba.core.codegen": ("JITCodeLibrary",),
-    "numba.core.compiler_machinery": ("PassManager",),
-    "numba.core.registry": ("CPUDispatcher",),
-    "numba.core.runtime": ("rtsys",),
-    "numba.core.typed_passes": (
-        *("AnnotateTypes", "IRLegalization", "NativeLowering", "NoPythonBackend", "NopythonTypeInference"),
-        "PreLowerStripPhis",
-    ),
-    "numba.core.untyped_passes": (
-        *("DeadBranchPrune", "FixupArgs", "GenericRewrites", "IRProcessing", "ReconstructSSA"),
-        *("RewriteSemanticConstants", "TranslateByteCode"),
-    ),
-}
-#: Attributes of classes and modules that are overridden, called or set.
-ATTRIBUTES = {
-    "numba.core.caching:FunctionCache": (
-        *("load_overload", "_load_overload", "_guard_against_spurious_io_errors"),
-        *("save_overload", "flush", "cache_path"),
-    ),
-    "numba.core.codegen:JITCodeLibrary": ("_finalize_final_module", "get_pointer_to_function"),
-    "numba.core.compiler:CompilerBase": ("define_pipelines",),
-    "numba.core.compiler_machinery:PassManager": ("add_pass", "finalize"),
-    "numba.core.registry:CPUDispatcher": ("add_overload", "compile"),
-    "numba.core.runtime:rtsys": ("initialize",),
-    "numba.core.config": ("CACHE_DIR",),
-}
 
 
 class TolerantCache(FunctionCache):  # type: ignore[misc]
@@ -126,9 +96,9 @@ _config_lock = Lock()
 
 
 def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: Path | None) -> Any:
-    """Build numba's dispatcher of a function: the object that compiles the function when it is called.
+    """Build numba's dispatcher, which compiles the function when it is called; `options`: further ones of `njit`.
 
-    `options`: additional options of `numba.njit`; `folder`: folder of the cache, None for no cache.
+    `folder`: folder of the cache, None for no cache.
     """
     dispatcher = numba.njit(pipeline_class=_ShortCompiler, nogil=True, error_model="numpy", **options)(function)
     if folder is None:
@@ -147,9 +117,9 @@ def _dispatcher(function: Callable[..., Any], options: dict[str, Any], folder: P
     return dispatcher
 
 
-def compile_kernel(function: Callable[..., Any], fastmath: Any, folder: Path | None) -> Any:
-    """Prepare a function for compilation at Python's first call; `fastmath` as for `numba.njit`; `folder`: cache."""
-    return _dispatcher(function, {"no_cfunc_wrapper": True, "fastmath": fastmath}, folder)
+def compile_kernel(function: Callable[..., Any], folder: Path | None) -> Any:
+    """Prepare a function for compilation at Python's first call; `folder`: cache, None for none."""
+    return _dispatcher(function, {"no_cfunc_wrapper": True}, folder)
 
 
 class _LawLibrary(JITCodeLibrary):  # type: ignore[misc]
@@ -178,8 +148,8 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
     """A law, i.e. a function for other compiled functions, without numba's wrapper for calls from Python.
 
     The wrapper, which unpacks and checks each argument, takes longer to compile than the law. Without it, Python cannot
-    call the law's compiled code. If Python calls a small law, i.e. a law that is inlined, its Python source runs
-    uncompiled. A large law is compiled a second time, as a kernel with the wrapper, and cached in `folder`.
+    call the compiled code. Python's calls run the uncompiled source of a small law, which is inlined. They compile a
+    large law a second time, as a kernel with the wrapper, which is cached in `folder`.
     """
 
     folder: Path | None = None
@@ -193,18 +163,17 @@ class _Law(CPUDispatcher):  # type: ignore[misc]
     @cached_property
     def _for_python(self) -> Any:
         """The function that Python calls: uncompiled for a small (inlined) law, a kernel for a large one."""
-        inlined = self.targetoptions["forceinline"]
-        return self.py_func if inlined else compile_kernel(self.py_func, self.targetoptions["fastmath"], self.folder)
+        return self.py_func if self.targetoptions["forceinline"] else compile_kernel(self.py_func, self.folder)
 
     def __call__(self, *arguments: Any, **named: Any) -> Any:
         return self._for_python(*arguments, **named)
 
 
 def compile_law(function: Callable[..., Any], fastmath: Any, inlined: bool, folder: Path | None) -> Any:
-    """Prepare a law, a function for calls from other compiled functions, for compilation when it is first needed.
+    """Prepare a law for compilation when it is first needed.
 
     `fastmath`: as for `numba.njit`; `inlined`: True to insert the law's code in place of each call; `folder`: cache for
-    a large law that Python calls (`_Law`), None without a cache.
+    Python's calls of a large law (`_Law`), None without a cache.
     """
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": fastmath, "forceinline": inlined}
     options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}

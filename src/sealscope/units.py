@@ -53,9 +53,7 @@ class Unit(NamedTuple):
     def times(self, other: Unit, power: Fraction) -> Unit:
         """Multiply by `other` raised to a `power`; the product has no offset, such as that of degC.
 
-        Raises ValueError if the numerator or the denominator of the factor of the power or the product would have more
-        than `_MAX_BITS` bits, or the magnitude of the product's power of pi exceeds `_MAX_PI`. Both limits keep the
-        factor and the power of pi within the range of doubles.
+        Raises ValueError beyond the limits `_MAX_BITS` and `_MAX_PI`.
         """
         bits = max(other.factor.numerator, other.factor.denominator).bit_length()
         if abs(power) * bits > _MAX_BITS:  # checked first, as the power itself could take forever
@@ -70,17 +68,14 @@ class Unit(NamedTuple):
 
 
 def _build_unit(row: Mapping[str, Any]) -> Unit:
-    """Build the Unit of a row of `units.toml`: powers of base units, and, if needed, factor, power of pi and offset."""
+    """Build the Unit of a row of `units.toml`."""
     powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
     factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
     return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Build the unit of absolute pressure that belongs to `unit`, a unit of gauge pressure.
-
-    SI values are gauge pressures: the offset is -1 atmosphere, expressed in `unit`.
-    """
+    """Build the unit of absolute pressure that belongs to `unit`, a unit of gauge pressure, as SI values are."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -125,10 +120,7 @@ def _registry() -> Any:
 
 
 def _parse_name(name: str) -> Unit:
-    """Look up a unit in `units.toml` and then in pint; raise InputError if neither has it.
-
-    Pint's units must be proportional to an SI unit; those with an offset, such as degC, are in the table alone.
-    """
+    """Look up a unit in `units.toml` and then in pint; raise InputError if neither has it, proportional to SI units."""
     unit_of_table = _ATOMS.get(_SPELLINGS.get(name, name))
     if unit_of_table is not None:
         return unit_of_table
@@ -169,10 +161,9 @@ def _tokenize(text: str) -> list[str]:
 
 
 def _parse_product(tokens: list[str]) -> Unit:
-    """Parse a product of units, such as ``m^3/(s Pa)``, from its `tokens`, and remove them from the list.
+    """Parse a product of units, such as ``m^3/(s Pa)``, from the first `tokens`, and remove them from the list.
 
-    The product ends with the list or before a closing bracket. A slash divides by the next factor alone. Raises
-    ValueError if there is no valid product.
+    A slash divides by the next factor alone. Raises ValueError if there is no valid product.
     """
     result: Unit | None = None
     divides = False
@@ -202,13 +193,10 @@ def _parse_product(tokens: list[str]) -> Unit:
 def _parse_marked_pressure(text: str) -> Unit | None:
     """Parse a unit of pressure marked as absolute or gauge, such as `bar abs` or `MPa(g)`; None for other texts."""
     match = _MARKED.fullmatch(text)
-    if match is None:
+    if match is None or not same_dimension(match["unit"], "Pa"):
         return None
-    try:
-        unit = parse_unit(match["unit"])
-    except InputError:
-        return None
-    if unit.powers != _ATOMS["Pa"].powers or unit.offset:
+    unit = parse_unit(match["unit"])
+    if unit.offset:  # absolute already
         return None
     return _absolute_unit(unit) if match["absolute"] else unit
 
@@ -230,13 +218,13 @@ def parse_unit(text: str) -> Unit:
     try:
         tokens = _tokenize(normalised.strip())
         unit = _parse_product(tokens)
-        if not tokens:
-            return unit
+        if tokens:  # a closing bracket too many
+            raise ValueError
     except InputError:  # a ValueError, too, but with a message
         raise
     except ValueError:
-        pass
-    raise InputError(f"got {normalised.strip()[:60]}, which is no product of units")
+        raise InputError(f"got {normalised.strip()[:60]}, which is no product of units") from None
+    return unit
 
 
 def _describe_dimension(si_unit: str) -> str:
@@ -257,7 +245,7 @@ def same_dimension(unit: str, other: str) -> bool:
 def is_familiar(unit: str) -> bool:
     """Test whether a unit is known without pint, alone or as a quotient, such as `bar`, `psig` and `cm3/s`.
 
-    Pint knows thousands of names, many of them ordinary words, such as `rod`, which is 5 m.
+    Pint also knows ordinary words, such as `rod`, which is 5 m.
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
     parts = [unit] if unit in names else unit.split("/")
@@ -282,10 +270,7 @@ def _conversion(unit: str, si_unit: str) -> _Conversion:
 
 
 def _require_conversion(unit: str, si_unit: str, name: str, place: str | None) -> _Conversion:
-    """Compute the `_conversion` from `unit` to `si_unit`, with an error for the user if the dimensions differ.
-
-    The InputError states the quantity (`name`), the expected dimension and the file (`place`).
-    """
+    """Compute the `_conversion` from `unit` to `si_unit`; raise InputError for the quantity `name` of file `place`."""
     try:
         return _conversion(unit, si_unit)
     except InputError as error:
@@ -342,18 +327,13 @@ def to_si(
 
 
 @overload
-def from_si(values: float, unit: str, si_unit: str, *, name: str = ..., place: str | None = ...) -> float: ...
+def from_si(values: float, unit: str, si_unit: str, *, name: str = ...) -> float: ...
 @overload
-def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ..., place: str | None = ...) -> Array: ...
-def from_si(
-    values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value", place: str | None = None
-) -> Array | float:
-    """Convert `values` (any shape, or one number) in `si_unit` to doubles in `unit`; the inverse of `to_si`.
-
-    Raises InputError if `unit` has another dimension; the message states `name`, that dimension and the file `place`.
-    """
-    _require_conversion(unit, si_unit, name, place)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
-    return to_si(values, si_unit, unit, name=name, place=place)
+def from_si(values: ArrayLike, unit: str, si_unit: str, *, name: str = ...) -> Array: ...
+def from_si(values: ArrayLike | float, unit: str, si_unit: str, *, name: str = "value") -> Array | float:
+    """Convert `values` (any shape, or one number) in `si_unit` to doubles in `unit`; the inverse of `to_si`."""
+    _require_conversion(unit, si_unit, name, None)  # raises the error on `unit`; that of `to_si` would be on `si_unit`
+    return to_si(values, si_unit, unit)
 
 
 def parse_quantity(
@@ -361,8 +341,8 @@ def parse_quantity(
 ) -> float:
     """Parse a text such as ``2[L/min]``, ``3 psi`` or ``5``, or a number, to a number in `si_unit`, the default unit.
 
-    Raises InputError if the text does not begin with a number, if the unit has another dimension or, with `finite`, if
-    the number is infinite or NaN. The message names the quantity (`name`) and the file or option (`place`).
+    Raises InputError for any other text, for a unit of another dimension and, with `finite`, for an infinite number or
+    NaN. The message names the quantity (`name`) and the file or option (`place`).
     """
     suffix = f" ({place})" if place else ""
     text = value if isinstance(value, str) else ""

@@ -22,7 +22,9 @@ def was_interrupted(done) -> bool:
     return (done.status, done.err.removeprefix("\n")) == (130, "sealscope: interrupted\n")
 
 
-@pytest.mark.parametrize("where", ["sealscope.simulation.integrate.integrate", "sealscope.simulation.simulate.record"])
+@pytest.mark.parametrize(
+    "where", ["sealscope.simulation.integrate.integrate_run", "sealscope.simulation.simulate.record"]
+)
 @pytest.mark.parametrize("words", [("simulate", "-o", "run.nc", "--duration", "2"), ("demo", "-o", ".")])
 def test_an_interrupt_while_simulating(where, words, call, untouched, monkeypatch):
     monkeypatch.setattr(where, interrupt)
@@ -43,11 +45,11 @@ def test_a_real_interrupt_of_a_long_simulation(untouched, surroundings):
     """SIGINT from outside, while the solver works on an hour of the rig."""
     tell = (
         "import sealscope.simulation.integrate as module, sealscope.cli\n"
-        "integrate = module.integrate\n"
+        "integrate = module.integrate_run\n"
         "def announced(*arguments, **options):\n"
         "    print('integrating', flush=True)\n"
         "    return integrate(*arguments, **options)\n"
-        "module.integrate = announced\n"
+        "module.integrate_run = announced\n"
         "sealscope.cli.main()\n"
     )
     words = ("simulate", "-o", "run.nc", "--duration", "3600", "--prove", "--leak", "0.01 L/min")

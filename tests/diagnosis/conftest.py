@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -40,7 +41,7 @@ def records() -> Records:
         throttled: bool = False,
     ) -> Recording:
         experiment, path, volts, factor = case(command, leak, duration, throttled)
-        return record(experiment.rig, path, volts, factor, seed)
+        return record(replace(experiment, seed=seed), path, volts, factor)
 
     return make
 

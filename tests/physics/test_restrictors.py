@@ -10,7 +10,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq
 
-from sealscope.physics.restrictors import implicit_orifice_flow, one_way_coefficient, orifice_coefficient, orifice_flow
+from sealscope.physics.restrictors import implicit_orifice_flow, one_way_flow, orifice_coefficient, orifice_flow
 
 decades = st.floats(-12.0, 0.0).map(lambda e: 10.0**e)
 
@@ -43,8 +43,8 @@ def test_the_coefficient_is_that_of_a_sharp_edged_orifice():
 
 
 def test_a_one_way_throttle_has_a_coefficient_for_each_direction():
-    assert one_way_coefficient(1.0, 2e-6, 1e-6) == 2e-6
-    assert one_way_coefficient(-1.0, 2e-6, 1e-6) == 1e-6
+    assert one_way_flow(1e5, 2e-6, 1e-6, 2000.0) == orifice_flow(1e5, 2e-6, 2000.0)
+    assert one_way_flow(-1e5, 2e-6, 1e-6, 2000.0) == orifice_flow(-1e5, 1e-6, 2000.0)
 
 
 @settings(max_examples=100, deadline=None)

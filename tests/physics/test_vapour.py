@@ -19,7 +19,7 @@ LEAST = P_VAP - P_ATM
 
 
 def boiling(**values):
-    return load_rig("thesis").with_overrides({"p_vap": P_VAP, **values})
+    return load_rig("thesis").with_overrides({"p_vap": P_VAP, "u_max": 12.0, **values})
 
 
 @pytest.fixture(scope="module")
@@ -27,10 +27,9 @@ def separated(drive):
     """The piston moves at a constant speed, without friction; both lines shut at once, and the column behind parts."""
     values = {"p_charge": "0.2 MPa", "F_pr": 0.1, "F_cfr": 0.0, "F_v": 0.1, "G_circ": 1e-9, "orifices": "present"}
     rig = boiling(**values)
-    words = [f"shut-off {side} to 0 % from 0.6 s" for side in "AB"]
-    effects = [effect for text in [*words, "circulation from 0.6 s"] for effect in parse_fault(text).effects(rig)]
+    words = [*(f"shut-off {side} to 0 % from 0.6 s" for side in "AB"), "circulation from 0.6 s"]
     u = {"u": lambda t: 6.0 - 6.0 * np.cos(np.pi * np.minimum(t / 0.5, 1.0))}
-    return rig, drive(rig, 0.7, **u, rate=2e4, step=2e-5, effects=effects)
+    return rig, drive(rig, 0.7, **u, rate=2e4, step=2e-5, faults=tuple(map(parse_fault, words)))
 
 
 def test_a_column_that_parts_surges_by_its_energy(separated):

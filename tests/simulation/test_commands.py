@@ -8,7 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Recording
 from sealscope.simulation.commands import (
     Chirp,
     MultiSine,
@@ -18,7 +17,6 @@ from sealscope.simulation.commands import (
     check_command,
     parse_command,
     ramp,
-    recorded_command,
     sampled_signal,
     step,
 )
@@ -144,11 +142,11 @@ def test_a_command_beyond_the_converter_between_samples_is_refused_too():
 
 def test_a_recorded_command_drives_the_rig_like_the_original():
     first = simulate(command="2 sin(3t)", duration=4.0)
-    again = simulate(command=recorded_command(first, "first.csv"), duration=4.0)
+    again = simulate(command=sampled_signal(first.t, first["u"], "first.csv"), duration=4.0)
     np.testing.assert_allclose(again["x"], first["x"], atol=21e-6)  # linear between samples; a count of 20 um
     assert np.ptp(first["x"]) > 0.01
-    shifted = Recording(first.t + 100.0, {"u": first["u"]}, {"u": "V"}, first.rate)
-    np.testing.assert_allclose(recorded_command(shifted, "").volts(first.t), first["u"], rtol=0, atol=1e-9)
+    shifted = sampled_signal(first.t + 100.0, first["u"])
+    np.testing.assert_allclose(shifted.volts(first.t), first["u"], rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

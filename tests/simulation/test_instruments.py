@@ -9,7 +9,8 @@ from sealscope.parameters import load_rig
 from sealscope.physics.rig import OUTPUTS
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.signals.details import details
-from sealscope.simulation.instruments import FILTER_REACH, decimate, record
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
+from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import Trajectory
 from sealscope.simulation.simulate import simulate
 
@@ -31,7 +32,9 @@ def still(n: int, pressure: float = 1e6, **outputs: np.ndarray) -> Trajectory:
 
 
 def read(n: int, values: dict | None = None, seed: int = 0, path: Trajectory | None = None):
-    return record(load_rig("thesis").with_overrides(values or {}), path or still(n), np.zeros(n), FACTOR, seed)
+    rig = load_rig("thesis").with_overrides(values or {})
+    experiment = Experiment(rig, duration=n / rig.daq.sample_rate, seed=seed)
+    return record(experiment, path or still(n), np.zeros(n), FACTOR)
 
 
 def rms(values: np.ndarray) -> float:

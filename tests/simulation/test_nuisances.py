@@ -13,8 +13,8 @@ from sealscope.simulation.changes import (
     linear_path,
 )
 from sealscope.simulation.commands import polyline_from_table
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import FILTER_REACH, decimate
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
+from sealscope.simulation.instruments import decimate
 from sealscope.simulation.simulate import simulate, simulate_experiment
 
 from ..refusals import refusal

@@ -10,7 +10,7 @@ import pytest
 from sealscope.signals.details import details
 from sealscope.signals.windows import rms
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import RunInputs, comparison_windows, integrate
+from sealscope.simulation.integrate import comparison_windows, integrate_run
 
 from ..refusals import refusal
 from ..representatives import few
@@ -37,11 +37,11 @@ PRBS = "prbs 1 every 0.5 s seed 1"
 )
 def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
     experiment = Experiment.of(rig=check_rig(throttled), command=command, leak="G = 6e-13 from 10 s", duration=20.0)
-    inputs = RunInputs(experiment, experiment.leaks)
-    truth = integrate(experiment.rig, inputs, 20.0, 500.0, step=5e-5, error=None)
+    common = {"duration": 20.0, "rate": 500.0}
+    truth = integrate_run(experiment, experiment.leaks, step=5e-5, **common)
     steps = []
     for error in (1000.0, 100.0, 10.0):
-        run = integrate(experiment.rig, inputs, 20.0, 500.0, error=error)
+        run = integrate_run(experiment, experiment.leaks, error=error, **common)
         assert off(run, truth) <= 1.25 * error, (error, run.step)
         assert run.error <= error
         steps.append(run.step)
@@ -58,7 +58,7 @@ def test_the_error_that_is_asked_for_comes_out(check_rig, throttled, command):
 def test_a_quick_command_gets_a_finer_step_than_a_slow_one(check_rig):
     def step(command: str) -> float:
         experiment = Experiment.of(rig=check_rig(), command=command, duration=4.0)
-        return integrate(experiment.rig, RunInputs(experiment, ()), 4.0, 500.0).step
+        return integrate_run(experiment, (), duration=4.0, rate=500.0).step
 
     assert step("prbs 1 every 0.5 s seed 1") < step("1 sin(2t)")
 
@@ -91,3 +91,9 @@ def test_an_error_must_be_a_pressure(check_rig, drive):
     for error in (0.0, -1.0, float("nan"), float("inf")):
         with refusal("error", "0 Pa"):
             drive(check_rig(), 1.0, error=error)
+
+
+def test_a_step_must_be_a_time(check_rig, drive):
+    for step in (0.0, -1e-4, float("nan"), float("inf")):
+        with refusal("step", "0 s"):
+            drive(check_rig(), 1.0, step=step)

@@ -11,7 +11,7 @@ from sealscope.errors import InputError
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.commands import polyline_from_table
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import integrate_run, solve_leak_coefficients
+from sealscope.simulation.integrate import integrate_run, run_with_sized_leaks
 from sealscope.simulation.leaks import Leak, growing_opening, opening_from, parse_leak
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.units import LITRE_PER_MINUTE
@@ -49,14 +49,13 @@ def test_the_mean_is_what_was_asked_for(law, values, lpm):
 
 def test_the_coefficient_is_the_one_the_operating_point_implies():
     # friction makes about 0.1 MPa: 0.0042 L/min needs near 6 to 7e-13 m^3/(s Pa)
-    (leak,) = solve_leak_coefficients(Experiment.of(leak="0.0042 L/min", duration=10.0))
+    (leak,), _ = run_with_sized_leaks(Experiment.of(leak="0.0042 L/min", duration=10.0))
     assert 5e-13 < leak.coefficient < 8e-13
 
 
 def test_two_leaks_at_once_each_get_their_mean():
     experiment = Experiment.of(leak=["0.01 L/min from 2 s", "0.05 L/min orifice from 6 s"], duration=12.0)
-    leaks = solve_leak_coefficients(experiment)
-    path = integrate_run(experiment, leaks)
+    leaks, path = run_with_sized_leaks(experiment)
     for leak, lpm in zip(leaks, (0.01, 0.05), strict=True):
         inside = path.t >= leak.opening.onset()
         assert flow(leak, path)[inside].mean() / LITRE_PER_MINUTE == pytest.approx(lpm, rel=1e-3)
@@ -171,6 +170,5 @@ def test_a_leak_is_sized_where_friction_sticks_under_a_controller():
         "closed-loop", 8118429864924167505, rig="thesis-closed-loop", duration=120.0, family="fault-tolerant"
     )
     experiment = replace(machine.experiment(seed=3666700274562699366, leak="0.0002 L/min"), duration=13.0)
-    (leak,) = solve_leak_coefficients(experiment)
-    path = integrate_run(experiment, (leak,))
+    (leak,), path = run_with_sized_leaks(experiment)
     assert flow(leak, path).mean() / LITRE_PER_MINUTE == pytest.approx(0.0002, rel=0.01)

@@ -20,13 +20,13 @@ from sealscope.fmu.variables import INPUTS
 from sealscope.parameters.instruments import Sensors
 from sealscope.recordings.channels import CHANNEL_UNITS, Array
 from sealscope.recordings.recording import Recording
-from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.instruments import FILTER_REACH, record
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
+from sealscope.simulation.instruments import record
 from sealscope.simulation.integrate import RunInputs, steps_per_output
 from sealscope.units import from_si, to_si
 
 if TYPE_CHECKING:
-    from sealscope.simulation.simulate import Progress
+    from sealscope.simulation.integrate import Progress
 
 #: Longest communication step [s], during which the inputs are constant, and as a fraction of the sampling interval: the
 #: anti-alias filter needs several outputs for each sample.
@@ -107,7 +107,7 @@ def record_fmu(
     volts = experiment.voltage_command.volts(t[: n * factor : factor])
     # zeros stand for channels that the unit lacks, which are not recorded
     all_outputs = {name: outputs.get(name, np.zeros(t.size)) for name in _MEASURED_NAMES}
-    recorded = record(experiment.rig, all_outputs, volts, factor, experiment.seed, experiment.readings())
+    recorded = record(experiment, all_outputs, volts, factor)
     recorded_names = {"u", *measured} | ({"omega"} if "theta" in measured else set())
     channels = {name: values for name, values in recorded.channels.items() if name in recorded_names}
     channels |= {name: outputs[name][: n * factor : factor] for name in _WITHOUT_INSTRUMENT if name in outputs}

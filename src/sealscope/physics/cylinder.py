@@ -14,11 +14,7 @@ from sealscope.units import P_ATM
 
 @law
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of sides A and B at mid-stroke, each with its hose.
-
-    `c`: object with the volume `V` of a chamber without the rod, the volume `V_rod` of the rod in side B, and the hose
-    volumes `V_hose_A` and `V_hose_B`, all in m^3.
-    """
+    """Compute the oil volumes [m^3] of sides A and B at mid-stroke, each with its hose; `c`: such as `Rig.cylinder`."""
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 
@@ -94,8 +90,8 @@ def opposing_force(v: float, A_opp: float, p_opp: float, C_opp: float) -> float:
     """Compute the force A_opp p [N] with which a second cylinder pushes the piston against +x.
 
     The second cylinder, of piston area `A_opp` [m^2], moves at the piston's velocity `v` [m/s]. It is fed at the
-    pressure `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)], and its oil is taken as
-    incompressible. Its pressure p [Pa gauge] is p_opp + v |v| (A_opp/C_opp)^2, but at least -P_ATM, vacuum.
+    pressure `p_opp` [Pa] through an orifice of flow coefficient `C_opp` [m^3/(s Pa^0.5)]. For incompressible oil its
+    pressure p [Pa gauge] is p_opp + v |v| (A_opp/C_opp)^2, but at least -P_ATM, vacuum.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4, orifice.
     """

@@ -20,7 +20,7 @@ def external_leakage(p: float, G_ext: float) -> float:
 
 @contracted
 def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
-    """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3].
+    """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3], < 0 to it.
 
     The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and p_abs (V_gas + V_up) is constant (isothermal).
     """
@@ -31,10 +31,8 @@ def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
 def polytropic_pressure(V_up: float, p_charge: float, V_gas: float, n_gas: float) -> float:
     """Compute the pressure [Pa gauge] of a gas accumulator whose gas changes its volume polytropically.
 
-    p_abs (V_gas + V_up)^n = constant, with the exponent n = `n_gas`: n = 1 is isothermal (`accumulator_pressure`),
-    n = 1.4 is adiabatic nitrogen. `V_up` [m^3]: oil that the accumulator has delivered, < 0 if it has received oil;
-    `V_gas` [m^3]: volume of the gas at `p_charge` [Pa gauge]. Source: Merritt, Hydraulic Control Systems, 1967,
-    accumulators.
+    p_abs (V_gas + V_up)^n = constant, with the exponent n = `n_gas`: 1 is isothermal, 1.4 is adiabatic nitrogen. Other
+    arguments: as in `accumulator_pressure`. Source: Merritt, Hydraulic Control Systems, 1967, accumulators.
     """
     return (p_charge + P_ATM) * math.pow(V_gas / (V_gas + V_up), n_gas) - P_ATM
 
@@ -71,29 +69,19 @@ def check_valve_flow(dp: float, p_crack: float, G_check: float) -> float:
 
 
 @contracted
-def pilot_opening(dp: float, dp_pilot: float, p_crack: float, k_pilot: float, p_open: float) -> float:
-    """Compute the opening of a pilot-operated check valve: (dp + k_pilot dp_pilot - p_crack)/p_open, limited to 0..1.
-
-    - `dp` [Pa]: pressure drop across the valve in its free direction.
-    - `dp_pilot` [Pa]: pilot pressure minus inlet pressure; a negative value acts like 0.
-    - `k_pilot`: pilot ratio, the piston area of the pilot over the area of the valve's seat.
-    - `p_crack` [Pa]: pressure at which the valve begins to open.
-    - `p_open` [Pa]: increase of the pressure from there until the valve is fully open.
-
-    Oil flows backwards (dp < 0) while k_pilot dp_pilot > p_crack - dp.
-
-    Source: the pilot-operated check valve of the Simscape Fluids library (area linear in the pressure on the poppet).
-    """
-    return min(max((dp + k_pilot * max(dp_pilot, 0.0) - p_crack) / p_open, 0.0), 1.0)
-
-
-@contracted
 def pilot_valve_flow(
     dp: float, dp_pilot: float, p_crack: float, G_check: float, k_pilot: float, p_open: float
 ) -> float:
     """Compute the flow [m^3/s] through a pilot-operated check valve, positive in the free direction.
 
-    The flow is G_check dp times the valve's opening. `dp` [Pa]: inlet minus outlet pressure; `G_check` [m^3/(s Pa)]:
-    conductance of the fully open valve; other arguments: as in `pilot_opening`, which computes the opening.
+    It is G_check dp times the opening (dp + k_pilot dp_pilot - p_crack)/p_open, limited to 0..1:
+
+    - `dp`, `dp_pilot` [Pa]: inlet minus outlet pressure; pilot minus inlet pressure, of which < 0 acts like 0.
+    - `p_crack` [Pa]: pressure at which the valve begins to open; `p_open` [Pa]: further rise until it is fully open.
+    - `G_check` [m^3/(s Pa)]: conductance of the fully open valve.
+    - `k_pilot`: pilot ratio, the piston area of the pilot over the area of the valve's seat.
+
+    Source: the pilot-operated check valve of the Simscape Fluids library (area linear in the pressure on the poppet).
     """
-    return G_check * dp * pilot_opening(dp, dp_pilot, p_crack, k_pilot, p_open)
+    opening = min(max((dp + k_pilot * max(dp_pilot, 0.0) - p_crack) / p_open, 0.0), 1.0)
+    return G_check * dp * opening

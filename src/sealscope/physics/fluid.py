@@ -23,16 +23,14 @@ _MIN_ABSOLUTE_PRESSURE = 100.0
 def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> float:
     """Compute the bulk modulus [Pa] of oil with free air at the pressure `p` [Pa gauge].
 
-    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the modulus `K_oil` [Pa] of the oil without air, the polytropic
-    exponent n = `n_air` of the air, and the volume r of air over the volume of oil at this pressure
-    (`air_volume_ratio`). `air`: the same ratio at atmospheric pressure, 0 for oil without air, whose modulus is K_oil.
-    Air does not dissolve. The absolute pressure p_abs is taken as at least 100 Pa.
+    K = K_oil (1 + r)/(1 + r K_oil/(n p_abs)), with the modulus `K_oil` [Pa] of the oil without air and the volume r of
+    air over the volume of oil (`air_volume_ratio`, which explains the other arguments). Air does not dissolve.
 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas). The Simscape library, from which the thesis took its friction law, has the same formula.
     """
     if not any_lane(air > 0.0):
-        return K_oil + 0.0 * p  # + 0.0 * p gives the result p's type: a number, or a vector of numbers (lanes)
+        return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
     p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
     r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))
@@ -64,12 +62,9 @@ def mixture_density_ratio(p: float, p_0: float, K_oil: float, air: float, n_air:
 
     Its logarithm is the integral of dp/K from p_0 to p, with the modulus K of `effective_bulk_modulus`:
 
-    - the air contributes ln((1 + r_0)/(1 + r)) exactly, where r and r_0 are the ratios of the volumes of air and oil at
-      p and p_0 (`air_volume_ratio`);
+    - the air contributes ln((1 + r_0)/(1 + r)) exactly, with the `air_volume_ratio` r at p and r_0 at p_0;
     - the liquid, of bulk modulus `K_oil` [Pa], contributes the integral of dp/(K_oil (1 + r)), which is computed by
       Simpson's rule with an error below max(r, r_0) |p - p_0|/(6 K_oil).
-
-    `air`: the ratio at atmospheric pressure; `n_air`: polytropic exponent of the air.
     """
     r, r_0 = air_volume_ratio(p, air, n_air), air_volume_ratio(p_0, air, n_air)
     r_m = air_volume_ratio(0.5 * (p + p_0), air, n_air)

@@ -39,9 +39,8 @@ def karnopp_friction(
     """Compute Karnopp's friction force [N]: the piston sticks at velocities |v| < v_th, and slides otherwise.
 
     While it sticks, friction balances `applied` [N], the sum of all other forces, up to `breakaway` [N], which is
-    K_brk F_C of the direction in which they push. While it slides at the velocity `v` [m/s], friction is F_C (1 +
-    (K_brk - 1) exp(-C_c |v|)) sign(v) + F_v v, eq. (4.21). `F_C` [N], `F_v` [N s/m]: Coulomb force and viscous
-    coefficient of the direction of `v`; `K_brk`: breakaway over Coulomb force; `C_c` [s/m]: transition coefficient.
+    K_brk F_C of the direction in which they push. While it slides at the velocity `v` [m/s], friction is that of eq.
+    (4.21) (`stribeck_friction`), with `F_C` [N] and `F_v` [N s/m] of the direction of `v`.
 
     Source: D. Karnopp, Computer simulation of stick-slip friction in mechanical dynamic systems, ASME Journal of
     Dynamic Systems, Measurement and Control 107 (1985) 100-103.
@@ -63,7 +62,7 @@ def bristle_rate(v: float, z: float, g: float, sigma_0: float) -> float:
     """Compute the rate dz/dt [m/s] of the mean deflection z [m] of the contact's elastic bristles in LuGre's law.
 
     dz/dt = v - sigma_0 |v|/g z, with the velocity v [m/s], the friction `g` > 0 [N] of steady sliding at v without its
-    viscous part, and the bristles' stiffness `sigma_0` [N/m]. At a constant v, z settles at g/sigma_0 sign(v).
+    viscous part, and the bristles' stiffness `sigma_0` [N/m].
 
     Source: C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, A new model for control of systems with
     friction, IEEE Transactions on Automatic Control 40 (1995) 419-425, eq. (2). The paper's g is a Gaussian of v, here

@@ -33,6 +33,8 @@ class Lanes(types.Type):  # type: ignore[misc]
 
     def __init__(self, number: Any, width: int) -> None:
         self.number, self.width = number, width
+        element = ir.DoubleType() if number == types.float64 else ir.FloatType()
+        self.llvm_type = ir.VectorType(element, width)
         super().__init__(name=f"Lanes({number}, {width})")
 
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
@@ -47,6 +49,7 @@ class Mask(types.Type):  # type: ignore[misc]
 
     def __init__(self, lanes: Lanes) -> None:
         self.lanes = lanes
+        self.llvm_type = ir.VectorType(ir.IntType(1), lanes.width)
         super().__init__(name=f"Mask({lanes.width})")
 
 
@@ -54,33 +57,20 @@ LANES, SINGLES = Lanes(types.float64, WIDTH), Lanes(types.float32, SINGLE_WIDTH)
 _MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
 
 
-def _vector_type(lanes: Lanes) -> Any:
-    """Return LLVM's vector type for `lanes`, numba's type of a vector of numbers."""
-    return ir.VectorType(ir.DoubleType() if lanes.number == types.float64 else ir.FloatType(), lanes.width)
-
-
 @register_model(Lanes)
-class _LanesModel(models.PrimitiveModel):  # type: ignore[misc]
-    """The representation of lanes in machine code: one LLVM vector of numbers."""
-
-    def __init__(self, manager: Any, lanes: Any) -> None:
-        """Set the LLVM type for `lanes`, the numba type of a vector of numbers; `manager`: numba's data models."""
-        super().__init__(manager, lanes, _vector_type(lanes))
-
-
 @register_model(Mask)
-class _MaskModel(models.PrimitiveModel):  # type: ignore[misc]
-    """The representation of a mask in machine code: one LLVM vector of single bits."""
+class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
+    """The representation of lanes or a mask in machine code: one LLVM vector."""
 
-    def __init__(self, manager: Any, mask: Any) -> None:
-        """Set the LLVM type for `mask`, the numba type of a mask; `manager`: numba's data models."""
-        super().__init__(manager, mask, ir.VectorType(ir.IntType(1), mask.lanes.width))
+    def __init__(self, manager: Any, vector: Any) -> None:
+        """Set the LLVM type of `vector`, the numba type of lanes or a mask; `manager`: numba's data models."""
+        super().__init__(manager, vector, vector.llvm_type)
 
 
 def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
     """Build the LLVM instructions that copy the number `scalar` into every lane of a vector of the type `lanes`."""
     zero = ir.Constant(ir.IntType(32), 0)
-    first_lane = builder.insert_element(ir.Constant(_vector_type(lanes), ir.Undefined), scalar, zero)
+    first_lane = builder.insert_element(ir.Constant(lanes.llvm_type, ir.Undefined), scalar, zero)
     zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
     return builder.shuffle_vector(first_lane, first_lane, zeros)
 
@@ -105,6 +95,38 @@ def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
     return lanes.pop() if compatible else None
 
 
+def _define_type(function: Any, infer_type: Any) -> None:
+    """Make a Python function or operator known to numba, with the type of its result.
+
+    `infer_type(arg_types)`: returns this type, or None if the function does not take arguments of these types.
+    """
+
+    @infer_global(function)
+    class Template(AbstractTemplate):  # type: ignore[misc]
+        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
+            """Return the signature for arguments of the types `args`, None if they are not taken."""
+            result_type = None if kws else infer_type(args)
+            return None if result_type is None else signature(result_type, *args)
+
+
+def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
+    """Make a Python function of `arity` arguments known to numba; return a decorator for the builder of its code.
+
+    `infer_type`: as in `_define_type`. The decorated function builds the LLVM instructions of one call: it takes
+    numba's context, LLVM's builder, and the types and values of the arguments, and returns the value of the result.
+    """
+    _define_type(function, infer_type)
+
+    def register(build: Any) -> Any:
+        """Register the decorated function `build` with numba."""
+        lower_builtin(function, *[types.Any] * arity)(
+            lambda context, builder, sig, args: build(context, builder, sig.args, args)
+        )
+        return build
+
+    return register
+
+
 def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> None:
     """Tell numba how a Python function or operator on lanes (vectors of numbers) is compiled.
 
@@ -112,12 +134,10 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
     `builder` for `values` that are lanes of one type. The result is lanes, or a mask of truth values if `is_test`.
     """
 
-    @infer_global(function)
-    class Template(AbstractTemplate):  # type: ignore[misc]
-        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature for arguments of the types `args`, None without a common type of lanes."""
-            lanes = None if kws else _common_lanes_type(args)
-            return None if lanes is None else signature(_MASKS[lanes] if is_test else lanes, *args)
+    def result_type(arg_types: tuple[Any, ...]) -> Any:
+        """Find the type of the result, None for arguments without a common type of lanes."""
+        lanes = _common_lanes_type(arg_types)
+        return _MASKS[lanes] if is_test and lanes else lanes
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Build the LLVM instructions of one call, with single numbers first converted to lanes."""
@@ -127,6 +147,7 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
         vectors = [_convert_to_lanes(context, builder, value, value_type, lanes) for value, value_type in pairs]
         return build(builder, *vectors)
 
+    _define_type(function, result_type)
     for arg_types in ((Lanes,), (Lanes, Lanes), (Lanes, types.Number), (types.Number, Lanes)):
         lower_builtin(function, *arg_types)(lower)
 
@@ -172,50 +193,20 @@ _define_on_lanes(min, lambda builder, a, b: builder.select(builder.fcmp_ordered(
 _define_on_lanes(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
 
 
+def _mask_type(arg_types: tuple[Any, ...]) -> Any:
+    """Find the type of `&` or `|` of two masks of one type; None for any other arguments."""
+    return arg_types[0] if isinstance(arg_types[0], Mask) and arg_types[0] == arg_types[-1] else None
+
+
 for _function, _name in ((operator.and_, "and_"), (operator.or_, "or_")):
-
-    @infer_global(_function)
-    class _MaskTemplate(AbstractTemplate):  # type: ignore[misc]
-        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature of `&` or `|` for two masks of one type, None for any other arguments."""
-            compatible = not kws and len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]
-            return signature(args[0], *args) if compatible else None
-
+    _define_type(_function, _mask_type)
     lower_builtin(_function, Mask, Mask)(lambda context, builder, sig, args, name=_name: getattr(builder, name)(*args))
 
 
-def register_lowering(function: Any, arity: int, infer_type: Any) -> Any:
-    """Make the Python function `function` known to numba; return a decorator for the builder of its compiled code.
-
-    `arity`: number of arguments of `function`; `infer_type(arg_types)`: returns the type of its result, or None if it
-    does not take arguments of these types. The decorated function builds the LLVM instructions of one call: it takes
-    numba's context, LLVM's builder, and the types and values of the arguments, and returns the value of the result.
-    """
-
-    @infer_global(function)
-    class Template(AbstractTemplate):  # type: ignore[misc]
-        def generic(self, args: tuple[Any, ...], kws: Any) -> Any:
-            """Return the signature of `function` for arguments of the types `args`, None if it does not take them."""
-            if len(args) != arity or kws:
-                return None
-            result_type = infer_type(args)
-            return None if result_type is None else signature(result_type, *args)
-
-    def register(build: Any) -> Any:
-        """Register the decorated function `build` with numba."""
-        lower_builtin(function, *[types.Any] * arity)(
-            lambda context, builder, sig, args: build(context, builder, sig.args, args)
-        )
-        return build
-
-    return register
-
-
 def select(condition: Any, yes: Any, no: Any) -> Any:
-    """Choose `yes` where the condition is true, else `no`, for one number or in each lane of a vector.
+    """Choose `yes` where the condition is true, else `no`, for one number or, compiled, in each lane of a vector.
 
-    Both values are computed before the call, unlike with `if`. Compiled code runs the instructions of `_lower_select`,
-    for numbers and vectors. Python runs the body below, for numbers only.
+    Both values are computed before the call, unlike with `if`.
     """
     return yes if condition else no
 
@@ -257,7 +248,7 @@ def _float_constant(value_type: Any, value: float) -> Any:
     """Return the LLVM constant of a number, repeated for every lane if `value_type` is a type of vectors (lanes)."""
     if not isinstance(value_type, Lanes):
         return ir.Constant(ir.DoubleType(), value)
-    return ir.Constant(_vector_type(value_type), [value] * value_type.width)
+    return ir.Constant(value_type.llvm_type, [value] * value_type.width)
 
 
 def nearest_integer(x: Any) -> Any:
@@ -305,24 +296,22 @@ _LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions for a pointer to one row of an array, as a pointer to a vector of lanes.
+    """Build the LLVM instructions for a pointer to a row of an array, as a pointer to a vector of lanes.
 
-    The first two `values` are the array and the index of the row, counted over all axes but the last. The row has as
-    many numbers as the vector, `lanes.width`.
+    The first two `values` are the array and the row's index, as in `load`.
     """
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
     lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
     first_element = builder.mul(row, ir.Constant(row.type, lanes.width))
-    return builder.bitcast(cgutils.gep_inbounds(builder, data, first_element), _vector_type(lanes).as_pointer())
+    return builder.bitcast(cgutils.gep_inbounds(builder, data, first_element), lanes.llvm_type.as_pointer())
 
 
 def load(array: Any, row: int) -> Any:
-    """Load one row of a C-ordered array as lanes (a vector of numbers).
+    """Load one row of a C-ordered array as lanes (a vector of numbers), in compiled code only (`_lower_load`).
 
-    Only compiled code may call it: `_lower_load` builds its instructions, and the Python function is empty. `array`:
-    (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over all axes
-    but the last.
+    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over all
+    axes but the last.
     """
 
 
@@ -335,16 +324,12 @@ def _loaded_type(arg_types: Any) -> Any:
 
 @register_lowering(load, 2, _loaded_type)
 def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `load`, whose arguments are the array and the row."""
+    """Build the LLVM instructions of `load`."""
     return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
 
 
 def store(array: Any, row: int, value: Any) -> None:
-    """Write lanes, a vector of numbers, to one row of a C-ordered array.
-
-    Only compiled code may call it, as for `load`: `_lower_store` builds its instructions. `array`, `row`: as in `load`;
-    `value`: the lanes.
-    """
+    """Write the lanes `value` to one row of an array, in compiled code only; `array`, `row`: as in `load`."""
 
 
 def _stored_type(arg_types: Any) -> Any:
@@ -355,7 +340,7 @@ def _stored_type(arg_types: Any) -> Any:
 
 @register_lowering(store, 3, _stored_type)
 def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `store`, whose arguments are the array, the row and the vector."""
+    """Build the LLVM instructions of `store`."""
     builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
     return context.get_dummy_value()
 
@@ -366,7 +351,7 @@ def broadcast(value: Any) -> Any:
 
 @register_lowering(broadcast, 1, lambda _: LANES)
 def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `broadcast`, whose only argument is the number."""
+    """Build the LLVM instructions of `broadcast`."""
     return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 

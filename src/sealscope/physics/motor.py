@@ -12,8 +12,7 @@ from sealscope.physics.lanes import select
 def controller_voltage(error: float, integral: float, k_p: float, K_i: float, V_max: float) -> float:
     """Compute the winding voltage [V] of the PI speed controller, eq. (4.3).
 
-    It is k_p error + K_i integral, limited to the drive's supply +-`V_max` [V]. `error` [rad/s]: set speed minus
-    actual speed; `integral` [rad]: its integral over time.
+    It is k_p error + K_i integral, limited to the drive's supply +-`V_max` [V]. `error` [rad/s]: that of the speed.
     """
     voltage = k_p * error + K_i * integral
     return min(max(voltage, -V_max), V_max)

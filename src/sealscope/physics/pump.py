@@ -12,7 +12,6 @@ import math
 from typing import Any
 
 from sealscope.compiled import contracted, law
-from sealscope.physics.restrictors import orifice_flow
 
 
 @contracted
@@ -35,8 +34,8 @@ def pump_torque(dp: float, q_b: float) -> float:
 def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[float, float]:
     """Compute the coefficients (c_slip, k_h) of the pump's turbulent slip and of its hydrodynamic torque.
 
-    c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)] and k_h = C_h rho D^(5/3)/2 [N m s^2], with the displacement
-    per radian D = q_b/(2 pi) [m^3/rad] and the oil's density `rho` [kg/m^3] (Schlosser 1961). `q_b` [m^3/rev]:
+    c_slip = C_st D^(2/3) sqrt(2/rho) [m^3/(s Pa^0.5)], of a flow back through the pump like that of an orifice, and
+    k_h = C_h rho D^(5/3)/2 [N m s^2], with the oil's density `rho` [kg/m^3] (Schlosser 1961). `q_b` [m^3/rev]:
     displacement; `C_st`, `C_h`: dimensionless coefficients.
     """
     D = q_b / (2.0 * math.pi)
@@ -44,26 +43,12 @@ def loss_coefficients(q_b: float, C_st: float, C_h: float, rho: float) -> tuple[
 
 
 @contracted
-def turbulent_slip(dp: float, c_slip: float, dp_0: float) -> float:
-    """Compute the pump's turbulent slip [m^3/s]: the flow that leaks back through its gaps under `dp` = p_1 - p_2 [Pa].
-
-    The flow is that of an orifice of coefficient `c_slip` [m^3/(s Pa^0.5)], laminar below about `dp_0` [Pa].
-    """
-    return orifice_flow(dp, c_slip, dp_0)
-
-
-@contracted
 def friction_torque(omega: float, dp: float, q_b: float, T_f: float, C_f: float, k_h: float, omega_f: float) -> float:
     """Compute the friction torque [N m] of motor and pump at the speed `omega` [rad/s], without viscous drag.
 
-    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|, with the displacement D = q_b/(2 pi) [m^3/rad]:
-
-    - `T_f` [N m]: constant friction.
-    - `C_f`: coefficient (without unit) of friction that grows with the pressure difference `dp` [Pa] of the ports.
-    - `k_h` [N m s^2]: coefficient of the hydrodynamic torque.
-
-    sat limits its argument to +-1, so that T is continuous at standstill: below the speed `omega_f` [rad/s] the
-    friction is linear in the speed. The viscous drag is B_M omega in `motor.shaft_acceleration`.
+    T = sat(omega/omega_f) (T_f + C_f D |dp|) + k_h omega |omega|: constant friction `T_f` [N m], friction that grows
+    with the pressure difference `dp` [Pa] of the ports, hydrodynamic torque (`loss_coefficients`). sat limits its
+    argument to +-1: below the speed `omega_f` [rad/s], friction is linear in the speed.
     """
     smooth_sign = min(max(omega / omega_f, -1.0), 1.0)
     return smooth_sign * (T_f + C_f * abs(pump_torque(dp, q_b))) + k_h * omega * abs(omega)

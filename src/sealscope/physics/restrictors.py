@@ -18,30 +18,19 @@ def orifice_coefficient(C_d: float, area: float, rho: float) -> float:
     return C_d * area * math.sqrt(2.0 / rho)
 
 
+@law
 def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
     """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve.
 
     1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, with the flow coefficients `c` of the throttle and `c_line` of the free
-    line. The valve opens the fraction `opening` of the line's area: fully open C = c, shut C = 0.
+    line. The valve opens the fraction `opening` of the line's area, in Python also an array: fully open C = c but for
+    rounding, shut C = 0.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
     square = opening * opening
     # no division by `opening`, so that a shut valve gives 0
     return c * c_line * opening * (c_line * c_line * square + c * c * (1.0 - square)) ** -0.5
-
-
-#: The same function for compiled code; `series_coefficient` itself also takes arrays.
-_series_coefficient = law(series_coefficient)
-
-
-@law
-def compiled_series_coefficient(c: float, c_line: float, opening: float) -> float:
-    """Compute the flow coefficient of a throttle `c` in series with a shut-off valve, for compiled code.
-
-    The arguments are those of `series_coefficient`. A fully open valve gives exactly `c`.
-    """
-    return c if opening >= 1.0 else _series_coefficient(c, c_line, opening)
 
 
 @contracted
@@ -56,12 +45,9 @@ def orifice_flow(dp: float, c: float, dp_0: float) -> float:
 
 
 @contracted
-def one_way_coefficient(dp: float, c_forward: float, c_reverse: float) -> float:
-    """Choose a one-way throttle's flow coefficient: `c_forward` for a pressure drop dp > 0, else `c_reverse`.
-
-    `dp` [Pa]: pressure drop in the throttle's forward direction.
-    """
-    return select(dp > 0.0, c_forward, c_reverse)  # type: ignore[no-any-return]
+def one_way_flow(dp: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
+    """Compute the flow [m^3/s] of a one-way throttle: `orifice_flow` with `c_forward` if dp > 0, else `c_reverse`."""
+    return orifice_flow(dp, select(dp > 0.0, c_forward, c_reverse), dp_0)
 
 
 @contracted
@@ -69,9 +55,8 @@ def _solve_scaled_flow(b: float, a: float) -> float:
     """Solve w r(w) + a w = b for the scaled flow w = Q/(c sqrt(dp_0)) >= 0 of an orifice, with a >= 0 and b >= 0.
 
     All three terms are pressure differences divided by dp_0. The first is that of the orifice, w r(w) with
-    r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1, which is `orifice_flow` solved for dp. The second, a w, grows linearly with
-    the flow. Their sum is b. The left side rises and is convex, so the root is unique. Halley's method finds it to a
-    relative error of 1e-12.
+    r = sqrt((w^2 + sqrt(w^4 + 4))/2) >= 1, which is `orifice_flow` solved for dp. The left side rises and is convex, so
+    the root is unique. Halley's method finds it to a relative error of 1e-12.
     """
     w = b / (a + 1.0)  # first guess, with r = 1
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w
@@ -97,12 +82,11 @@ def _solve_scaled_flow(b: float, a: float) -> float:
 def implicit_orifice_flow(total: float, g: float, c_forward: float, c_reverse: float, dp_0: float) -> float:
     """Compute the flow Q [m^3/s] of a one-way throttle at the end of an implicit stage of the solver.
 
-    Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`orifice_flow`) under the pressure difference d
+    Q solves d + g Q(d) = total, where Q(d) is the flow of the throttle (`one_way_flow`) under the pressure difference d
     [Pa] at the end of the stage. `total` [Pa]: d if nothing flowed in the stage; `g` >= 0 [Pa s/m^3]: fall of d over
-    the stage per unit flow. The root is unique and has the sign of `total`. `c_forward`, `c_reverse`
-    [m^3/(s Pa^0.5)]: flow coefficients for d > 0 and d < 0; `dp_0` [Pa]: difference below which the flow is laminar.
+    the stage per unit flow. The root is unique and has the sign of `total`.
     """
-    c = one_way_coefficient(total, c_forward, c_reverse)
+    c = select(total > 0.0, c_forward, c_reverse)
     sqrt_dp_0 = math.sqrt(dp_0)
     w = _solve_scaled_flow(abs(total) / dp_0, g * c / sqrt_dp_0)
     return math.copysign(c * sqrt_dp_0 * w, total)
@@ -114,12 +98,8 @@ def clogged_resistance(R: float, V: float, k: float, n: float) -> float:
 
     The blocking laws of filtration at a constant dirt concentration, dR_V/dV = k R (R_V/R)^n, give
     R_V = R (1 + (1 - n) k V)^(1/(1 - n)): `R` is the resistance of the new filter, `k` [1/m^3] the relative rise of the
-    resistance per volume at first, and `n` selects the law. R_V/R is
-
-    - 1 + k V for cake filtration (n = 0) and exp(k V) for intermediate blocking (n = 1),
-    - (1 - k V/2)^-2 for standard (n = 1.5) and 1/(1 - k V) for complete blocking (n = 2).
-
-    1 + (1 - n) k V is limited to at least 1e-3, where a filter with n > 1 passes almost nothing.
+    resistance per volume at first, and `n` selects the law: cake filtration (0), intermediate (1), standard (1.5) or
+    complete blocking (2). 1 + (1 - n) k V is limited to at least 1e-3, where a filter with n > 1 passes almost nothing.
 
     Source: J. Hermia, Constant pressure blocking filtration laws, Trans. IChemE 60 (1982) 183-187.
     """

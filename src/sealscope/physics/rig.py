@@ -22,7 +22,7 @@ from collections import namedtuple
 from collections.abc import Callable, Mapping
 from functools import cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -114,23 +114,13 @@ LAWS: Mapping[str, Callable[[Rig], bool]] = {
 #: The choices: truth values, and the laws.
 CHOICES = (*_CHOICES, *LAWS)
 
+#: `RigNumbers`: a rig's parameters, and the numbers derived from them, as the compiled laws take them: SI floats, truth
+#: values, and for each optional law a tuple, empty if the rig lacks it. `RigValues`: the parameters of `VALUES` only.
+#: They are plain named tuples, which numba takes apart into their fields.
 if TYPE_CHECKING:
-
-    class RigNumbers(tuple[Any, ...]):
-        """A rig's parameters, and the numbers derived from them, as the compiled laws take them.
-
-        The numbers are SI floats, the choices truth values, each optional law a tuple, empty if the rig lacks it.
-        """
-
-        _fields: tuple[str, ...]
-
-        def __init__(self, *values: Any, **fields: Any) -> None: ...
-        def __getattr__(self, name: str) -> Any: ...
-        def _replace(self, **fields: Any) -> RigNumbers: ...
-        def _asdict(self) -> dict[str, Any]: ...
-
-    RigValues = RigNumbers
-else:  # plain named tuples, which numba takes apart into their fields; `RigValues` has the parameters of `VALUES` only
+    RigNumbers: TypeAlias = Any  # type checkers cannot know the fields
+    RigValues: TypeAlias = Any
+else:
     RigNumbers = namedtuple("RigNumbers", (*NUMBERS, *CHOICES))
     RigValues = namedtuple("RigValues", VALUES)
 
@@ -139,29 +129,29 @@ else:  # plain named tuples, which numba takes apart into their fields; `RigValu
 def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> tuple[float, float, float, float]:
     """Compute the throttles' flow coefficients (c_A_in, c_A_out, c_B_in, c_B_out) [m^3/(s Pa^0.5)], eqs. (4.7)-(4.12).
 
-    "in" is the flow towards the cylinder, "out" the return. Each throttle is in series with a shut-off valve. `v`: the
-    rig's parameters. `exponent`: 1 if a throttle's closed fraction is that of its area (eq. 4.8), 2 if that of its
-    diameter (the thesis's text). `literal`: if False, the flow towards the cylinder is free and the return is throttled
-    on both sides (the text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12) are printed.
+    "in" is the flow towards the cylinder, "out" the return. Each throttle is in series with a shut-off valve.
+    `exponent`: 1 if a throttle's closed fraction is that of its area (eq. 4.8), 2 if that of its diameter (the thesis's
+    text). `literal`: if False, the flow towards the cylinder is free and the return is throttled on both sides (the
+    text and Appendix A); if True, side B is the other way round, as eqs. (4.9)-(4.12) are printed.
     """
     free = restrictors.orifice_coefficient(v.C_d, math.pi / 4.0 * v.d_line**2, v.rho)  # eq. (4.7)
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
     throttled_B = free * (1.0 - v.closed_B) ** exponent
-    A_in = restrictors.compiled_series_coefficient(free, free, v.open_A)
-    A_out = restrictors.compiled_series_coefficient(throttled_A, free, v.open_A)
-    B_free = restrictors.compiled_series_coefficient(free, free, v.open_B)
-    B_throttled = restrictors.compiled_series_coefficient(throttled_B, free, v.open_B)
+    free_A, free_B = free, free
+    if v.open_A < 1.0:
+        free_A = restrictors.series_coefficient(free, free, v.open_A)
+        throttled_A = restrictors.series_coefficient(throttled_A, free, v.open_A)
+    if v.open_B < 1.0:
+        free_B = restrictors.series_coefficient(free, free, v.open_B)
+        throttled_B = restrictors.series_coefficient(throttled_B, free, v.open_B)
     if literal:
-        return A_in, A_out, B_throttled, B_free
-    return A_in, A_out, B_free, B_throttled
+        return free_A, throttled_A, throttled_B, free_B
+    return free_A, throttled_A, free_B, throttled_B
 
 
 @law
 def derived_numbers(v: RigValues, exponent: float, literal: bool) -> tuple[float, ...]:
-    """Compute throttle coefficients, mid-stroke volumes and pump loss coefficients (`DERIVED`) of a rig's parameters.
-
-    `v`: the parameters; `exponent`, `literal`: as in `throttle_flow_coefficients`.
-    """
+    """Compute the numbers `DERIVED` of a rig; `exponent`, `literal`: as in `throttle_flow_coefficients`."""
     c_A_in, c_A_out, c_B_in, c_B_out = throttle_flow_coefficients(v, exponent, literal)
     V_A, V_B = cylinder.mid_stroke_volumes(v)
     c_slip, k_h = pump.loss_coefficients(v.q_b, v.C_st, v.C_h, v.rho)
@@ -174,10 +164,7 @@ def parameter_values(rig: Rig) -> RigValues:
 
 
 def throttle_readings(rig: Rig) -> tuple[float, bool]:
-    """Return the rig's interpretation of two ambiguous statements of the thesis about throttles.
-
-    They are the arguments `exponent` and `literal` of `throttle_flow_coefficients`, which explains them.
-    """
+    """Return the arguments `exponent` and `literal` of `throttle_flow_coefficients` for a rig."""
     return (2.0 if rig.line.closed_means == "diameter" else 1.0), rig.line.metering == "literal"
 
 
@@ -200,10 +187,7 @@ def rig_numbers(rig: Rig) -> RigNumbers:
 
 @cache
 def _record_type(lengths: tuple[int, ...]) -> np.dtype[Any]:
-    """Build the NumPy dtype of the record that `pack_numbers` makes.
-
-    `lengths`: lengths of the tuples in `RigNumbers` for the optional laws, 0 for an absent law.
-    """
+    """Build the NumPy dtype of the record that `pack_numbers` makes; `lengths`: those of the laws' tuples."""
     numbers = [(name, "f8") for name in NUMBERS]
     truth_values = [(name, "?") for name in CHOICES if name not in LAWS]
     laws = [(name, "f8", (length,)) for name, length in zip(LAWS, lengths, strict=True)]
@@ -225,10 +209,9 @@ def pack_numbers(p: RigNumbers) -> Any:
 def limit_state(y: State, p: RigNumbers) -> State:
     """Limit the states of motor and spool in `y` after a step of the solver, and set those that no law changes.
 
-    - The motor current is limited to +-i_max, a servo valve's spool to its stroke, and the spool's speed to +-v_max,
-      which a step may overshoot although the rates become 0 at the limits.
-    - Without lines p_1 = p_A and p_2 = p_B are set; with a servo valve p_2 is the return's pressure.
-    - Other states of parts that the rig does not have are set to 0, so that the compiler removes them.
+    A step may overshoot the limits, although the rates become 0 there. Without lines p_1 = p_A and p_2 = p_B are set;
+    with a servo valve p_2 is the return's pressure. Other states of parts that the rig does not have are set to 0, so
+    that the compiler removes them.
     """
     V_up = y[MADE_UP] if len(p.open_circuit) > 0 else 0.0
     bristle = y[BRISTLE] if len(p.bristled) > 0 else 0.0
@@ -247,9 +230,8 @@ def limit_state(y: State, p: RigNumbers) -> State:
 def vapour_floor(q: float, p: RigNumbers) -> float:
     """Compute an oil volume's pressure [Pa gauge]: its pressure state q [Pa gauge], but at least the vapour pressure.
 
-    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further, so that mass balances
-    hold: rho(q) V is the mass of oil in the volume V, with the density rho(q) that follows from the oil's bulk modulus.
-    The fraction 1 - rho(q)/rho(p_vap) of V is vapour.
+    Below the vapour pressure `p_vap` [Pa absolute] the oil boils. The state q may fall further: rho(q) V remains the
+    mass of oil in the volume V, of which the fraction 1 - rho(q)/rho(p_vap) is vapour.
 
     Source: E. B. Wylie, V. L. Streeter, Fluid Transients, 1978, chapter 8: vapour cavities at constant pressure.
     """
@@ -266,11 +248,8 @@ def pressures_of(y: State, p: RigNumbers) -> Pressures:
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s], the set speed minus the speed in the state `y`.
-
-    The command `u` [V] sets the speed. In a rig with a servo valve the set speed is `omega_P`, that of the supply.
-    """
-    if len(p.valved) > 0:  # a rig with a servo valve
+    """Compute the motor's speed error [rad/s]: the speed set by `u` [V] or, with a valve, its supply's, minus y's."""
+    if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
 
@@ -289,8 +268,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     """Compute the friction force [N] on the piston against +x, and the rate [m/s] at which LuGre's bristles deflect.
 
     The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's law (`sticking`) or LuGre's (`bristled`); the
-    rate is 0 unless it has LuGre's. The friction of a motion along -x is multiplied by the rig's parameter `backward`.
-    `applied` [N]: sum of all other forces on the piston along +x.
+    rate is 0 for the other laws. Friction along -x is multiplied by the parameter `backward`. `applied` [N]: sum of all
+    other forces on the piston along +x.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -326,13 +305,12 @@ def implicit_flows(
 
     Q_A flows from line 1 to chamber A, Q_B from chamber B to line 2. On each side the throttle's pressure drop d [Pa]
     at the end of the stage solves d + g Q(d) = total (`implicit_orifice_flow`). `total_A`, `total_B` [Pa]: the drops if
-    nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow. The resistance R of a
-    filter in series with the throttle, which follows from the state `y`, is added to g. With a bypass valve of the
-    filter, `filtered_flow` solves the equation.
+    nothing flowed in the stage; `g_A`, `g_B` [Pa s/m^3]: their fall over the stage per unit flow, to which the
+    resistance R of a filter in series is added.
     """
-    if len(p.filtered) > 0:  # a rig with filters
+    if len(p.filtered) > 0:
         R_A, R_B = filter_resistances(y, p)
-        if len(p.bypassed) > 0:  # the filters have a bypass valve
+        if len(p.bypassed) > 0:
             Q_A = restrictors.filtered_flow(total_A, g_A, R_A, p.p_bypass, p.G_bypass, p.c_A_in, p.c_A_out, p.dp_0)
             return Q_A, restrictors.filtered_flow(
                 total_B, g_B, R_B, p.p_bypass, p.G_bypass, p.c_B_out, p.c_B_in, p.dp_0
@@ -347,7 +325,7 @@ def implicit_flows(
 def filter_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """Compute the flows [m^3/s] through the filters of lines A and B, >= 0 in either direction, without bypass flow."""
     Q_A, Q_B = throttle_flows(y, p)
-    if len(p.bypassed) == 0:  # the filters have no bypass valve
+    if len(p.bypassed) == 0:
         return abs(Q_A), abs(Q_B)
     R_A, R_B = filter_resistances(y, p)
     filter_flow_A = restrictors.flow_through_filter(Q_A, R_A, p.p_bypass, p.G_bypass)
@@ -362,11 +340,11 @@ def throttle_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
     dp_A, dp_B = p_1 - p_A, p_B - p_2
-    if len(p.filtered) > 0:  # a rig with filters
+    if len(p.filtered) > 0:
         return implicit_flows(dp_A, dp_B, 0.0, 0.0, y, p)  # g = 0: the pressures are those of `y`
     # Q_A > 0 flows into the cylinder, Q_B > 0 out of it
-    Q_A = restrictors.orifice_flow(dp_A, restrictors.one_way_coefficient(dp_A, p.c_A_in, p.c_A_out), p.dp_0)
-    return Q_A, restrictors.orifice_flow(dp_B, restrictors.one_way_coefficient(dp_B, p.c_B_out, p.c_B_in), p.dp_0)
+    Q_A = restrictors.one_way_flow(dp_A, p.c_A_in, p.c_A_out, p.dp_0)
+    return Q_A, restrictors.one_way_flow(dp_B, p.c_B_out, p.c_B_in, p.dp_0)
 
 
 @contracted
@@ -409,7 +387,7 @@ def flows_at_both_ends(Q: float, source: float, sink: float, p: RigNumbers) -> t
     carries the same mass, rho_up Q_up = rho_down Q_down, with the oil's densities rho at the pressures `source` and
     `sink` [Pa]. In a rig that balances volumes instead of masses both flows are Q.
     """
-    if len(p.conserving) == 0:  # the rig balances volumes instead of masses
+    if len(p.conserving) == 0:
         return Q, Q
     forward = Q > 0.0
     ratio = density_ratio(select(forward, source, sink), select(forward, sink, source), p)
@@ -432,11 +410,8 @@ def throttle_rates(y: State, Q_A: float, Q_B: float, p: RigNumbers) -> Pressures
 
 @contracted
 def makeup_pressure(y: State, p: RigNumbers) -> float:
-    """Compute the pressure [Pa gauge] of the make-up's accumulator in the state `y`.
-
-    The state contains the oil volume V_up (`MADE_UP`) [m^3] that the accumulator has delivered.
-    """
-    if len(p.polytropic) > 0:  # the gas is not isothermal
+    """Compute the pressure [Pa gauge] of the make-up's accumulator in the state `y`."""
+    if len(p.polytropic) > 0:
         return external.polytropic_pressure(y[MADE_UP], p.p_charge, p.V_gas, p.n_gas)
     return external.accumulator_pressure(y[MADE_UP], p.p_charge, p.V_gas)
 
@@ -450,7 +425,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
     """
     p_up = makeup_pressure(y, p)
     p_A, p_B, p_1, p_2 = pressures_of(y, p)
-    if len(p.throttled) == 0:  # a rig without lines
+    if len(p.throttled) == 0:
         p_1, p_2 = p_A, p_B
     if len(p.piloted) > 0:
         makeup_1 = external.pilot_valve_flow(p_up - p_1, p_2 - p_up, p.p_crack, p.G_check, p.k_pilot, p.p_open)
@@ -482,7 +457,7 @@ def external_pressure_rates(y: State, p: RigNumbers) -> tuple[Pressures, float]:
     drawn_1, makeup_1 = flows_at_both_ends(makeup_1, p_up, y[P_1] if len(p.throttled) > 0 else y[P_A], p)
     drawn_2, makeup_2 = flows_at_both_ends(makeup_2, p_up, y[P_2] if len(p.throttled) > 0 else y[P_B], p)
     fed = drawn_1 + drawn_2  # oil that the accumulator feeds
-    if len(p.throttled) > 0:  # a rig with lines
+    if len(p.throttled) > 0:
         rate_1 = cylinder.pressure_rate(makeup_1, p.V_1, bulk_modulus(y[P_1], p))
         rate_2 = cylinder.pressure_rate(makeup_2, p.V_2, bulk_modulus(y[P_2], p))
         return (-cylinder.pressure_rate(out_A, V_A, K_A), -cylinder.pressure_rate(out_B, V_B, K_B), rate_1, rate_2), fed
@@ -548,12 +523,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 
 @contracted
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
-    """Compute the state's rates dy/dt from all physical laws but the throttles' flows.
-
-    `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)]: conductance and
-    flow coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load over time in addition to the rig's
-    own, which counts only if `p.pushed` is not empty.
-    """
+    """Compute the state's rates dy/dt from all physical laws but the throttles' flows; arguments: as in `rates`."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
     if len(p.sticking) > 0:
         v = friction.stuck_velocity(v, p.v_th)
@@ -565,7 +535,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
     Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
         torque = torque + pump.friction_torque(y[OMEGA], dp_pump, p.q_b, p.T_f, p.C_f, p.k_h, p.omega_f)
-        Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
+        Q_1 = Q_1 - restrictors.orifice_flow(dp_pump, p.c_slip, p.dp_0)  # turbulent slip
     d_omega = motor.shaft_acceleration(y[CURRENT], y[OMEGA], torque, p.C_m, p.B_M, p.J_M)
     stop = cylinder.hard_stop_force(x, v, p.L, p.k_stop, p.d_stop)
     load = cylinder.load_force(x, p.F_l, p.k_load)
@@ -604,7 +574,7 @@ def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p:
         rate_A, rate_B = rate_A + external_part[0], rate_B + external_part[1]
         rate_1, rate_2 = rate_1 + external_part[2], rate_2 + external_part[3]
     if len(p.valved) > 0:
-        d_x_s = valve.spool_speed(y[SPOOL_SPEED], p.v_max)
+        d_x_s = min(max(y[SPOOL_SPEED], -p.v_max), p.v_max)
         x_d = valve.spool_target(u, p.u_N, p.x_max)
         d_v_s = valve.spool_acceleration(y[SPOOL], y[SPOOL_SPEED], x_d, p.omega_s, p.zeta_s, p.v_max)
     if len(p.clogging) > 0:  # in a rig without a spool, these two states are the oil that has passed each filter
@@ -618,10 +588,11 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
     """Compute the rates dy/dt of all states of the rig from its physical laws.
 
     `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: conductance and flow
-    coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load in addition to the rig's own.
+    coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load over time in addition to the rig's own,
+    which counts only if `p.pushed` is not empty.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
-    if len(p.throttled) > 0:  # a rig with throttles
+    if len(p.throttled) > 0:
         Q_A, Q_B = throttle_flows(y, p)
         dy = add_to_pressures(dy, 1.0, throttle_rates(y, Q_A, Q_B, p))
     return dy
@@ -629,10 +600,9 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 
 @contracted
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
-    """Write all outputs of the rig in the state `y` to `row` (21,), in the order of `OUTPUTS`.
+    """Write all outputs of the rig to `row` (21,), in the order of `OUTPUTS`; other arguments: as in `rates`.
 
-    They are the states with pressures not below the vapour pressure, the flows, and the motor's voltage. `u` [V]:
-    command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: leakage coefficients of the piston (`piston_leakage`).
+    No pressure written is below the vapour pressure.
     """
     n = len(y)
     for m in range(n):
@@ -641,7 +611,7 @@ def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarr
     dp_pump = pump_difference(y, p)
     Q_1 = pump.pump_flow(y[OMEGA], dp_pump, p.q_b, p.G_pump)
     if len(p.lossy) > 0:
-        Q_1 = Q_1 - pump.turbulent_slip(dp_pump, p.c_slip, p.dp_0)
+        Q_1 = Q_1 - restrictors.orifice_flow(dp_pump, p.c_slip, p.dp_0)  # turbulent slip
     Q_A, Q_B = throttle_flows(y, p) if len(p.throttled) > 0 else (Q_1, Q_1)  # else the pump is at the chambers
     if len(p.valved) > 0:
         Q_PA, Q_AT, Q_PB, Q_BT = valve_flows(y, p)

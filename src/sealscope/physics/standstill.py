@@ -9,7 +9,8 @@ import numpy as np
 from sealscope.compiled import law
 from sealscope.errors import InputError
 from sealscope.physics.cylinder import hard_stop_force, load_force, opposing_force
-from sealscope.physics.pump import friction_torque, pump_flow, pump_torque, turbulent_slip
+from sealscope.physics.pump import friction_torque, pump_flow, pump_torque
+from sealscope.physics.restrictors import orifice_flow
 from sealscope.physics.rig import RigNumbers, rig_numbers, valve_rates
 from sealscope.physics.state import CURRENT, INTEGRAL, OMEGA, P_1, P_2, P_A, P_B, POSITION, STATES, state_of
 from sealscope.units import P_ATM
@@ -39,12 +40,10 @@ def pressures_at_standstill(force: float, p: RigNumbers) -> tuple[float, float]:
     """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest: p_A A_A - p_B A_B = force.
 
     `force` [N]: load against +x. If the rig has a make-up (`made_up`), the lower pressure is the charge pressure. If
-    not, the circuit contains as much oil as with the charge pressure everywhere. The mean of both pressures, weighted
-    by the oil volumes of the two sides at mid-stroke, is therefore the charge pressure.
+    not, the circuit contains as much oil as with the charge pressure everywhere: the mean of both pressures, weighted
+    by the oil volumes of the two sides at mid-stroke, is the charge pressure.
     """
     if p.made_up:
-        # each pressure balances the force with the charge pressure on the other side, or is the charge pressure if that
-        # is higher
         p_B = max((p.p_charge * p.A_A - force) / p.A_B, p.p_charge)
         p_A = max((p.p_charge * p.A_B + force) / p.A_A, p.p_charge)
         return p_A, p_B
@@ -63,9 +62,8 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     """Set the state `y` (14,), all 0, to standstill of a pump-controlled rig; return 0, or a code if impossible.
 
     `x` [m]: position; `force` [N]: load against +x. The motor holds the pump with the current i = T_load/C_m, eq.
-    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3); it is 0 if K_i = 0, where it has no
-    effect. The code is `BELOW_VACUUM` for a pressure below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the
-    drive's limit.
+    (4.5), for which the speed controller's integral is R_c i/K_i, eq. (4.3). The code is `BELOW_VACUUM` for a pressure
+    below vacuum, `BEYOND_DRIVE` for a current or voltage beyond the drive's limit.
     """
     p_A, p_B = pressures_at_standstill(force, p)
     y[POSITION] = x
@@ -78,36 +76,27 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     return 0 if abs(y[CURRENT]) <= p.i_max and p.R_c * abs(y[CURRENT]) <= p.V_max else BEYOND_DRIVE
 
 
-@law
-def pressures_behind_valve(force: float, A_A: float, A_B: float, p_1: float, p_2: float) -> tuple[float, float]:
-    """Compute the chamber pressures p_A, p_B [Pa] that hold the piston at rest behind a centred servo valve.
-
-    `force` [N]: load against +x; `A_A`, `A_B` [m^2]: piston areas; `p_1`, `p_2` [Pa]: pressures of supply and return.
-    p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
-    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
-    at other pressures.
-    """
-    p_A = (force + A_B * (p_1 + p_2)) / (A_A + A_B)
-    return p_A, p_1 + p_2 - p_A
-
-
 def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, float, float]:
     """Compute the supply pressure p_1 and chamber pressures p_A, p_B [Pa] of a rig at rest with a centred servo valve.
 
     `force` [N]: load against +x; `x` [m]: position. At rest dp_1/dt = 0. As dp_1/dt falls with rising p_1, bisection
     finds this p_1 between the return's pressure and one at which the relief valve takes more than the pump delivers.
+    p_A + p_B = p_1 + p_2, because the edges to supply and return are equal and have equal pressure drops (Merritt,
+    Hydraulic Control Systems, 1967, section 5.2). The same sum is assumed for an overlapped valve, which may trap oil
+    at other pressures.
     """
     y = np.zeros(len(STATES))
     y[POSITION], y[P_2] = x, p.p_return
     low = p.p_return
-    high = low + p.p_set + p.q_b * p.omega_P / p.G_set  # here the relief valve takes more than the pump delivers
+    high = low + p.p_set + p.q_b * p.omega_P / p.G_set
     p_A, p_B = low, low  # overwritten in the loop
     for _ in range(200):  # more halvings than doubles resolve: `low` and `middle` then agree
         middle = 0.5 * (low + high)
-        p_A, p_B = pressures_behind_valve(force, p.A_A, p.A_B, middle, p.p_return)
+        p_A = (force + p.A_B * (middle + p.p_return)) / (p.A_A + p.A_B)
+        p_B = middle + p.p_return - p_A
         y[P_A], y[P_B], y[P_1] = p_A, p_B, middle
         dp = middle - p.p_return
-        Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - turbulent_slip(dp, p.c_slip, p.dp_0)
+        Q_1 = pump_flow(p.omega_P, dp, p.q_b, p.G_pump) - orifice_flow(dp, p.c_slip, p.dp_0)
         _, _, p_1_rate, _ = valve_rates(state_of(y), Q_1, p)
         if p_1_rate > 0.0:
             low = middle
@@ -117,14 +106,11 @@ def supply_at_standstill(force: float, x: float, p: RigNumbers) -> tuple[float, 
 
 
 def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
-    """Compute the state (14,) of a rig at rest with the piston at x_0 [m].
+    """Compute the state (14,) of a rig at rest with the piston at x_0 [m], under its load and `push` [N] against +x.
 
-    The rig's load and `push` [N] act against +x. The pressures carry both (`pressures_at_standstill`), and the motor
-    holds the pump against the pressures (`stand_still`). In a rig with a servo valve the valve is centred and the motor
-    runs at the supply's speed (`supply_at_standstill`). A machine with a leak or an underlapped valve creeps.
-
-    Raises InputError if a pressure is below vacuum (in a rig with a servo valve: not between those of return and
-    supply), or if the drive cannot hold the load.
+    The motor holds the pump against the pressures (`stand_still`). In a rig with a servo valve the valve is centred and
+    the motor runs at the supply's speed (`supply_at_standstill`). A machine with a leak or an underlapped valve creeps.
+    Raises InputError if the pressures or the drive cannot hold the load.
     """
     p, y = rig_numbers(rig), np.zeros(len(STATES))
     force = standstill_force(x_0, p) + push
@@ -149,8 +135,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
     """Fill the state `y` (14,), all zeros, with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the force would need a chamber pressure that
-    is not between those of return and supply, or if the motor cannot drive the supply's pump.
+    `x` [m]: position; `force` [N]: load against +x.
     """
     motor = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)

@@ -16,12 +16,6 @@ def spool_target(u: float, u_N: float, x_max: float) -> float:
 
 
 @contracted
-def spool_speed(v_s: float, v_max: float) -> float:
-    """Compute the velocity dx_s/dt [m/s] of the spool: the state `v_s` [m/s], limited to +-`v_max` [m/s]."""
-    return min(max(v_s, -v_max), v_max)
-
-
-@contracted
 def spool_acceleration(x_s: float, v_s: float, x_d: float, omega_s: float, zeta_s: float, v_max: float) -> float:
     """Compute the rate dv_s/dt [m/s^2] of the spool's speed, as a second-order lag with a limited speed.
 

@@ -1,9 +1,4 @@
-"""Changes of machine and instruments within a run.
-
-An `Effect` changes one parameter of the compiled model or of an instrument over time; a `Hold` makes a sensor repeat
-a reading. Drifts (in this module) and faults (in `faults`) cause effects. The solver takes the machine's parameters
-as constant within short blocks of time.
-"""
+"""Changes of machine and instruments within a run, which drifts (in this module) and faults (in `faults`) cause."""
 
 from __future__ import annotations
 
@@ -12,12 +7,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
+from sealscope.simulation.commands import Polyline
 
 if TYPE_CHECKING:
     from sealscope.physics.rig import RigNumbers
@@ -73,11 +69,7 @@ class Effect:
 
 
 def apply_effects(rig_value: T, effects: Sequence[Effect], field: str, t: Array) -> T | Array:
-    """Compute the parameter `field` at times t [s]: (`rig_value` + sum of addends) x product of factors.
-
-    Addends and factors are the changes by those `effects` that concern this parameter. Without any, `rig_value` is
-    returned as it is.
-    """
+    """Compute the parameter `field` at times t [s] from its `rig_value` and the `effects` on it, if any."""
     value: T | Array = rig_value
     for effect in sorted(effects, key=lambda effect: not effect.additive):  # sums before products
         if effect.field == field:
@@ -102,9 +94,7 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 
     The run is first divided at the breakpoints of effects, to within one output interval, and at times `LONGEST_BLOCK`
     apart. Then each block is divided into equal parts, as many as the most demanding effect needs: an effect may change
-    by its `max_change` from part to part, or more if the parts would otherwise be shorter than its `min_block`. A part
-    may therefore be shorter than the `min_block` of another effect. Between two close breakpoints it may be shorter
-    than that of every effect.
+    by its `max_change` from part to part, or more if the parts would otherwise be shorter than its own `min_block`.
     """
     if not effects:
         return np.array([0, n_out], dtype=np.int64)
@@ -129,16 +119,14 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
 def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers, duration: float) -> tuple[RigNumbers, ...]:
     """Collect the sets of model parameters in a run of `duration` [s] for which the solver's step is checked.
 
-    The first is `base`, without effects. The others are those just before and just after each breakpoint of a fault,
-    between which its effects rise or fall, and at the end of the run if a breakpoint is later. Effects without
-    breakpoints, such as smooth drifts, are left out.
+    The first is `base`, without effects. The others are those just before and just after each breakpoint of an effect,
+    or at the end of the run if that is earlier. Effects without breakpoints, such as smooth drifts, are left out.
     """
     faults = [effect for effect in effects if effect.breakpoints]
-    times = np.array(sorted({min(t, duration) for effect in faults for t in effect.breakpoints}))
-    before_and_after = np.concatenate([times - 1e-9, times + 1e-9])  # a nanosecond from each
-    values = changing_values(faults, base, before_and_after) if times.size else {}
-    if not values:
+    if not faults:
         return (base,)
+    times = np.array(sorted({min(t, duration) for effect in faults for t in effect.breakpoints}))
+    values = changing_values(faults, base, np.r_[times - 1e-9, times + 1e-9])  # a nanosecond from each
     distinct_rows = np.unique(np.array(list(values.values())).T, axis=0)  # a row has the changing parameters at a time
     return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in distinct_rows)
 
@@ -146,7 +134,7 @@ def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers, durati
 def add_needed_laws(base: RigNumbers, effects: Sequence[Effect]) -> RigNumbers:
     """Add to the parameters `base` the optional laws that effects need: leaks to the outside, and free air.
 
-    They are compiled in, so that every block of a run has them. A factor needs no law: it leaves a parameter of 0 at 0.
+    A factor needs no law: it leaves a parameter of 0 at 0.
     """
     options: dict[str, Any] = {}
     for effect in effects:
@@ -163,15 +151,13 @@ def build_blocks(
     """Divide a run into blocks of constant parameters; return their bounds, and the values of changing parameters.
 
     `base`: the parameters without effects. The blocks are those of `block_bounds`, merged where neighbours have equal
-    parameters: the bounds (n + 1,) of n blocks are indices of the `n_out` outputs at `rate` [Hz]. The values (n,), by
-    parameter, are those of the blocks' middles.
+    parameters. The values (blocks,), by parameter, are those of the blocks' middles.
     """
     bounds = block_bounds(effects, n_out, rate)
     values = changing_values(effects, base, np.asarray(0.5 * (bounds[:-1] + bounds[1:]) / rate, dtype=np.float64))
     if not values:
         return bounds, values
     table = np.array(list(values.values()))  # (parameters, blocks)
-    # for each block: do its parameters differ from those of the block before it? True for the first block
     differs = np.r_[True, np.any(table[:, 1:] != table[:, :-1], axis=0)]
     return np.r_[bounds[:-1][differs], n_out], {name: series[differs] for name, series in values.items()}
 
@@ -179,8 +165,7 @@ def build_blocks(
 class Schedule:
     """The model's parameters over a run of `n_out` solver outputs at `rate` [Hz], block by block (`build_blocks`).
 
-    `base`: the parameters without effects; `bounds` (n + 1,): bounds of the n blocks as output indices; `numbers`: the
-    parameters in each block.
+    `bounds` (blocks + 1,): bounds of the blocks as output indices; `numbers`: the parameters in each block.
     """
 
     def __init__(self, effects: Sequence[Effect], base: RigNumbers, n_out: int, rate: float) -> None:
@@ -196,51 +181,6 @@ class Schedule:
             stop = min(int(self.bounds[block + 1]), last)
             yield first, stop, self.numbers[block]
             first, block = stop, block + 1
-
-
-@dataclass(frozen=True)
-class Hold:
-    """A span of time in which a channel is stuck: from `start` to `stop` [s] it repeats its reading at `start`."""
-
-    channel: str
-    start: float
-    stop: float
-
-
-@dataclass(frozen=True)
-class Readings:
-    """All changes of the instruments within a run: changed parameters, and spans in which a channel is stuck."""
-
-    effects: tuple[Effect, ...] = ()
-    holds: tuple[Hold, ...] = ()
-
-    def value(self, parameter: str, rig_value: float, t: Array) -> Array | float:
-        """Compute a parameter, such as "sensors.p_A.noise", at times t [s]; `rig_value`: its value without changes."""
-        return apply_effects(rig_value, self.effects, parameter, t)
-
-    def hold_readings(self, channel: str, values: Array, t: Array) -> Array:
-        """Replace the readings in each span in which the channel is stuck by the first reading of that span.
-
-        `values` (n,): readings at times `t` (n,) [s]. They are copied before a change.
-        """
-        for hold in self.holds:
-            samples = np.flatnonzero((t >= hold.start) & (t < hold.stop))
-            if hold.channel == channel and samples.size:
-                values = values.copy()
-                values[samples] = values[samples[0]]
-        return values
-
-
-class Shape(Protocol):
-    """The course of a drift: the change of a parameter since the start of the run, relative or in its SI unit."""
-
-    def value_at(self, t: Array) -> Array:
-        """Compute the drift at times t [s], for an array t of any shape; 0 at the start of the run."""
-        ...
-
-    def breakpoints(self) -> tuple[float, ...]:
-        """Return the times [s] at which the drift jumps or changes its slope."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -283,11 +223,11 @@ class Wander:
         return self.times(size / path_range) if path_range > 0 else self
 
     def times(self, factor: float) -> Wander:
-        """Return this random walk multiplied by `factor`."""
+        """Multiply the walk by a factor."""
         return Wander(tuple(weight * factor for weight in self.weights), self.duration, self.slope * factor)
 
     def plus(self, other: Wander) -> Wander:
-        """Return the sum of this random walk and another one over the same duration."""
+        """Add another walk over the same duration."""
         pairs = zip_longest(self.weights, other.weights, fillvalue=0.0)
         return Wander(tuple(a + b for a, b in pairs), self.duration, self.slope + other.slope)
 
@@ -310,13 +250,13 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    Here value is the parameter's value in the rig. `parameter`: bare or dotted name of a parameter of the machine, of
-    noise, hum, offset, gain or scale error of a sensor, or `friction`, for all friction forces together. `absolute`
-    must be `is_absolute_drift(parameter)`. Raises InputError for a parameter that cannot drift, such as `cylinder.L`.
+    `parameter`: bare or dotted name of a parameter of the machine, of noise, hum, offset, gain or scale error of a
+    sensor, or `friction`, for all friction forces together; value: its value in the rig. `absolute` must be
+    `is_absolute_drift(parameter)`. Raises InputError for a parameter that cannot drift, such as `cylinder.L`.
     """
 
     parameter: str
-    shape: Shape
+    shape: Wander | Polyline
     absolute: bool = False
 
     def __post_init__(self) -> None:
@@ -348,7 +288,7 @@ class ParameterDrift:
 
         def build_effect(name: str, power: float) -> Effect:
             """Build the change of one parameter: the drift is added if absolute, else (1 + drift)^power is a factor."""
-            if self.absolute:  # without a limit for instruments, which the solver does not simulate
+            if self.absolute:  # instruments have no limit of their change: the solver does not simulate them
                 max_change = _ABSOLUTE_MAX_CHANGES.get(name, math.inf)
                 return Effect(name, self.shape.value_at, max_change, additive=True, breakpoints=breakpoints)
             return Effect(

@@ -39,8 +39,7 @@ class Feedback:
 
     The controller measures position and angle in whole counts of the rig's encoders, and pressures with each
     transducer's own noise. Other errors of the sensors, also those by faults and drifts, change the recording but not
-    the control. A controller in machine code (`compiled`) is called directly, one in Python through C. `rate` [Hz]:
-    rate of the solver's outputs; `seed`: seed of the noise.
+    the control. `rate` [Hz]: rate of the solver's outputs; `seed`: seed of the noise.
     """
 
     def __init__(
@@ -63,11 +62,9 @@ class Feedback:
         theta_count = 2.0 * math.pi / sensors.theta.counts  # [rad]
         # `Loop.numbers`; the last is the controller's last voltage, 0 at the start
         self._loop_numbers = sensors.x.resolution, theta_count, min_pressure, rig.daq.u_max, 0.0
-        self.loop: Loop
-        self.restart()
 
     def restart(self) -> None:
-        """Reset the controller, its memory and its outputs to the start of the run."""
+        """Set the controller, its memory and its outputs (`loop`) to the start of the run."""
         controller, samples = self._controller, len(self._inputs)
         measured = np.empty(len(Measured._fields))
         self._law = start_law(controller)

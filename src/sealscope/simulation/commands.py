@@ -11,7 +11,7 @@ from typing import Protocol
 import numpy as np
 
 from sealscope.errors import InputError
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array
 from sealscope.units import parse_quantity
 
 
@@ -59,7 +59,7 @@ def _format_addend(value: float) -> str:
 
 @dataclass(frozen=True)
 class MultiSine:
-    """A command that is the sum of two or more sines, of which only the last may have an offset."""
+    """The sum of two or more sines, of which only the last may have an offset."""
 
     parts: tuple[Sine, ...]
 
@@ -68,7 +68,7 @@ class MultiSine:
             raise InputError(f"a multi-sine must have two sines or more, with an offset in the last only, got {self}")
 
     def volts(self, t: Array) -> Array:
-        """Compute the voltage u [V], the sum of all sines, at times t [s]."""
+        """Compute the voltage u [V] at times t [s]."""
         return np.asarray(sum(sine.volts(t) for sine in self.parts))
 
     def __str__(self) -> str:
@@ -77,10 +77,7 @@ class MultiSine:
 
 @dataclass(frozen=True)
 class Trapezoid:
-    """A periodic command that rises from 0 to `level` [V] within `rise` [s], and falls to 0 half a `period` [s] later.
-
-    The fall also takes `rise` seconds.
-    """
+    """A periodic command that rises from 0 to `level` [V] within `rise` [s], and falls as fast half a period later."""
 
     level: float
     rise: float
@@ -105,10 +102,7 @@ class Trapezoid:
 
 @dataclass(frozen=True)
 class Alternating:
-    """A command of several sines in turn, repeated without end.
-
-    `parts`: for each sine the number of its periods, and the sine, which has neither phase nor offset.
-    """
+    """Several sines in turn, repeated without end; `parts`: for each sine the number of its periods, and the sine."""
 
     parts: tuple[tuple[int, Sine], ...]
 
@@ -140,7 +134,7 @@ class Polyline:
     """A signal over time that is linear between points, and constant before the first and after the last.
 
     `t` (n,): times [s], which never decrease; `y` (n,): values. Two points at one time are a jump. `words`: text of the
-    signal, such as "step 5 at 1 s". Two polylines are equal if their points and texts are.
+    signal, such as "step 5 at 1 s".
     """
 
     t: Array
@@ -188,10 +182,7 @@ _MAX_BREAKPOINTS = 1000
 
 
 def polyline(points: Sequence[tuple[float, float]], text: str) -> Polyline:
-    """Make the signal that is linear between the points (t [s], y), with its description `text`.
-
-    Example: [(1.0, 0.0), (3.0, 5.0)] with the text "ramp 5 from 1 s to 3 s".
-    """
+    """Make the signal that is linear between the points (t [s], y); `text`: its `words`."""
     t, y = np.array(points, dtype=np.float64).T
     return Polyline(t, y, text)
 
@@ -284,22 +275,14 @@ class PseudoRandom:
 
 
 def sampled_signal(t: Array, u: Array, origin: str = "recorded") -> Polyline:
-    """Make the polyline through the samples of a recorded signal, `u` (n,) at the times `t` (n,) [s].
+    """Make the polyline through the samples `u` (n,) of a recorded signal at the times `t` (n,) [s], moved to t[0] = 0.
 
     `origin`: name of the signal in messages and text. Raises InputError for fewer than two samples, times that do not
     rise, or a number that is not finite.
     """
     if t.size < 2 or np.any(np.diff(t) == 0):
         raise InputError(f"a recorded signal must have two samples or more, one at a time, got {t.size} ({origin})")
-    return replace(polyline_from_table(t, u, f"a recorded signal ({origin})"), words=f"file {origin}")
-
-
-def recorded_command(recording: Recording, origin: str) -> Polyline:
-    """Make a command from the channel `u` [V] of a recording, whose first sample is moved to t = 0.
-
-    `origin`: name of the recording in messages and in the command's text.
-    """
-    return sampled_signal(recording.t - recording.t[0], recording["u"], origin)
+    return replace(polyline_from_table(t - t[0], u, f"a recorded signal ({origin})"), words=f"file {origin}")
 
 
 #: Samples of a command that are checked at once, which bounds the memory.
@@ -342,7 +325,7 @@ def parse_seconds(text: str | None) -> float:
 
 
 def _parse_number(text: str | None, default: float = 0.0) -> float:
-    """Parse a number in the text of a command; return `default` for None. Raise InputError if it is not finite."""
+    """Parse a number in the text of a command, `default` for None; raise InputError if it is not finite."""
     if text is None:
         return default
     value = float(text.replace(" ", ""))
@@ -402,7 +385,8 @@ def parse_command(text: str) -> Command:
         from sealscope.recordings import read
 
         path = stripped[len("file ") :].strip()
-        return recorded_command(read(path), path)
+        recording = read(path)
+        return sampled_signal(recording.t, recording["u"], path)
     stripped = normalize_blanks(text, "command")
     if "period" in stripped.lower():  # sines in turn, such as "6 periods of 5 sin(2t), 10 periods of 3 sin(4t)"
         form = r"\s*(\d{1,6})\s+periods?\s+of\s+(.*)"

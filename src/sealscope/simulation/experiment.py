@@ -15,7 +15,7 @@ from sealscope.calls import take_fields_of
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Array
 from sealscope.simulation.arguments import Arguments, Method
-from sealscope.simulation.changes import Effect, ParameterDrift, Readings
+from sealscope.simulation.changes import Effect, ParameterDrift
 from sealscope.simulation.commands import DEFAULT_COMMAND, Command, Sine, check_command
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import Leak, Thinned, parse_leak
@@ -32,6 +32,8 @@ MAX_SAMPLES = 20_000_000
 MAX_STEPS = 1_000_000_000
 #: Times at which a drift is checked.
 _N_DRIFT_CHECKS = 2001
+#: Half length of the instruments' anti-alias filter, in samples of the recording.
+FILTER_REACH = 16
 #: Longest step [s] that is tried when the step is chosen by error (docs/decisions/0004-solvers.md).
 LONGEST_STEP = 1e-3
 #: Default for the rms error [Pa] that a pressure may have (a transducer's noise is 8600 Pa).
@@ -40,10 +42,7 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Choose the integration method of a rig: `method` as stated, or for `auto` imex with throttles, rk4 without.
-
-    Raises InputError for imex (implicit-explicit) without throttles or with motor.integrator = euler.
-    """
+    """Choose the integration method of a rig: `method` as stated, or for `auto` imex with throttles, rk4 without."""
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
     is_throttled = rig.line.orifices == "present"
@@ -60,7 +59,7 @@ def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
 def throttle_values(closed: float) -> dict[str, str | float]:
     """Build the rig parameters, by name, that close both throttles by the fraction `closed`, 0 to 1.
 
-    Above 0 they include `line.orifices`, which gives the rig throttles. At 0 the rig keeps its own choice.
+    Above 0 they give the rig throttles (`line.orifices`); at 0 it keeps its own choice.
     """
     values: dict[str, str | float] = {"line.closed_A": closed, "line.closed_B": closed}
     return {**values, "line.orifices": "present"} if closed > 0 else values
@@ -81,8 +80,8 @@ def check_target(target: Position, t: Array, half_stroke: float) -> None:
 def check_circuit(rig: Rig) -> None:
     """Raise InputError for a single-rod cylinder in a closed circuit without pilot-operated check or relief valves.
 
-    When the piston of such a cylinder moves, one chamber gives off more oil than the other takes in. Only these valves
-    let the difference out of the circuit. A cylinder counts as single-rod if its piston areas differ at all.
+    When its piston moves, one chamber gives off more oil than the other takes in. Only these valves let the difference
+    out of the circuit.
     """
     cylinder, makeup = rig.cylinder, rig.makeup
     is_single_rod = rig.circuit.pump_feeds_chambers and cylinder.A_A != cylinder.A_B
@@ -255,7 +254,7 @@ class Experiment:
         return replace(self.command, signal=self._with_duty_changes(self.command.signal))
 
     def _with_duty_changes(self, command: Command) -> Command:
-        """Return the command after each fault has changed its amplitude or frequency."""
+        """Apply the faults of the duty to a command."""
         for fault in self.faults:
             command = fault.change_command(command)
         return command
@@ -279,10 +278,7 @@ class Experiment:
         return (*drift_effects, *(effect for fault in self.faults for effect in fault.effects(self.rig)))
 
     def scale_with_viscosity(self, leaks: tuple[Leak, ...]) -> tuple[Leak, ...]:
-        """Divide the openings of laminar leaks by the oil's relative viscosity over time, if a fault warms the oil.
-
-        The relative viscosity is 1 at the rig's oil temperature, for which the leaks' coefficients hold.
-        """
+        """Divide the openings of laminar leaks by the oil's viscosity relative to the rig's, if a fault changes it."""
         for fault in self.faults:
             if (viscosity := fault.viscosity_ratio(self.rig)) is not None:
                 leaks = tuple(
@@ -291,10 +287,9 @@ class Experiment:
                 )
         return leaks
 
-    def readings(self) -> Readings:
-        """Collect the changes of instruments within the run, and the spans in which a sensor is stuck."""
-        effects = tuple(effect for effect in self._all_effects() if effect.changes_instrument)
-        return Readings(effects, tuple(hold for fault in self.faults for hold in fault.holds()))
+    def instrument_effects(self) -> tuple[Effect, ...]:
+        """Collect the changes over time of the instruments' parameters by drifts and faults."""
+        return tuple(effect for effect in self._all_effects() if effect.changes_instrument)
 
     @property
     def error_allowed(self) -> float:
@@ -317,7 +312,7 @@ class Experiment:
         return max(0.0, min(onsets)) if onsets else None
 
     def describe(self) -> dict[str, Any]:
-        """Describe the experiment for the provenance, without leaks, faults and drifts: a diagnosis must find them."""
+        """Describe the experiment for the provenance, without leaks, faults and drifts, which a diagnosis must find."""
         overrides = [row for row in self.rig.table() if row.source.startswith("set by")]
         return {
             "rig": self.rig.name,
@@ -345,10 +340,7 @@ class Experiment:
 
 
 def identity_values(value: Any) -> Any:
-    """Convert a command, leak or other object to plain values that are equal only for equal objects.
-
-    An array becomes its hash, a dataclass a list of its name and converted fields, and any other object its `repr`.
-    """
+    """Convert a command, leak or other object to plain values that are equal only for equal objects."""
     if isinstance(value, np.ndarray):
         return hashlib.sha256(np.ascontiguousarray(value, dtype=np.float64).tobytes()).hexdigest()
     if is_dataclass(value):
@@ -359,19 +351,16 @@ def identity_values(value: Any) -> Any:
 def _parse_several(
     argument: Any, kind: type[_Kind], parse: Callable[[str], _Kind | None], name: str
 ) -> tuple[_Kind, ...]:
-    """Parse an argument that states one or several leaks or faults.
+    """Parse the argument `name`, which states one or several leaks or faults.
 
-    `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` converts a text, and
-    returns None for a text such as ``none``, which is left out. Raises InputError, with the `name` of the argument, for
-    an argument of any other type.
+    `argument`: a text, an object of the class `kind`, an iterable of these, or None. `parse` returns None for a text
+    such as ``none``, which is left out.
     """
     if argument is None:
         return ()
-    items = [argument] if isinstance(argument, (str, kind)) else argument
-    if not isinstance(items, Iterable):
-        raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {argument!r}")
+    is_single = isinstance(argument, (str, kind)) or not isinstance(argument, Iterable)
     result = []
-    for item in items:
+    for item in [argument] if is_single else argument:
         if not isinstance(item, (str, kind)):
             raise InputError(f"{name} must be a text, a {kind.__name__} or several of them, got {item!r}")
         parsed = parse(item) if isinstance(item, str) else item

@@ -24,7 +24,6 @@ from sealscope.simulation.changes import (
     SHORTEST_BLOCK,
     THROTTLES,
     Effect,
-    Hold,
     model_parameters_derived_from,
 )
 from sealscope.simulation.commands import NUMBER, TIME, UNSIGNED, Command, Polyline, format_number, normalize_blanks
@@ -55,9 +54,9 @@ _PATTERNS = {
 }
 
 
-def _parse_number(text: str | None) -> float:
-    """Convert a text such as "3", "-1.5" or "+ 20" to a number; None to 0."""
-    return float((text or "0").replace(" ", ""))
+def _parse_number(text: str) -> float:
+    """Convert a text such as "3", "-1.5" or "+ 20" to a number."""
+    return float(text.replace(" ", ""))
 
 
 @dataclass(frozen=True)
@@ -102,14 +101,12 @@ class FaultRow:
             return None
         groups = match.groupdict()
         channel_or_side = groups.get("at") or ""  # the channel of a faulty sensor, or the side A or B of a part
-        if not self.is_sensor_fault:
-            channel_or_side = channel_or_side.upper()
         return Fault(
             self.name,
             value=self._parse_value(groups),
-            at=channel_or_side,
-            opening=parse_opening(groups),  # the extent of the fault over time, such as "from 90 s"
-            frequency_factor=_parse_number(groups.get("frequency") or "1"),  # factor on the command's frequency
+            at=channel_or_side if self.is_sensor_fault else channel_or_side.upper(),
+            opening=parse_opening(groups),
+            frequency_factor=_parse_number(groups.get("frequency") or "1"),
         )
 
     def _parse_value(self, groups: Groups) -> float:
@@ -118,13 +115,13 @@ class FaultRow:
         "x3" gives 3, "+20 %" gives 1.2, and "1 %" of a gain or of air gives 0.01. Without a number, a factor is 1 and
         any other size 0.
         """
-        if groups.get("size") is not None:
+        if size := groups.get("size"):
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
-            return parse_quantity(groups["size"] or "", unit, name=self.what)
-        if groups.get("percent") is not None:
-            return 1.0 + _parse_number(groups["percent"]) / 100.0
-        if groups.get("share") is not None:
-            return _parse_number(groups["share"]) / (100.0 if groups["sign"] else 1.0)  # `sign`: a % after the number
+            return parse_quantity(size, unit, name=self.what)
+        if percent := groups.get("percent"):
+            return 1.0 + _parse_number(percent) / 100.0
+        if share := groups.get("share"):
+            return _parse_number(share) / (100.0 if groups["sign"] else 1.0)  # `sign`: a % after the number
         return _parse_number(groups.get("times") or groups.get("value") or ("1" if self.factor else "0"))
 
 
@@ -172,16 +169,14 @@ class Fault:
         return self.opening.onset()
 
     def effects(self, rig: Rig) -> tuple[Effect, ...]:
-        """Build the changes of the machine's or a sensor's parameters over time that the fault causes.
+        """Build the changes of the machine's or a sensor's parameters over time that the fault causes (`FaultRow`).
 
-        If `_EFFECTS` has a function for this kind of fault, it builds the effects. Otherwise each parameter in
-        `row.parameters` is multiplied by a factor or gets an addend, to the extent of the fault's opening (0 to 1). The
-        addend is the rig's parameter that `row.adds` names, or else the fault's value, over the parameter `row.over`.
-        Raises InputError if this rig cannot have the fault: a part is absent, or a needed parameter is 0.
+        They grow with the fault's opening (0 to 1). Raises InputError if this rig cannot have the fault: a part is
+        absent, or a needed parameter is 0.
         """
         row = self.row
         if row.needs is not None:
-            pattern, rule = row.needs  # pattern of a parameter's name, and beginning of the message
+            pattern, rule = row.needs
             if rig[name := pattern.format(at=self.at)] == 0:
                 raise InputError(f"{rule} {name} > 0, got 0 ({self})")
         if self.name in _EFFECTS:
@@ -209,13 +204,12 @@ class Fault:
             for name in row.parameters
         )
 
-    def holds(self) -> tuple[Hold, ...]:
-        """Return the time span over which a stuck sensor repeats its reading, in a tuple; () for any other fault."""
+    def stuck_span(self) -> tuple[float, float] | None:
+        """Find the time span [s] over which a stuck sensor repeats its reading; None for any other fault."""
         if self.name != "sensor stuck":
-            return ()
+            return None
         never_ends = self.opening.y[-1] > 0  # the opening stays as at its last point
-        stop = math.inf if never_ends else float(self.opening.t[-1])
-        return (Hold(self.at, self.onset(), stop),)
+        return self.onset(), math.inf if never_ends else float(self.opening.t[-1])
 
     def change_command(self, command: Command) -> Command:
         """Apply a fault of the duty to a command's amplitude and frequency; return it unchanged for any other fault."""
@@ -224,7 +218,7 @@ class Fault:
     def viscosity_ratio(self, rig: Rig) -> Callable[[Array], Array] | None:
         """Build a function that computes the oil's dynamic viscosity at times t [s], relative to that in the rig.
 
-        Returns None unless this is a fault of the oil's temperature, because other faults do not change the viscosity.
+        Returns None unless this is a fault of the oil's temperature.
         """
         if self.name != "oil":
             return None
@@ -235,13 +229,13 @@ class Fault:
 
         def dynamic_viscosity_ratio(t: Array) -> Array:
             """Compute kinematic viscosity times density at times t [s], over those at the rig's temperature."""
-            T = self._oil_temperature(rig, t)
+            T = self.oil_temperature(rig, t)
             nu_ratio = kinematic_viscosity(T, oil.nu_40, oil.nu_100) / rig_nu
             return np.asarray(nu_ratio * thermal_density_ratio(T, oil.T_oil, oil.alpha))
 
         return dynamic_viscosity_ratio
 
-    def _oil_temperature(self, rig: Rig, t: Array) -> Array:
+    def oil_temperature(self, rig: Rig, t: Array) -> Array:
         """Compute the oil's temperature [K] at times t [s]: that of the rig, plus the part by this fault."""
         return np.asarray(rig.fluid.T_oil + self.value * self.opening.value_at(t))
 
@@ -249,11 +243,10 @@ class Fault:
         template = self.row.words
         if self.name == "duty":
             changes_frequency = self.frequency_factor != 1.0
-            template = "duty amplitude x{value}" if self.value != 1.0 or not changes_frequency else "duty"
+            template += " amplitude x{value}" if self.value != 1.0 or not changes_frequency else ""
             template += f" frequency x{format_number(self.frequency_factor)}" if changes_frequency else ""
-        value, percent = format_number(self.value), format_number(100.0 * self.value)
-        signed, lpm = f"{self.value:+.12g}", self.value / LITRE_PER_MINUTE
-        unit = CHANNEL_UNITS.get(self.at)
+        value, percent, signed = format_number(self.value), format_number(100.0 * self.value), f"{self.value:+.12g}"
+        lpm, unit = self.value / LITRE_PER_MINUTE, CHANNEL_UNITS.get(self.at)
         text = template.format(at=self.at, value=value, lpm=lpm, unit=unit, percent=percent, signed=signed)
         return f"{text} {self.opening}"
 
@@ -315,8 +308,8 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
             name, change, max_change, additive=True, breakpoints=fault.opening.breakpoints(), min_block=_VALVE_BLOCK
         )
 
-    names = [name for name in THROTTLES if name.startswith(f"c_{fault.at}_")]
-    return tuple(build_effect(name, open_coefficients[THROTTLES.index(name)]) for name in names)
+    pairs = zip(THROTTLES, open_coefficients, strict=True)
+    return tuple(build_effect(name, c_open) for name, c_open in pairs if name.startswith(f"c_{fault.at}_"))
 
 
 def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
@@ -329,13 +322,13 @@ def _oil_temperature_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
     def density_power(power: float) -> Callable[[Array], Array]:
         """Build a function that computes, at times t [s], the `power` of the oil's density relative to that at T_0."""
         alpha = rig.fluid.alpha
-        return lambda t: np.asarray(thermal_density_ratio(fault._oil_temperature(rig, t), T_0, alpha) ** power)
+        return lambda t: np.asarray(thermal_density_ratio(fault.oil_temperature(rig, t), T_0, alpha) ** power)
 
     # viscous friction of piston and motor, filter resistances
     factors: list[tuple[str, Callable[[Array], Array]]] = [(name, viscosity) for name in ("F_v", "B_M", "R_A", "R_B")]
     # leakage conductances of the pump and past the rod seals
     factors += [(name, lambda t: 1.0 / viscosity(t)) for name in ("G_pump", "G_ext_A", "G_ext_B")]
-    factors += [("K_oil", lambda t: thermal_stiffness_ratio(fault._oil_temperature(rig, t), T_0))]
+    factors += [("K_oil", lambda t: thermal_stiffness_ratio(fault.oil_temperature(rig, t), T_0))]
     factors += [(name, density_power(power)) for name, power in model_parameters_derived_from("fluid.rho")]
     return tuple(
         Effect(name, factor, MAX_RELATIVE_CHANGE, breakpoints=fault.opening.breakpoints()) for name, factor in factors
@@ -354,8 +347,8 @@ FAULTS: Mapping[str, FaultRow] = {
 def parse_fault(text: str) -> Fault | None:
     """Parse the text of a fault, such as "pump leak x3 from 90 s"; return None for ``none``.
 
-    The flow stated for a leaking rod seal is the one at the charge pressure. Operations of the rig, such as
-    `circulation`, are faults, too. Raises InputError, which lists the forms, for any other text.
+    Operations of the rig, such as `circulation`, are faults, too. Raises InputError, which lists the forms, for any
+    other text.
     """
     stripped = normalize_blanks(text, "fault")
     if stripped.lower() in ("none", "no fault"):

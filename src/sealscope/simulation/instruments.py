@@ -4,40 +4,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sealscope.physics.solvers.loop import quantize
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
-from sealscope.simulation.changes import Readings
+from sealscope.simulation.changes import apply_effects
+from sealscope.simulation.experiment import FILTER_REACH, Experiment
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Daq, PressureTransducer, Rig
+    from sealscope.parameters import Daq, PressureTransducer
 
-#: Half length of the anti-alias filter, in samples of the recording.
-FILTER_REACH = 16
 #: Highest harmonic of the mains hum.
 HUM_HARMONICS = 5
 _KAISER_BETA = 8.0
 _CUTOFF_FRACTION = 0.9  # cut-off (-6 dB) over the Nyquist frequency
 
 
-class Outputs(Protocol):
-    """The simulated outputs of a run, available by name, such as a `Trajectory`."""
-
-    def __getitem__(self, name: str) -> Array:
-        """Return the simulated values of the output `name` over time."""
-        ...
-
-
 def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
     """Compute the anti-alias filter's coefficients (2 FILTER_REACH factor + 1,), a Kaiser-windowed sinc of unit gain.
 
     The first coefficient multiplies the earliest value, the middle one the value at the time of the output.
-    `factor`: the signal's rate over the recording's; `delay`: lag of the output behind the signal as a fraction of the
-    signal's sampling interval. For `factor` 1 without a delay there is a single coefficient, 1.
+    `factor`: the signal's rate over the recording's; `delay`: lag of the output behind the signal, in intervals of the
+    signal, 0 to 1. For `factor` 1 without a delay there is a single coefficient, 1.
     """
     if factor == 1 and delay == 0.0:
         return np.ones(1)
@@ -53,8 +44,8 @@ def anti_alias_taps(factor: int, delay: float = 0.0) -> Array:
 def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
     """Filter a signal against aliasing (`anti_alias_taps`), and return `n` samples of it, one in `factor` values.
 
-    `values` must continue for FILTER_REACH x `factor` values after the last sample. Before their beginning, the signal
-    is taken as constant. `delay` >= 0: lag of the samples behind the signal, in intervals of `values`.
+    `values` must continue for FILTER_REACH x `factor` values after the last sample. Before them the signal is taken as
+    constant. `delay` >= 0: lag of the samples behind the signal, in intervals of `values`.
     """
     if factor == 1 and delay == 0.0:
         return np.array(values[:n])
@@ -71,8 +62,8 @@ def decimate(values: Array, factor: int, n: int, delay: float = 0.0) -> Array:
 def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     """Compute the output y of a first-order transducer for a signal at `rate` [Hz]: lag dy/dt + y = signal.
 
-    `lag` [s]: time constant; with 0 the signal `values` is returned as it is. The output is exact for a signal that is
-    linear between its values and constant before the first.
+    `lag` [s]: time constant, which may be 0. The output is exact for a signal that is linear between its values and
+    constant before the first.
     """
     if lag == 0.0:
         return values
@@ -87,17 +78,15 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:
-    """Sample a signal by a clock with jitter; return the samples (n,).
+    """Sample the signal `values` by a clock with jitter; return the samples (n,).
 
-    `values`: the signal, of any length; `sample(signal)`: computes the samples (n,) of a signal by a clock without
-    jitter; `lateness` (n,): delay of each sample in intervals of `values`, -1 .. 1, None for no jitter. Each sample is
-    interpolated by a parabola through the sample without jitter, the one an interval earlier and the one an interval
-    later.
+    `sample(signal)`: computes the samples (n,) of a signal by a clock without jitter; `lateness` (n,): delay of each
+    sample in intervals of `values`, -1 .. 1, None for no jitter. Each sample is interpolated by a parabola through the
+    samples without jitter that are an interval earlier, in time and an interval later.
     """
     center = sample(values)
     if lateness is None:
         return center
-    # the samples one interval of `values` earlier and later
     left, right = sample(np.r_[values[:1], values[:-1]]), sample(np.r_[values[1:], values[-1:]])
     return np.asarray(center + 0.5 * lateness * (right - left) + 0.5 * lateness**2 * (right - 2.0 * center + left))
 
@@ -108,10 +97,7 @@ def volts_per_pascal(sensor: PressureTransducer, daq: Daq) -> float:
 
 
 def digitize(pressure: Array, sensor: PressureTransducer, daq: Daq) -> Array:
-    """Compute the readings [Pa] that a transducer and the analog-digital converter give for pressures [Pa].
-
-    The transducer saturates at its range. The converter rounds its voltage to whole steps.
-    """
+    """Compute the readings [Pa] of pressures [Pa]: the transducer saturates, the analog-digital converter rounds."""
     sensitivity = volts_per_pascal(sensor, daq)
     saturated = np.clip(pressure, sensor.range_lo, sensor.range_hi)
     volts = daq.sensor_volts_lo + (saturated - sensor.range_lo) * sensitivity
@@ -133,8 +119,8 @@ def read_pressure(
 
     The errors are, in turn: gain; offset, drift, mains hum, noise of the channel and of all channels (`common_noise`
     [Pa]); saturation and conversion to digits (`digitize`); stuck samples, which repeat a reading; lost samples, NaN.
-    `random`: random numbers of this channel. `parameter(symbol, value)` computes a parameter of the sensor over time
-    from its `value` in the rig, because faults and drifts may change it within the run.
+    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig, because faults
+    and drifts may change it within the run.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -164,31 +150,28 @@ def _hum_harmonics(sensor: PressureTransducer, t: Array, random: np.random.Gener
     return np.asarray(sensor.hum_harmonics ** (orders - 1) @ np.sin(2.0 * np.pi * cycles))
 
 
-def record(
-    rig: Rig, trajectory: Outputs, u: Array, factor: int, seed: int, readings: Readings | None = None
-) -> Recording:
-    """Record a simulated run with the rig's instruments.
+def record(experiment: Experiment, trajectory: Any, u: Array, factor: int) -> Recording:
+    """Record a simulated run of an experiment with the rig's instruments.
 
-    `trajectory` has `factor` outputs per sample and continues for FILTER_REACH samples after the end of the recording;
-    `u` (n,): command [V] at the samples; `readings`: changes of the instruments within the run.
+    `trajectory[name]`: values of an output over time, `factor` per sample, which continue for FILTER_REACH samples
+    after the end of the recording; `u` (n,): command [V] at the samples.
 
     The analog channels (pressures, flow meter) pass the anti-alias filter; the encoders are read without a filter. The
-    clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from `seed`, so
-    that its noise does not depend on the settings of other channels.
+    clock of all channels but the command may jitter. Each channel has its own random numbers, drawn from the
+    experiment's seed, so that its noise does not depend on the settings of other channels.
     """
+    rig, sensors, effects = experiment.rig, experiment.rig.sensors, experiment.instrument_effects()
     n = u.size
     rate = rig.daq.sample_rate
     names = ("common", *PRESSURES, "x", "q_leak", "clock")
-    streams = dict(zip(names, np.random.SeedSequence(seed).spawn(len(names)), strict=True))
-    random = {name: np.random.default_rng(stream) for name, stream in streams.items()}
-    sensors = rig.sensors
+    streams = np.random.SeedSequence(experiment.seed).spawn(len(names))
+    random = {name: np.random.default_rng(stream) for name, stream in zip(names, streams, strict=True)}
     at_samples = slice(0, n * factor, factor)
     t = np.arange(n) / rate
-    readings = readings or Readings()
 
     def parameters_of(channel: str) -> Callable[[str, float], Array | float]:
         """Build the function that computes a parameter of the channel's sensor over time, from its symbol and value."""
-        return lambda symbol, rig_value: readings.value(f"sensors.{channel}.{symbol}", rig_value, t)
+        return lambda symbol, rig_value: apply_effects(rig_value, effects, f"sensors.{channel}.{symbol}", t)
 
     jitter_steps = None
     if rig.daq.jitter > 0:
@@ -208,7 +191,7 @@ def record(
     scale = 1.0 + x_parameter("scale_error", sensors.x.scale_error)
     x = scale * read_instantly(trajectory["x"]) + x_parameter("offset", 0.0)  # the rig has no such offset, a fault may
     x = x + x_parameter("noise", sensors.x.noise) * random["x"].standard_normal(n)
-    common_noise_sd = readings.value("sensors.common_noise", sensors.common_noise, t)
+    common_noise_sd = apply_effects(sensors.common_noise, effects, "sensors.common_noise", t)
     common_noise = common_noise_sd * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
@@ -228,5 +211,8 @@ def record(
     channels["q_leak"] = q if meter.resolution == 0 else np.rint(q / meter.resolution) * meter.resolution
     if not rig.circuit.pump_is_measured:  # the supply's motor has no encoder
         del channels["omega"], channels["theta"]
-    channels = {name: readings.hold_readings(name, values, t) for name, values in channels.items()}
+    for fault in experiment.faults:
+        if (span := fault.stuck_span()) is not None:
+            stuck = np.flatnonzero((t >= span[0]) & (t < span[1]))
+            channels[fault.at][stuck] = channels[fault.at][stuck[:1]]
     return Recording(t, channels, CHANNEL_UNITS, rate)

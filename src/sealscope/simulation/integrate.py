@@ -1,39 +1,34 @@
-"""Integrate the rig over an experiment: compute its inputs, choose the solver's step, and check the result.
-
-The step is stated, or chosen so that an error is small enough. In both cases short windows of the run are integrated
-at half the step, too, and the run is refused if the results differ by more than the tolerances.
-"""
+"""Integrate the rig over an experiment: compute its inputs, choose the solver's step, and check the result."""
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from functools import partial
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.arguments import Method
-from sealscope.simulation.changes import Effect, Schedule
+from sealscope.simulation.changes import Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample
 from sealscope.simulation.commands import Sine, check_command
-from sealscope.simulation.experiment import LONGEST_STEP, PRESSURE_TOLERANCE, Experiment, choose_method
-from sealscope.simulation.instruments import FILTER_REACH
+from sealscope.simulation.experiment import FILTER_REACH, LONGEST_STEP, Experiment, choose_method
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.sizing import leak_flow, mean_while_open, size_leaks
-from sealscope.simulation.targets_and_loads import Force, loaded_rig_numbers, loaded_standstill_state
+from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
 from sealscope.units import LITRE_PER_MINUTE, P_ATM
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
-#: Called with the simulated time reached [s].
-Progress = Callable[[float], None]
+#: Called with the name of the current task and its completed fraction, 0..1.
+Progress = Callable[[str, float], None]
 #: Step [s] that suits the thesis's rig: error in p_A under 10 Pa rms (docs/decisions/0004-solvers.md).
 DEFAULT_STEP = {"rk4": 5e-4, "imex": 1e-3}
 #: The shortest step that is chosen by error is `LONGEST_STEP` over this.
@@ -52,17 +47,15 @@ LATER_STARTS = (0.5, 0.9)
 LEVELS = 4
 #: Most solver steps for which the inputs are computed at once, which bounds the memory.
 _BLOCK_STEPS = 4096
-#: Solver outputs per recorded sample that suffice for the anti-alias filter.
-_OVERSAMPLING = 4
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Result of an integration: times `t` (n,) [s] and outputs `rows` (n, 21) in the order of `physics.state.OUTPUTS`.
 
-    `trajectory[name]` gives one output (n,). `method`: rk4 or imex; `step` [s]: the solver's step; `error`: estimated
-    rms error [Pa] of the pressures, NaN if it was not checked. `volts` (n,): voltages [V] of the controller,
-    `compensated` (n,): leakage flow [m^3/s] that it compensates; None without a controller or report.
+    `trajectory[name]` gives one output (n,). `method`: rk4 or imex; `step` [s]: the solver's step; `error` [Pa]:
+    estimated rms error of the pressures, NaN if it was not checked. `volts` (n,) [V]: voltage of a controller, if any;
+    `compensated` (n,) [m^3/s]: leakage flow that it reports to compensate, if any.
     """
 
     t: Array
@@ -80,15 +73,14 @@ class Trajectory:
 
 
 class RunInputs:
-    """Inputs of a run over time: the voltage command, and the leakage coefficients summed over all leaks.
+    """Inputs of a run over time: the voltage command, and the leakage coefficients G and C summed over all leaks.
 
-    The coefficients are G [m^3/(s Pa)] of laminar leaks, Q = G dp, and C [m^3/(s Pa^0.5)] of orifices, Q = C sign(dp)
-    sqrt|dp|. `leaks`, all with coefficients, replace those of the experiment.
+    `leaks`, all with coefficients (`Leak`), replace those of the experiment.
     """
 
     def __init__(self, experiment: Experiment, leaks: tuple[Leak, ...]) -> None:
         self._leaks = experiment.scale_with_viscosity(leaks)
-        # under a target the controller sets the voltage (`Feedback`), and this command is not used
+        # 0 under a target, for which the controller sets the voltage (`Feedback`)
         self._command = experiment.voltage_command if experiment.target is None else Sine(amplitude=0.0, omega=0.0)
         self._duration, self._limit = experiment.duration, experiment.rig.daq.u_max
 
@@ -96,14 +88,13 @@ class RunInputs:
         """Compute the command [V], G [m^3/(s Pa)] and C [m^3/(s Pa^0.5)], each (steps, nodes), for some solver steps.
 
         `start` (steps,): beginnings of the steps [s]; `offsets` (nodes,): times [s] after each at which the solver
-        needs its inputs. Raises InputError for a command beyond the converter's limit within the run. After the end of
-        the run the command is limited instead.
+        needs its inputs. Raises InputError for a command beyond the converter's limit within the run.
         """
         t = start[:, None] + offsets
         u = self._command.volts(t)
         if not np.abs(u).max(initial=0.0) <= self._limit:  # also for NaN
             check_command(self._command, t[t <= self._duration], self._limit)
-            # the solver continues after the end, because the anti-alias filter looks ahead
+            # beyond the limit only after the recording's end, where the solver runs on for the anti-alias filter
             u = np.clip(u, -self._limit, self._limit)
         return u, *self._leakage(t)
 
@@ -129,7 +120,7 @@ class RunInputs:
 def oversampling(experiment: Experiment) -> int:
     """Compute the number of solver outputs per recorded sample that the anti-alias filter and a controller need.
 
-    Without a stated step, a step that is usual for the integration method (`DEFAULT_STEP`) is assumed.
+    Without a stated step, `DEFAULT_STEP` of the integration method is assumed.
     """
     max_step = experiment.step or DEFAULT_STEP[choose_method(experiment.rig, experiment.method)]
     min_outputs = oversampling_of(experiment.rate, max_step)
@@ -142,7 +133,7 @@ def oversampling_of(rate: float, step: float) -> int:
 
     It is 4 for the anti-alias filter, or fewer if a sample takes fewer than 4 steps.
     """
-    return min(_OVERSAMPLING, steps_per_output(rate, step))
+    return min(4, steps_per_output(rate, step))
 
 
 def steps_per_output(rate: float, step: float) -> int:
@@ -150,80 +141,19 @@ def steps_per_output(rate: float, step: float) -> int:
     return max(1, math.ceil(1.0 / (rate * step) * (1.0 - 1e-9)))  # 1e-9: a quotient just above a whole number is whole
 
 
-def integrate_run(
-    experiment: Experiment,
-    leaks: tuple[Leak, ...],
-    *,
-    step: float | None = None,
-    error: float | None = None,
-    duration: float | None = None,
-    progress: Progress | None = None,
-) -> Trajectory:
-    """Integrate an experiment from standstill, with outputs at the rate that its instruments need.
-
-    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
-    experiment's unless None; with a `step` stated here the error is not checked. `duration` [s]: by default that of the
-    recording plus the reach of the anti-alias filter.
-    """
-    if duration is None:
-        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
-    if step is not None:
-        error = None  # with a step stated here the error is not checked
-    elif error is None:
-        error = experiment.error_allowed
-    rate = experiment.rate * oversampling(experiment)
-    feedback = None
-    target, controller = experiment.target, experiment.active_controller
-    if target is not None and controller is not None:
-        feedback = Feedback(experiment.rig, target, controller, duration=duration, rate=rate, seed=experiment.seed)
-    return integrate(
-        experiment.rig,
-        RunInputs(experiment, leaks),
-        duration,
-        rate,
-        load=experiment.load,
-        feedback=feedback,
-        x_0=experiment.x_0,
-        method=experiment.method,
-        step=step or experiment.step,
-        error=error,
-        allow_unresolved=experiment.allow_unresolved,
-        progress=progress,
-        effects=experiment.effects(),
-    )
-
-
-def _start_of_search(leaks: Sequence[Leak]) -> tuple[Leak, ...]:
-    """Replace each leak's stated mean flow by the coefficient 0, at which the search for the coefficient starts."""
-    return tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
-
-
-def solve_leak_coefficients(experiment: Experiment) -> tuple[Leak, ...]:
-    """Find the leakage coefficients that give the stated mean flows; return the leaks with these coefficients.
-
-    Leaks with a stated coefficient keep it. Without a stated mean flow > 0, nothing is simulated.
-    """
-    if not any(leak.mean for leak in experiment.leaks):
-        return _start_of_search(experiment.leaks)
-    leaks, _ = run_with_sized_leaks(experiment)
-    return leaks
-
-
 def run_with_sized_leaks(
-    experiment: Experiment,
-    progress: Callable[[str, float], None] | None = None,
-    report_time: Callable[[float], None] | None = None,
+    experiment: Experiment, progress: Progress | None = None
 ) -> tuple[tuple[Leak, ...], Trajectory]:
     """Integrate an experiment with leaks of the stated mean flows; return the leaks with coefficients, and the run.
 
-    The search for the coefficients (`size_leaks`) calls `progress` with the name of a task and its completed fraction.
-    Without a stated mean flow, the only run calls `report_time` with the simulated time [s]. Raises InputError for a
-    leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the search does not converge.
+    Raises InputError for a leak not smaller than the pump's mean flow |Q_1| or never open, SimulationFailed if the
+    search for the coefficients (`size_leaks`) does not converge.
     """
     leaks, dp_0 = experiment.leaks, experiment.rig.line.dp_0
-    initial_leaks = _start_of_search(leaks)
+    # the search begins at the coefficient 0
+    initial_leaks = tuple(leak if leak.mean is None else replace(leak, mean=None, coefficient=0.0) for leak in leaks)
     if not any(leak.mean for leak in leaks):
-        return initial_leaks, integrate_run(experiment, initial_leaks, progress=report_time)
+        return initial_leaks, integrate_run(experiment, initial_leaks, progress=progress)
     is_first_run = True  # it has the sought coefficients 0, so that these leaks do not change the pump's flow
 
     def measure(coefficients: Array) -> tuple[Array, tuple[tuple[Leak, ...], Trajectory]]:
@@ -259,77 +189,75 @@ def run_with_sized_leaks(
     return leaks_and_run
 
 
-def integrate(
-    rig: Rig,
-    inputs: RunInputs,
-    duration: float,
-    rate: float,
+def integrate_run(
+    experiment: Experiment,
+    leaks: tuple[Leak, ...],
     *,
-    x_0: float = 0.0,
-    method: Method = "auto",
     step: float | None = None,
-    error: float | None = PRESSURE_TOLERANCE,
-    allow_unresolved: bool = False,
+    error: float | None = None,
+    duration: float | None = None,
+    rate: float | None = None,
     progress: Progress | None = None,
-    effects: Sequence[Effect] = (),
-    load: Force | None = None,
-    feedback: Feedback | None = None,
+    task: str = "simulating",
 ) -> Trajectory:
-    """Integrate a rig from standstill over `duration` [s], with outputs at `rate` [Hz].
+    """Integrate an experiment from standstill over `duration` [s], with outputs at `rate` [Hz].
 
-    `inputs`: command and leakage over time; `x_0` [m]: position at the start; `load`: load in addition to the rig's
-    own; `feedback`: a controller whose voltage replaces the command; `effects`: changes of the model's parameters
-    within the run.
+    `leaks`, all with coefficients, replace those of the experiment. `step` [s] and `error` [Pa] replace the
+    experiment's unless None; with a `step` stated here the error is not checked. By default the duration is that of the
+    recording plus the reach of the anti-alias filter, and the rate is the one that the instruments need. `progress` is
+    called with the name of the `task`.
 
-    A stated `step` [s] is rounded down to a divisor of the output interval. If `step` is None, ever shorter steps are
-    tried until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
+    A stated step is rounded down to a divisor of the output interval. If none is stated, ever shorter steps are tried
+    until one passes a check: from the longest that resolves the rig, at most `LONGEST_STEP`, to `LONGEST_STEP` /
     `MAX_STEP_REFINEMENT`, which is taken even if it fails. The check integrates short windows of the run
-    (`comparison_windows`) at half the step as well: no pressure may change by more than `error` [Pa rms], and the RMS
-    of no wavelet detail by more than 0.1 % (`StepErrorCheck`). A stated step is not checked if `error` is None.
+    (`comparison_windows`) at half the step as well, and allows changes of the pressures up to `error` [Pa rms]
+    (`StepErrorCheck`).
 
-    Raises InputError for a step or an error that is not positive. Raises SimulationFailed if
+    Raises InputError for a step or an error that is not positive. Raises SimulationFailed if a state is not finite and,
+    unless the experiment allows an unresolved run, if
 
-    - a state is not finite;
     - a pressure falls below vacuum;
     - the step cannot resolve the rig, the leak or an end stop that was hit;
     - a stated step fails the check, unless it is as short as the last step that would be tried.
-
-    `allow_unresolved` permits all of these but a state that is not finite.
     """
     from sealscope.physics.solvers.limits import longest_step
     from sealscope.physics.state import OUTPUTS
 
-    base = loaded_rig_numbers(rig, load)
-    start_state = loaded_standstill_state(rig, load, x_0)
-    if step is not None and not (math.isfinite(step) and step > 0):
-        raise InputError(f"step must be > 0 s, got {step}")
-    if error is not None and not (math.isfinite(error) and error > 0):
-        raise InputError(f"error must be > 0 Pa, got {error}")
+    if duration is None:
+        duration = (round(experiment.duration * experiment.rate) + FILTER_REACH) / experiment.rate
+    rate = rate or experiment.rate * oversampling(experiment)
+    allowed_error = experiment.error_allowed if error is None else error
+    is_checked = step is None
+    step = experiment.step if step is None else step
+    for name, value, unit in (("step", step, "s"), ("error", allowed_error, "Pa")):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise InputError(f"{name} must be > 0 {unit}, got {value}")
     n_out = round(duration * rate)
-    schedule = Schedule(effects, base, n_out, rate)
-    chosen_method, euler = choose_method(rig, method), rig.motor.integrator == "euler"
-    run = _Integration(inputs, schedule, rate, chosen_method, euler, allow_unresolved, progress, load, feedback)
-    windows = [] if error is None else comparison_windows(n_out, rate)
+    run = _Integration(experiment, leaks, n_out, rate, progress and partial(progress, task))
+    start_state = loaded_standstill_state(experiment.rig, experiment.load, experiment.x_0)
+    windows = comparison_windows(n_out, rate) if is_checked else []
     bounds = {0, n_out}  # outputs at which the run stops
-    max_steps = steps_per_output(rate, LONGEST_STEP / MAX_STEP_REFINEMENT)  # most steps per output that are tried
-    if step is None:  # the run stops at the end of each window, so that a step that fails is abandoned at once
+    shortest_step = LONGEST_STEP / MAX_STEP_REFINEMENT
+    max_steps = steps_per_output(rate, shortest_step)  # most steps per output that are tried
+    first_step = step
+    if first_step is None:
+        # the run stops at the end of each window, so that a step that fails is abandoned at once
         bounds |= {bound for window in windows for bound in window}
-        max_G, max_C = inputs.max_leakage(np.arange(n_out) / rate)
-        first_step = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in schedule.numbers))
-        n_steps = steps_per_output(rate, max(first_step, LONGEST_STEP / MAX_STEP_REFINEMENT))
-    else:
-        n_steps = steps_per_output(rate, step)
+        max_G, max_C = run.inputs.max_leakage(np.arange(n_out) / rate)
+        longest = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in run.schedule.numbers))
+        first_step = max(longest, shortest_step)
+    n_steps = steps_per_output(rate, first_step)
     while True:
         h = 1.0 / (rate * n_steps)
-        if not allow_unresolved:  # leaks and end stops are checked during the run
-            for p in schedule.numbers:
+        if not experiment.allow_unresolved:  # leaks and end stops are checked during the run
+            for p in run.schedule.numbers:
                 refuse_unresolved(p, h, run.method)
-        check = StepErrorCheck(rig, rate, error or PRESSURE_TOLERANCE)  # without `error` nothing is checked
+        check = StepErrorCheck(experiment.rig, rate, allowed_error)
         excess = 0.0  # largest ratio of an error to its tolerance
         rows = np.empty((n_out, len(OUTPUTS)))
         y = start_state.copy()
-        if feedback is not None:
-            feedback.restart()
+        if run.feedback is not None:
+            run.feedback.restart()
         for start, stop in itertools.pairwise(sorted(bounds)):
             run.advance(y, start, stop, n_steps, rows)
             for first, end in windows:
@@ -337,9 +265,9 @@ def integrate(
                     excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break  # a shorter step is tried at once
-        if excess <= 1.0 or n_steps >= max_steps or (step is not None and allow_unresolved):
-            volts = None if feedback is None else feedback.volts(n_out)
-            compensated = None if feedback is None else feedback.compensated_flow(n_out)
+        if excess <= 1.0 or n_steps >= max_steps or (step is not None and experiment.allow_unresolved):
+            volts = None if run.feedback is None else run.feedback.volts(n_out)
+            compensated = None if run.feedback is None else run.feedback.compensated_flow(n_out)
             found_error = check.pressure_error if windows else math.nan
             return Trajectory(np.arange(n_out) / rate, rows, run.method, h, found_error, volts, compensated)
         if step is not None:
@@ -347,31 +275,36 @@ def integrate(
                 f"the run is under-resolved: halving the step of {h:.3g} s ({run.method}) moves "
                 f"{check.describe_worst()}; take a smaller step, or state an error instead of a step"
             )
-        # the error goes with h^4, here with a margin of 10 %; at most twice the steps, because the error that is found
-        # at a step far too long is unreliable
+        # the error goes with h^4, here with a margin of 10 %; at most twice the steps, because the error found at a
+        # step far too long is unreliable
         refinement = min(2.0, (1.1 * excess) ** 0.25) if math.isfinite(excess) else 2.0
         n_steps = min(max(n_steps + 1, math.ceil(n_steps * refinement)), max_steps)
 
 
-@dataclass
 class _Integration:
-    """The integration of one run, with inputs and settings as in `integrate`.
+    """The integration of an experiment with `leaks` over `n_out` outputs at `rate` [Hz], at any step.
 
-    `schedule`: the model's parameters over time; `rate` [Hz]: rate of the outputs; `euler`: True to advance the
-    integral of the motor's speed error once a step, as eq. (4.2) is printed (`rk4_step`); `reached` [s]: time last
-    reported to `progress`, which parts of the run that are integrated again do not report.
+    `schedule`: the model's parameters over time; `feedback`: the controller of a position target, None without one;
+    `reported`: outputs last reported to `progress`, so that no fraction of the run is reported again.
     """
 
-    inputs: RunInputs
-    schedule: Schedule
-    rate: float
-    method: Literal["rk4", "imex"]
-    euler: bool
-    allow_unresolved: bool
-    progress: Progress | None
-    load: Force | None = None
-    feedback: Feedback | None = None
-    reached: float = 0.0
+    def __init__(
+        self,
+        experiment: Experiment,
+        leaks: tuple[Leak, ...],
+        n_out: int,
+        rate: float,
+        progress: Callable[[float], None] | None,
+    ) -> None:
+        rig, target, controller = experiment.rig, experiment.target, experiment.active_controller
+        self.experiment, self.n_out, self.rate = experiment, n_out, rate
+        self.progress, self.reported = progress, 0
+        self.inputs = RunInputs(experiment, leaks)
+        self.method = choose_method(rig, experiment.method)
+        self.schedule = Schedule(experiment.effects(), loaded_rig_numbers(rig, experiment.load), n_out, rate)
+        self.feedback: Feedback | None = None
+        if target is not None and controller is not None:
+            self.feedback = Feedback(rig, target, controller, duration=n_out / rate, rate=rate, seed=experiment.seed)
 
     def advance(self, y: Array, start: int, stop: int, n_steps: int, rows: Array, origin: int = 0) -> None:
         """Integrate the state `y` (14,) in place from output `start` to `stop`, with `n_steps` steps per output.
@@ -383,27 +316,26 @@ class _Integration:
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, advance, advance_closed, step_nodes
         from sealscope.physics.solvers.limits import longest_step
 
-        unloaded = np.zeros((0, 0))  # stands for no load
-        h = 1.0 / (self.rate * n_steps)
+        h, load = 1.0 / (self.rate * n_steps), self.experiment.load
+        euler = self.experiment.rig.motor.integrator == "euler"  # `euler_integral` of `rk4_step`
         implicit = IMPLICIT if self.method == "imex" else EXPLICIT
         nodes = step_nodes(implicit, h)
         max_outputs = max(1, _BLOCK_STEPS // n_steps)
         for first in range(start, stop, max_outputs):
             last = min(first + max_outputs, stop)
             step_numbers = np.arange(first * n_steps, last * n_steps, dtype=np.float64)
-            # command, conductance of a laminar leak and coefficient of an orifice
             u, G, C = map(np.ascontiguousarray, self.inputs.at_nodes(step_numbers * h, nodes))
-            F = unloaded  # force of the load
-            if self.load is not None:
-                F = np.ascontiguousarray(self.load.value_at(step_numbers[:, None] * h + nodes))
+            F = np.zeros((0, 0))  # stands for no load
+            if load is not None:
+                F = np.ascontiguousarray(load.value_at(step_numbers[:, None] * h + nodes))
             max_G, max_C = float(G.max()), float(C.max())
             for k, end, p in self.schedule.blocks_between(first, last):
-                if not self.allow_unresolved and max(max_G, max_C) > 0.0:
+                if not self.experiment.allow_unresolved and max(max_G, max_C) > 0.0:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
                 # the arguments that `advance` and `advance_closed` share, in their order
-                arguments = G[steps], C[steps], F[steps], pack_numbers(p), self.euler, n_steps
+                arguments = G[steps], C[steps], F[steps], pack_numbers(p), euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
                     self._check_rows(p, h, out, k)
@@ -412,15 +344,14 @@ class _Integration:
                 self._check_rows(p, h, out[:n_completed], k)
                 if n_completed < end - k:  # the controller failed
                     self.feedback.raise_failure()
-            if self.progress is not None and last / self.rate > self.reached:
-                self.reached = last / self.rate
-                self.progress(self.reached)
+            if self.progress is not None and last > self.reported:
+                self.reported = last
+                self.progress(last / self.n_out)
 
     def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
         `rows`: outputs of the run, with `n_steps` steps between them; the window has the outputs first <= k < end.
-        `check` computes the errors and keeps the largest ones.
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
@@ -431,15 +362,15 @@ class _Integration:
         return check.add_window(rows[first:end, pressures], fine[:, pressures])
 
     def _check_rows(self, p: RigNumbers, h: float, rows: Array, first: int) -> None:
-        """Raise SimulationFailed if one of successive outputs of the solver has diverged.
+        """Raise SimulationFailed if the solver's outputs `rows` (n, 21) have diverged.
 
-        Unless unresolved runs are allowed, a pressure below vacuum or a step too long for an end stop that was hit
-        raises it, too. `rows` (n, 21): outputs; `first`: number of rows[0] in the run; `h` [s]: step; `p`: parameters.
+        Unless unresolved runs are allowed, a pressure below vacuum or a step h [s] too long for an end stop that was
+        hit raises it, too. `first`: number of rows[0] in the run; `p`: parameters.
         """
         from sealscope.physics.solvers.limits import longest_step_on_stop
         from sealscope.physics.state import OUTPUTS, P_2, P_A, POSITION
 
-        if not self.allow_unresolved and (np.abs(rows[:, POSITION]) > 0.5 * p.L).any():
+        if not self.experiment.allow_unresolved and (np.abs(rows[:, POSITION]) > 0.5 * p.L).any():
             refuse_long(h, longest_step_on_stop(p), "the hard stop (cylinder.k_stop, d_stop)")
         diverged = ~np.isfinite(rows)
         if diverged.any():
@@ -449,7 +380,7 @@ class _Integration:
                 "smaller step or smaller gains"
             )
         below_vacuum = rows[:, P_A : P_2 + 1] < VACUUM
-        if below_vacuum.any() and not self.allow_unresolved:
+        if below_vacuum.any() and not self.experiment.allow_unresolved:
             k, column = np.unravel_index(int(np.argmax(below_vacuum)), below_vacuum.shape)
             raise SimulationFailed(
                 f"{OUTPUTS[P_A + column]} must stay above vacuum ({VACUUM:g} Pa gauge: the rig's oil does not boil), "
@@ -468,8 +399,7 @@ def refuse_long(h: float, limit: float, what: str) -> None:
 def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
     """Raise SimulationFailed if steps of h [s] by `method` are too long for a rig `p` without its leaks.
 
-    The limit is `longest_step` without leaks, which excludes throttles and end stops, and 2.785/lambda for throttles
-    with rk4: lambda [1/s] is the fastest rate at which pressures equalise across a throttle (`stiffest_rate`).
+    The limits are `longest_step` and, for throttles with rk4, 2.785/lambda with lambda of `stiffest_rate`.
     """
     from sealscope.physics.solvers.limits import DECAY_LIMIT, longest_step, stiffest_rate
 
@@ -488,7 +418,7 @@ def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
     They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless this would overlap the window before
-    or exceed the run. `n_out`: number of outputs of the run; `rate` [Hz]: rate of the outputs.
+    or exceed the run. The run has `n_out` outputs at `rate` [Hz].
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -509,7 +439,7 @@ class StepErrorCheck:
 
     def __init__(self, rig: Rig, rate: float, tolerance: float) -> None:
         self._tolerance = tolerance
-        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))  # solver outputs per sample
+        self._outputs_per_sample = max(1, round(rate / rig.daq.sample_rate))
         sensors = [getattr(rig.sensors, name) for name in CHAMBERS]
         # four columns: p_A at the step and at half the step, then p_B
         self._noise_variances = np.repeat([sensor.noise**2 + rig.sensors.common_noise**2 for sensor in sensors], 2)
@@ -522,9 +452,9 @@ class StepErrorCheck:
 
         `coarse`, `fine` (n, 4): p_A, p_B, p_1, p_2 [Pa] at the step and at half the step. The error of a pressure is
         the rms difference within the window, times `SAFETY`. If all pressures are within their tolerance, the RMS of
-        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too: over all windows so far that are long
-        enough for the wavelet, at the recording's sampling rate (without its anti-alias filter) and with the variance
-        of the sensors' noise added, which white noise has in each detail.
+        the db8 wavelet details d_1 .. d_4 of p_A and p_B are compared, too, over all windows so far that are long
+        enough for the wavelet. They are those at the recording's sampling rate, without its anti-alias filter, and with
+        the variance of the sensors' noise, which white noise has in each detail.
         """
         pressure_error = SAFETY * float(np.sqrt(np.mean(np.square(coarse - fine), axis=0)).max(initial=0.0))
         self.pressure_error = max(self.pressure_error, pressure_error)

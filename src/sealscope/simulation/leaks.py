@@ -64,8 +64,8 @@ def growing_opening(start: float, stop: float) -> Polyline:
 class Thinned:
     """The opening of a laminar leak in oil of changing viscosity: `opening` divided by the relative viscosity.
 
-    `viscosity`: function that computes the relative viscosity at times t [s]; `rise`: None, because the quotient is not
-    a single linear rise (`Polyline.rise`).
+    `viscosity`: function that computes the relative viscosity at times t [s]; `rise`: None, as the quotient is no
+    linear rise (`Polyline.rise`).
     """
 
     opening: Opening
@@ -77,7 +77,7 @@ class Thinned:
         return self.opening.value_at(t) / self.viscosity(t)
 
     def onset(self) -> float:
-        """Return the time [s] at which the leak begins to open."""
+        """Return the onset [s] of `opening`."""
         return self.opening.onset()
 
     def __str__(self) -> str:
@@ -122,28 +122,23 @@ class Leak:
 
 
 def parse_opening(groups: Groups) -> Polyline:
-    """Build the opening of a leak or fault from the times in its text.
+    """Build the opening of a leak or fault from the times in its text, the named groups of a pattern such as `WHEN`.
 
-    `groups`: named groups of a match with a pattern such as `WHEN`. `start` and `stop` are the times between which the
-    opening grows. Otherwise it begins at `since`, ends at `until` and takes `ramp` to open; by default it is fully open
-    from 0 s on without an end.
+    It grows from `start` to `stop`. Otherwise it begins at `since`, by default at 0 s, ends at `until`, by default
+    never, and takes `ramp` to open, by default no time.
     """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))
-    until = groups.get("until")
-    return opening_from(
-        parse_seconds(groups.get("since")),
-        math.inf if until is None else parse_seconds(until),
-        parse_seconds(groups.get("ramp")),
-    )
+    stop = parse_seconds(groups["until"]) if groups.get("until") else math.inf
+    return opening_from(parse_seconds(groups.get("since")), stop, parse_seconds(groups.get("ramp")))
 
 
 def parse_leak(text: str) -> Leak | None:
     """Parse the text of a leak across the piston, such as "0.0042 L/min from 90 s"; return None for ``none``.
 
     ``table FILE`` names a file with the columns `t [s]` and `q_leak [L/min]`: a laminar leak, with the largest `q_leak`
-    as its mean flow at full opening, and `q_leak` over this maximum as its opening, linear between the times. Raises
-    InputError, which lists all forms, for any other text.
+    as its mean flow at full opening, and `q_leak` over this maximum as its opening. Raises InputError, which lists all
+    forms, for any other text.
     """
     stripped = text.strip()
     if stripped.lower() in ("none", "0", "no leak"):
@@ -164,12 +159,12 @@ def parse_leak(text: str) -> Leak | None:
             "leak must be like '0.0042 L/min from 90 s', '0.01 L/min orifice growing from 60 s to 120 s', "
             f"'G = 6.1e-13 from 90 s', 'C = 2e-10', 'table LEAK.csv' or 'none', got {text!r}"
         )
-    groups = match.groupdict()
+    opening = parse_opening(match.groupdict())
     stated_law = (match["law"] or "").lower()
-    if letter := (groups["letter"] or "").upper():
+    if letter := (match["letter"] or "").upper():
         law: Literal["laminar", "orifice"] = "laminar" if letter == "G" else "orifice"
         if stated_law not in ("", law):
             raise InputError(f"{letter} is the coefficient of the {law} law, got law {stated_law} ({text!r})")
-        return Leak(law, coefficient=float(groups["coefficient"]), opening=parse_opening(groups))
-    mean = parse_quantity(groups["mean"], "m^3/s", name="a leak")
-    return Leak(stated_law or "laminar", mean=mean, opening=parse_opening(groups))  # type: ignore[arg-type]
+        return Leak(law, coefficient=float(match["coefficient"]), opening=opening)
+    mean = parse_quantity(match["mean"], "m^3/s", name="a leak")
+    return Leak(stated_law or "laminar", mean=mean, opening=opening)  # type: ignore[arg-type]

@@ -6,9 +6,8 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +23,7 @@ from sealscope.simulation.faults import Fault
 from sealscope.simulation.instruments import decimate, record
 from sealscope.simulation.integrate import (
     DETAIL_TOLERANCE,
+    Progress,
     Trajectory,
     integrate_run,
     oversampling,
@@ -37,8 +37,6 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Called with the name of the current task and its completed fraction, 0..1.
-Progress = Callable[[str, float], None]
 #: Outputs in the truth of a run at each sample, in addition to the powers (`powers`).
 TRUE_OUTPUTS = (
     *("omega", "theta", "x", "v", "p_A", "p_B", "p_1", "p_2", "Q_1", "Q_A", "Q_B", "q_leak", "q_ext", "q_up"),
@@ -54,7 +52,7 @@ class Truth:
 
     `leaks`: leaks across the piston with their coefficients; `onset_s`: time [s] at which the first of them opens, None
     if none does; `mean_leak_lpm`: sum of the leaks' mean flows while open [L/min]; `outputs`: noise-free outputs by
-    name, at the times `t` [s] of the recording's samples.
+    name, at the recording's sample times `t` [s].
     """
 
     leaks: tuple[Leak, ...]
@@ -83,7 +81,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class Proof:
-    """Comparison of a run at a `step` [s] with one at the step `halved` [s], by `method` (rk4 or imex)."""
+    """Comparison of a run at `step` [s] with one at the step `halved` [s], by `method` (rk4 or imex)."""
 
     method: str
     step: float
@@ -96,7 +94,7 @@ class Proof:
         return all(difference.resolved for difference in self.differences)
 
     def text(self) -> str:
-        """Format the proof as text, one line for each difference and its tolerance."""
+        """Format the proof as text, with a line for each difference."""
         lines = [f"halving the step ({self.method}, {self.step:.3g} s to {self.halved:.3g} s) moves"]
         for row in self.differences:
             limit = "" if row.tolerance is None else f" (at most {row.tolerance:.3g})"
@@ -112,7 +110,7 @@ class Proof:
 
 @dataclass(frozen=True)
 class Run:
-    """A simulated experiment: the recording, the truth about it, and the proof of its step if one was requested."""
+    """A simulated experiment: the recording, the truth about it, and, if requested, the proof of its step."""
 
     recording: Recording
     truth: Truth
@@ -160,17 +158,10 @@ def simulate_experiment(experiment: Experiment, progress: Progress | None = None
     """
     if not isinstance(experiment, Experiment):
         raise InputError(f"experiment must be an Experiment (Experiment.of(...) makes one), got {experiment!r}")
-
-    def report(task: str, time: float) -> None:
-        """Report the completed fraction of a task at the simulated time `time` [s]."""
-        if progress is not None:
-            progress(task, min(1.0, time / experiment.duration))
-
-    leaks, run = run_with_sized_leaks(experiment, progress, partial(report, "simulating"))
+    leaks, run = run_with_sized_leaks(experiment, progress)
     proof = None
     if prove:
-        report_proof = partial(report, "proving: half the step")
-        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=report_proof)
+        fine = integrate_run(experiment, leaks, step=run.step / 2, progress=progress, task="proving: half the step")
         proof = Proof(run.method, run.step, fine.step, compare_trajectories(experiment, run, fine))
         if not (proof.resolved or experiment.allow_unresolved):
             worst = proof.worst()
@@ -192,8 +183,8 @@ def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
     """Record an integrated run with the rig's instruments, and state its origin in the recording's provenance."""
     at_samples = _sample_outputs(experiment)
     times = experiment.sample_times()
-    volts = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
-    readings = record(experiment.rig, run, volts, at_samples.step, experiment.seed, experiment.readings())
+    command = experiment.voltage_command.volts(times) if run.volts is None else run.volts[at_samples]
+    readings = record(experiment, run, command, at_samples.step)
     solver = {"method": run.method, "step_s": run.step, "allow_unresolved": experiment.allow_unresolved}
     if experiment.step is None:
         solver["error_pa"] = experiment.error_allowed
@@ -212,10 +203,7 @@ def _record_run(experiment: Experiment, run: Trajectory) -> Recording:
 
 
 def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Trajectory) -> Truth:
-    """Collect the truth about a simulated run: leaks, onset, mean leakage, noise-free outputs, powers and faults.
-
-    `leaks`: those of the experiment, with the coefficients that were found for their stated flows.
-    """
+    """Collect the truth about a simulated run; `leaks`: those of the experiment, all with coefficients."""
     at_samples, times = _sample_outputs(experiment), experiment.sample_times()
     outputs = {name: run[name][at_samples] for name in TRUE_OUTPUTS}
     if experiment.rig.line.k_clog_A > 0 or experiment.rig.line.k_clog_B > 0:
@@ -223,9 +211,10 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
         outputs |= {"passed_A": run["x_s"][at_samples], "passed_B": run["v_s"][at_samples], "x_s": np.zeros(times.size)}
     outputs |= powers(outputs, experiment.rig)
     dp, dp_0 = run["p_A"] - run["p_B"], experiment.rig.line.dp_0
-    flows = (leak_flow(leak, run.t, dp, dp_0) for leak in experiment.scale_with_viscosity(leaks))
-    # the mean is weighted by the opening 0..1 of `leak`, without the viscosity
-    mean_leak = sum(mean_while_open(leak, run.t, flow) for leak, flow in zip(leaks, flows, strict=True))
+    mean_leak = 0.0
+    for leak, thinned in zip(leaks, experiment.scale_with_viscosity(leaks), strict=True):
+        # the mean is weighted by the opening 0..1 of `leak`, without the viscosity
+        mean_leak += mean_while_open(leak, run.t, leak_flow(thinned, run.t, dp, dp_0))
     mean_leak_lpm = mean_leak / LITRE_PER_MINUTE
     return Truth(leaks, experiment.onset(), mean_leak_lpm, times, outputs, experiment.faults, experiment.drifts)
 
@@ -233,8 +222,8 @@ def _collect_truth(experiment: Experiment, leaks: tuple[Leak, ...], run: Traject
 def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
     """Compute the powers [W] of a run: electrical into the motor, hydraulic from the pump, mechanical on the piston.
 
-    `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). Returns arrays by the names P_electric, P_hydraulic and
-    P_mechanical. In a rig with a servo valve, the first two belong to the motor and pump of the supply.
+    `outputs`: outputs of the run by name (`TRUE_OUTPUTS`). In a rig with a servo valve, the first two powers belong to
+    the motor and pump of the supply.
     """
     from sealscope.physics.cylinder import mechanical_power
     from sealscope.physics.motor import electric_power
@@ -334,7 +323,7 @@ def write_truth(truth: Truth, path: str | os.PathLike[str]) -> None:
 
 
 def _describe_drift(drift: ParameterDrift, t: Array) -> dict[str, Any]:
-    """Describe a drift over times t [s] for JSON: its range (maximum minus minimum), and its change from start to end.
+    """Describe a drift for JSON: its range (maximum minus minimum) over the times t [s], and its change over all of t.
 
     Both are in per cent of the parameter for a relative drift, else in the parameter's SI unit.
     """

@@ -26,12 +26,11 @@ _MIN_SLOPE = 0.1
 def leak_flow(leak: Leak, t: Array, dp: Array, dp_0: float) -> Array:
     """Compute the flow |Q_L| (n,) [m^3/s] of a leak at times `t` (n,) [s] under `dp` (n,) = p_A - p_B [Pa].
 
-    The flow is s G |dp| for a laminar leak and s C sqrt|dp| for an orifice, with the leak's opening s, 0 to 1, and its
-    coefficient G or C. The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
+    The flow of an orifice is linear in dp for |dp| below about `dp_0` [Pa].
     """
     from sealscope.physics.leakage import laminar_leakage, leakage_series
 
-    coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)  # s G or s C
+    coefficient = (leak.coefficient or 0.0) * leak.opening.value_at(t)
     if leak.law == "laminar":
         return np.asarray(np.abs(laminar_leakage(dp, coefficient)))  # type: ignore[arg-type]
     G = np.zeros_like(coefficient)
@@ -55,8 +54,8 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     for no run. If the `latest` coefficient is 0, its flow is the one that a coefficient of 1 would give in that run.
 
     The next coefficient is on the straight line through both runs on logarithmic scales. The line's slope is limited to
-    0.1 .. 1, because a leak's flow grows with its coefficient, at most in proportion. The slope is 1 if the previous
-    run was without a leak, or if both coefficients are nearly equal.
+    0.1 .. 1, because a leak's flow grows with its coefficient, at most in proportion, and 1 if the previous run was
+    without a leak.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest
@@ -78,16 +77,15 @@ def size_leaks(
 ) -> tuple[Array, T]:
     """Find the leakage coefficients (n,) that give the leaks' stated mean flows, by repeated simulation.
 
-    A coefficient has the unit m^3/(s Pa) for a laminar leak, m^3/(s Pa^0.5) for an orifice. `coefficients`: start
-    values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates the rig; it returns
-    the mean flow [m^3/s] of each leak per unit of its coefficient (n,), and the run, of any type. For a coefficient of
-    0 the flow is that of a leak of coefficient 1 under the pressures of this run. Returns the coefficients found, and
-    the run with them. `progress` is called with the name of the task and its completed fraction. `independent`: True if
-    each leak is in a run of its own, so that it keeps its coefficient once its error is at most `TOLERANCE`.
+    `coefficients`: start values, which are kept for leaks without a stated mean flow. `measure(coefficients)` simulates
+    the rig; it returns the mean flow [m^3/s] of each leak per unit of its coefficient (n,), and the run, of any type.
+    For a coefficient of 0 the flow is that of a leak of coefficient 1 under the pressures of this run. Returns the
+    coefficients found, and the run with them. `progress` is called with the name of the task and its completed
+    fraction. `independent`: True if each leak is in a run of its own, so that it keeps its coefficient once its error
+    is at most `TOLERANCE`.
 
-    A small leak's flow is proportional to its coefficient, because friction sets the pressure difference. A large
-    leak's flow grows less (`next_coefficient`). The search ends at a relative error of `TOLERANCE`, or after `MAX_RUNS`
-    with the best run. Raises SimulationFailed if its error is not below `SCATTER_TOLERANCE`.
+    The search ends at a relative error of `TOLERANCE`, or after `MAX_RUNS` with the best run. Raises SimulationFailed
+    if its error is not below `SCATTER_TOLERANCE`.
     """
     means = np.array([leak.mean or 0.0 for leak in leaks])
     indices = np.flatnonzero(means > 0.0)

@@ -35,7 +35,7 @@ _DAMPINGS = {"N s/mm": 1e3, "kN s/mm": 1e6, "N s/m": 1.0, "kN s/m": 1e3}
 #: Most rows of a table of force over position or velocity: every stage of every step evaluates them all.
 MAX_LOAD_ROWS = 200
 _NO_FORCE = Sine(amplitude=0.0, omega=0.0)
-#: A force F(s) = a + b s + sum of c_k max(s - s_k, 0) over position or velocity s: (a, b), then each (s_k, c_k).
+#: A force over position or velocity, (a, b), (s_1, c_1), ..., as in `piecewise_linear_force`.
 Breakpoints = tuple[tuple[float, float], ...]
 
 
@@ -48,7 +48,7 @@ class Position:
 
     def value_at(self, t: Array) -> Array:
         """Compute the target position [m] at times t [s]."""
-        return self.signal.volts(t)  # the value of the signal, here in metres
+        return self.signal.volts(t)
 
     def __str__(self) -> str:
         return f"position {self.words}"
@@ -58,9 +58,8 @@ class Position:
 class Force:
     """An additional load on the piston against +x: F = signal(t) + f(x) + g(v) [N].
 
-    `signal`: the force over time, as a command whose method `volts` computes newtons; `words`: text of the load;
-    `over_x`, `over_v`: the piecewise linear functions f of the piston's position x [m] and g of its velocity v [m/s]
-    as `Breakpoints`, () for none.
+    `signal`: a command whose `volts` are newtons; `words`: text of the load; `over_x`, `over_v`: the piecewise linear
+    functions f of the piston's position x [m] and g of its velocity v [m/s], () for none.
     """
 
     signal: Command
@@ -70,25 +69,21 @@ class Force:
 
     def value_at(self, t: Array) -> Array:
         """Compute the part of the load [N] that depends on time only, at times t [s]."""
-        return self.signal.volts(t)  # the value of the signal, here in newtons
+        return self.signal.volts(t)
 
     def tables(self) -> tuple[Array, Array] | None:
         """Build the tables (n, 2) of f and g for `piecewise_linear_force`; None if the load is over time only."""
         if not (self.over_x or self.over_v):
             return None
         no_load: Breakpoints = ((0.0, 0.0),)
-        return np.array(self.over_x or no_load, dtype=np.float64), np.array(self.over_v or no_load, dtype=np.float64)
+        return np.array(self.over_x or no_load), np.array(self.over_v or no_load)
 
     def __str__(self) -> str:
         return f"load {self.words}"
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the parameters of the compiled model for a rig with an additional `load`, if any.
-
-    The result's `pushed` has the load's tables over position and velocity, or is (True,) for a load over time only, ()
-    without a load.
-    """
+    """Build the parameters of the compiled model for a rig with an additional `load` (`pushed`), if any."""
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
@@ -96,17 +91,12 @@ def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
 
 
 def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
-    """Compute the model's state (14,) at rest at `x` [m], under a `load` in addition to the rig's own, if any.
-
-    The load is taken at t = 0, at the position x and at the velocity 0.
-    """
+    """Compute the model's state (14,) at rest at `x` [m], under an additional `load`, if any, at t = 0."""
     from sealscope.physics.cylinder import piecewise_linear_force
     from sealscope.physics.standstill import initial_state
 
-    if load is None:
-        return initial_state(rig, x)
-    force = float(load.value_at(np.zeros(())))  # at t = 0
-    if (tables := load.tables()) is not None:
+    force = 0.0 if load is None else float(load.value_at(np.zeros(())))
+    if load is not None and (tables := load.tables()) is not None:
         over_x, over_v = tables
         force = float(force + piecewise_linear_force(x, over_x) + piecewise_linear_force(0.0, over_v))
     return initial_state(rig, x, force)
@@ -115,8 +105,7 @@ def loaded_standstill_state(rig: Rig, load: Force | None, x: float) -> Array:
 def breakpoints_through(s: Array, F: Array) -> Breakpoints:
     """Convert points (s, F) of a load to `Breakpoints`, linear between the points and constant beyond the outer ones.
 
-    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N]. The first pair returned is (F_0, 0): the force
-    and the slope before the first point. The next pairs are (s_k, c_k), where c_k is the change of the slope at s_k.
+    `s` (n,), rising: positions [m] or velocities [m/s]; `F` (n,) [N].
     """
     slopes = np.concatenate([[0.0], np.diff(F) / np.diff(s), [0.0]])
     return (float(F[0]), 0.0), *zip(s.tolist(), np.diff(slopes).tolist(), strict=True)
@@ -125,7 +114,7 @@ def breakpoints_through(s: Array, F: Array) -> Breakpoints:
 def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
     """Parse a signal over time that is written like a command but with units, such as "step 100 mm at 1 s".
 
-    `units`: allowed units, with factors to SI; `what`: noun for messages. Raises InputError for a text in another form.
+    `units`: allowed units, with factors to SI; `what`: noun for messages.
     """
     number_with_unit = re.compile(rf"({UNSIGNED})\s*\[?({_unit_pattern(units)})\b\]?")
     if not number_with_unit.search(text):
@@ -138,16 +127,15 @@ def _parse_signal(text: str, units: Mapping[str, float], what: str) -> Command:
     try:
         return parse_command(in_si)
     except InputError as error:  # let the message name this quantity, and quote the text with its units
-        raise InputError(
-            str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
-        ) from None
+        message = str(error).replace("command must be", f"{what} must be").replace(repr(in_si), repr(text))
+        raise InputError(message) from None
 
 
 def parse_position(text: str) -> Position | None:
     """Parse a position target, such as ``position 50 mm sin(2t)`` or ``position step 100 mm at 1 s``.
 
     The signal is written as in `parse_command`, in mm, cm or m; ``position file LOG`` takes channel x of a recording.
-    Returns None for a text that does not begin with ``position``. Raises InputError for a signal in another form.
+    Returns None for a text that does not begin with ``position``.
     """
     normalized = normalize_blanks(text, "command")
     if not normalized.lower().startswith("position "):
@@ -160,7 +148,7 @@ def parse_position(text: str) -> Position | None:
         recording = read(path)
         if "x" not in recording or recording.units["x"] != "m":
             raise InputError(f"a recorded position must have the channel x with a unit of length, got none ({path})")
-        return Position(sampled_signal(recording.t - recording.t[0], recording["x"], path), signal)
+        return Position(sampled_signal(recording.t, recording["x"], path), signal)
     return Position(_parse_signal(signal, _LENGTHS, "position"), signal)
 
 
@@ -172,9 +160,8 @@ def command_or_target(text: str) -> Command | Position:
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]``, ``v [m/s]``, in any unit.
 
-    The load is linear between the rows and constant beyond them. If there is a column of times, columns of x and v are
-    ignored, and the first time becomes t = 0. `words`: text of the load for the result. Raises InputError for any other
-    table, such as one with columns of x and v but without times.
+    The load is linear between the rows and constant beyond them. Beside a column of times, which begin at the first,
+    columns of x and v are ignored. `words`: text of the load. Raises InputError for any other table.
     """
     with open_regular(path, "a recorded load") as file:
         first_line = file.readline(4096).decode("utf-8-sig", "replace")
@@ -196,7 +183,7 @@ def _read_force(path: str, words: str) -> Force:
     s = to_si(table[:, 0], units[argument], unit, name=argument, place=path)
     F = to_si(table[:, 1], units["F"], "N", name="F", place=path)
     if argument == "t":
-        return Force(sampled_signal(s - s[:1], F, path), words)  # s[:1], not s[0]: the table may be empty
+        return Force(sampled_signal(s, F, path), words)
     if s.size > 1 and s[0] > s[-1]:  # x or v falls from row to row: reversed, it rises
         s, F = s[::-1], F[::-1]
     if not (2 <= s.size <= MAX_LOAD_ROWS and np.all(np.diff(s) > 0) and np.all(np.isfinite(table))):

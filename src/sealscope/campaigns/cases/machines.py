@@ -20,7 +20,7 @@ from sealscope.parameters.rig import resolve_name
 from sealscope.simulation.bench.machines import BenchMachine, draw
 from sealscope.simulation.commands import DEFAULT_COMMAND
 from sealscope.simulation.experiment import Experiment
-from sealscope.simulation.integrate import solve_leak_coefficients
+from sealscope.simulation.integrate import run_with_sized_leaks
 from sealscope.simulation.leaks import Leak, opening_from
 from sealscope.simulation.targets_and_loads import command_or_target, parse_force
 from sealscope.units import LITRE_PER_MINUTE
@@ -103,5 +103,5 @@ def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
     """
     if not experiment.leaks:
         return ()
-    sized = solve_leak_coefficients(sizing_experiment(experiment))
+    sized, _ = run_with_sized_leaks(sizing_experiment(experiment))
     return tuple(replace(leak, opening=planned.opening) for leak, planned in zip(sized, experiment.leaks, strict=True))

@@ -20,8 +20,8 @@ IMPLICIT: Implicit = (True,)
 def step_nodes(implicit: Implicit, h: float) -> np.ndarray:
     """Compute the times (nodes,) [s] within a step of `h` [s] at which the integration method needs its inputs.
 
-    `implicit`: the method, `IMPLICIT` or `EXPLICIT` (an empty tuple). The first and the last time lie just inside the
-    step: if an input jumps between two steps, its values there are those of this step.
+    The first and the last time lie just inside the step: if an input jumps between two steps, its values there are
+    those of this step.
     """
     nodes = np.array(IMEX_NODES if len(implicit) > 0 else RK4_NODES)
     nodes[0], nodes[-1] = 1e-9, 1.0 - 1e-9
@@ -44,11 +44,9 @@ def advance(
 ) -> None:
     """Integrate the state `y` (14,) in place over n steps of h [s], with outputs before each `every`-th step.
 
-    - `implicit`: the integration method, `IMPLICIT` or `EXPLICIT` (an empty tuple). With `euler_integral` the explicit
-      method changes the speed controller's integral only at the end of each step (`rk4_step`).
-    - `u`, `G`, `C`, `F` (n, nodes): inputs at the times within each step that the method needs (`step_nodes`). They are
-      the command [V], the leakage coefficients [m^3/(s Pa)] and [m^3/(s Pa^0.5)] of the piston (`piston_leakage`), and
-      a load [N] in addition to the rig's own. Without such a load `F` is an empty array of shape (0, 0).
+    - `implicit`: the integration method, `IMPLICIT` or `EXPLICIT`; `euler_integral`: as in `rk4_step`.
+    - `u`, `G`, `C`, `F` (n, nodes): inputs of `rates` at the times within each step that the method needs
+      (`step_nodes`). Without an additional load `F` is an empty array of shape (0, 0).
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs; n is a multiple of `every`.
     """
     z = state_of(y)
@@ -80,13 +78,7 @@ def advance_closed(
 ) -> int:
     """Integrate a run, or a part of it, whose voltage the controller `loop` sets; return the number of outputs written.
 
-    - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method; `euler_integral`: as in `advance`.
-    - `y` (14,): the state, changed in place. `h` [s]: the step; there is an output before each `every`-th step.
-    - `G`, `C`, `F` (n, nodes): leakage coefficients of the piston [m^3/(s Pa)] and [m^3/(s Pa^0.5)], and additional
-      load [N], at the times within each of n steps that the method needs (`step_nodes`); `F` is (0, 0) without a load.
-    - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs. `start`: number of the output
-      in rows[0], counted from the beginning of the run.
-
+    `start`: number of the output in rows[0], counted from the beginning of the run; other arguments: as in `advance`.
     If the controller returns a voltage that is not finite, the integration stops there, with fewer outputs.
     """
     spacing, n_rows = loop.counters[SPACING], rows.shape[0]  # outputs per sample of the controller; all outputs

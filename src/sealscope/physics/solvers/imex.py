@@ -71,12 +71,11 @@ def _add_stage(z: State, h: float, e: float, f: State, i: float, s: Pressures) -
 def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
     """Solve one implicit stage of a step; return its state, and the pressure rates [Pa/s] due to the throttles.
 
-    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. On each side the throttle's
-    flow Q and its pressure drop d [Pa] at the end of the stage satisfy d + g Q = total (`implicit_flows`): total is the
-    drop if nothing flowed in the stage, and g = GAMMA h (r_chamber + r_line) [Pa s/m^3], where r [Pa/m^3] is the
-    pressure rate of an oil volume per unit flow. Boiling oil keeps its pressure, so its r is 0. If bulk moduli and
-    densities depend on the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`), each time with those at
-    the pressures `solved` last. In `p`, an optional law such as `boiling` is an empty tuple if the rig lacks it.
+    `h` [s]: length of the step; `z`: the state without the implicit rates of this stage. On each side `implicit_flows`
+    solves d + g Q = total, with g = GAMMA h (r_chamber + r_line) [Pa s/m^3], where r [Pa/m^3] is the pressure rate of
+    an oil volume per unit flow. Boiling oil keeps its pressure, so its r is 0. If bulk moduli and densities depend on
+    the pressures, the stage is solved repeatedly (`MAX_STAGE_ITERATIONS`), each time with those at the pressures
+    `solved` last.
     """
     V_A, V_B = rig.volumes_at(z[POSITION], p)
     step = GAMMA * h
@@ -115,10 +114,9 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
 def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers) -> State:
     """Integrate the state `y` over one step of h [s] by the implicit-explicit method; return the new state.
 
-    The tuples hold the inputs at the six `IMEX_NODES` of the step: command `u` [V], leakage coefficients `G` [m^3/(s
-    Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. Stage 1 is explicit: its state is `y`, at which both rates are
-    evaluated. Stage k >= 2 solves for its state z and its implicit rates s_k, then evaluates its explicit rates f_k.
-    E_k and I_k are the rows of the tableaus, W the weights.
+    The tuples hold the inputs of `rates` at the six `IMEX_NODES` of the step. Stage 1 is explicit: its state is `y`, at
+    which both rates are evaluated. Stage k >= 2 solves for its state z and its implicit rates s_k, then evaluates its
+    explicit rates f_k. E_k and I_k are the rows of the tableaus, W the weights.
     """
     Q_A, Q_B = rig.throttle_flows(y, p)
     s1 = rig.throttle_rates(y, Q_A, Q_B, p)
@@ -149,10 +147,9 @@ def imex_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: Rig
 def implicit_step(
     z: State, h: float, u: np.ndarray, G: np.ndarray, C: np.ndarray, F: np.ndarray, step: int, p: RigNumbers
 ) -> State:
-    """Integrate the state `z` over step number `step` by the implicit-explicit method; return the new state.
+    """Integrate the state `z` over step number `step` by `imex_step`, with its inputs from row `step` of the arrays.
 
-    `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 6) hold the inputs of n steps at the `IMEX_NODES`, one step
-    in a row (`imex_step`). `F` is read only if the rig has an additional load.
+    `F` is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2], u[step, 3], u[step, 4], u[step, 5])
     laminar = (G[step, 0], G[step, 1], G[step, 2], G[step, 3], G[step, 4], G[step, 5])

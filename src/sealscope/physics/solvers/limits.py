@@ -25,8 +25,8 @@ def _longest_mode_step(damping: float, stiffness: float) -> float:
     """Compute the longest step [s] that resolves the two modes of s^2 + damping s + stiffness = 0.
 
     `damping` [1/s], `stiffness` [1/s^2]. Modes that oscillate may advance by one radian a step: 1/sqrt(stiffness). If
-    they decay without oscillation, the faster one, of rate lambda, must be stable: 2.785/lambda, the limit of the
-    Runge-Kutta method of order four. The result is infinite if they do neither.
+    they decay without oscillation, the faster one, of rate lambda, must be stable: 2.785/lambda. The result is infinite
+    if they do neither.
     """
     discriminant = damping * damping - 4.0 * stiffness
     if discriminant < 0.0:
@@ -36,10 +36,9 @@ def _longest_mode_step(damping: float, stiffness: float) -> float:
 
 
 def _steepest_rise(breakpoints: np.ndarray) -> float:
-    """Compute the steepest positive slope of a piecewise linear load, or 0 if the load never rises.
+    """Compute the steepest positive slope of a `piecewise_linear_force`, or 0 if it never rises.
 
-    `breakpoints` (n, 2): as in `piecewise_linear_force`; column 1 has the first slope, then its change at each further
-    breakpoint. The slope is in N/m for a load over position, in N s/m for a load over velocity.
+    Column 1 of its `breakpoints` (n, 2) has the first slope, then the changes of the slope.
     """
     return max(0.0, float(np.cumsum(breakpoints[:, 1]).max()))
 
@@ -66,9 +65,8 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
       where friction acts like a steep damper (about K_brk F_C/v_th at the charge pressure) or like LuGre's spring;
     - the leakage between the chambers, external leakage and make-up, and a servo valve with its supply.
 
-    The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it.
-    Position-dependent volumes are taken at the end of the stroke where the oil is stiffer. Air is left out because it
-    only softens the oil. In `p`, an optional law, such as `lossy`, is an empty tuple if the rig does not have it.
+    The stability limit of a decay is that of RK4; the explicit part of ARK4(3)6L[2]SA is stable beyond it. Air is left
+    out because it only softens the oil.
     """
     ends = _end_volumes(p)
     # stiffness of the oil in both chambers, and in the volumes at the pump's ports [Pa/m^3]
@@ -114,14 +112,13 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
 def _longest_valve_step(p: RigNumbers, end_volumes: tuple[tuple[float, float], ...]) -> float:
     """Compute the longest step [s] that resolves a servo valve with its supply, the smallest of three limits.
 
-    - The spool: a second-order lag with the natural frequency omega_s and the damping ratio zeta_s.
+    - The spool, a second-order lag.
     - A chamber: its pressure decays through the two metering edges that connect it with supply and return. Their slope
-      dQ/dp is taken at full stroke and at a small pressure drop, where the flow is laminar and the slope largest. An
-      underlap adds to the opening. The volume is the smallest of both chambers over the stroke.
+      dQ/dp is taken where it is largest, at full stroke and a small pressure drop.
     - The supply line: its oil oscillates with the inertia of motor and pump, and is damped by the pump's leakage, the
       relief valve and the edges of both chambers.
 
-    Each part gives a limit by `_longest_mode_step`. `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
+    `end_volumes`: (V_A, V_B) [m^3] at each end of the stroke.
     """
     overlaps = (p.o_PA, p.o_AT, p.o_PB, p.o_BT)
     edge_slope = p.Q_N / math.sqrt(p.dp_N * p.dp_lam)  # dQ/dp of one edge at full stroke, laminar

@@ -27,8 +27,7 @@ def freeze_integral(dy: State, euler_integral: bool) -> State:
 def rk4_step(y: State, h: float, u: Nodes, G: Nodes, C: Nodes, F: Nodes, p: RigNumbers, euler_integral: bool) -> State:
     """Integrate the state `y` over one step of h [s] by the Runge-Kutta method of order four; return the new state.
 
-    The tuples hold the inputs at the beginning, middle and end of the step: command `u` [V], leakage coefficients `G`
-    [m^3/(s Pa)] and `C` [m^3/(s Pa^0.5)], and load `F` [N]. With `euler_integral` the integral of the speed controller
+    The tuples hold the inputs of `rates` at the `RK4_NODES`. With `euler_integral` the integral of the speed controller
     is constant within the step and then grows by h (omega_d - omega), as eq. (4.2) of the thesis is printed: omega_d is
     the speed that the command sets, omega that of the motor, both [rad/s] at the beginning of the step. Otherwise the
     integral is a state like the others.
@@ -56,10 +55,9 @@ def explicit_step(
     p: RigNumbers,
     euler_integral: bool,
 ) -> State:
-    """Integrate the state `z` over step number `step` by the Runge-Kutta method of order four; return the new state.
+    """Integrate the state `z` over step number `step` by `rk4_step`, with its inputs from row `step` of the arrays.
 
-    `h` [s]: length of the step. `u`, `G`, `C` and `F` (n, 3) hold the inputs of n steps at the `RK4_NODES`, one step in
-    a row (`rk4_step`). `F` is read only if the rig has an additional load.
+    `F` is read only if the rig has an additional load.
     """
     volts = (u[step, 0], u[step, 1], u[step, 2])
     laminar, orifice = (G[step, 0], G[step, 1], G[step, 2]), (C[step, 0], C[step, 1], C[step, 2])

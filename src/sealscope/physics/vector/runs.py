@@ -65,15 +65,10 @@ def leak_opening(leak: Leak, t: float) -> float:
 def _build_inputs_law(count: int) -> Any:
     """Compile the function (t, nodes, shape, k, drive, leak, p) that computes the inputs of a group of runs in step k.
 
-    It returns the command u [V], the leakage coefficients G and C, and the load F [N], each at the `count` times
-    within a step (nodes) that the integration method needs. Its arguments are:
-
-    - `t` [s]: start of the step; `nodes` (count,) [s]: the nodes, from the start of the step on.
-    - `shape` (steps, count): the commands' common waveform at the nodes, followed by the load in further columns.
-    - `drive`: gain and offset [V] of each run's command; `leak`: numbers of each run's leak (`LEAK_ROWS`).
-    - `p`: the optional parts of the runs' model; `p.pushed` is empty without an additional load.
-
-    In the generated source, s is the opening of the leak (`leak_opening`) at each node.
+    It returns the inputs u, G, C, F of `rates`, each at the `count` times within a step (nodes) that the integration
+    method needs. Its arguments are the start `t` [s] of the step, the gain and offset `drive` [V] of each run's
+    command, each run's `leak` (`LEAK_ROWS`), and others as in `advance`. In the generated source, s is the opening of
+    the leak at each node.
     """
 
     def for_nodes(text: str) -> str:
@@ -99,11 +94,9 @@ _rk4_inputs, _imex_inputs = _build_inputs_law(3), _build_inputs_law(6)
 
 @contracted
 def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -> Totals:
-    """Add the solver's output at time `t` [s] to the totals of a group of runs; return the new totals.
+    """Add the solver's output at time `t` [s] to the totals of a group of runs (`N_TOTALS`); return the new totals.
 
-    The totals are listed at `N_TOTALS`. `z`: states of the runs; `leak`: parameters of their leaks, listed at
-    `LEAK_ROWS`, of which the last two are the coefficients G and C of the leak whose flow is summed; `q`: parameters of
-    the rigs.
+    `z`: states of the runs; `leak`: parameters of their leaks (`LEAK_ROWS`); `q`: parameters of the rigs.
     """
     flow_sum, opening_sum, max_travel, min_pressure, diverged = totals
     opening = leak_opening(leak, t)
@@ -123,7 +116,6 @@ def _add_output(z: State, leak: Leak, t: float, totals: Totals, q: RigNumbers) -
 @contracted
 def advance(
     implicit: Implicit,
-    groups: tuple[int, int],
     y: np.ndarray,
     h: float,
     start: int,
@@ -142,8 +134,7 @@ def advance(
     """Integrate groups of runs in place over n steps of h [s]; write their pressures and add to their totals.
 
     - `implicit`: `IMPLICIT` or `EXPLICIT`, the integration method.
-    - `groups`: the first group, and the group after the last; each group has WIDTH runs. `y` (groups, 14, WIDTH):
-      states. `start`: number of the first step.
+    - `y` (groups, 14, WIDTH): states, WIDTH runs to a group. `start`: number of the first step.
     - `shape` (n, nodes): the commands' common waveform at the times `nodes` [s] within each step; (n, 2 nodes) if the
       load [N] at the same times follows. `drive` (groups, 2, WIDTH): gain and offset [V] of the command.
     - `leaks` (groups, LEAK_ROWS, WIDTH): numbers of the leaks.
@@ -153,7 +144,7 @@ def advance(
     - `totals` (groups, N_TOTALS, WIDTH): sums and extremes of each run.
     """
     cells, fields, states = table.shape[1], table.shape[2], y.shape[1]
-    for g in range(groups[0], groups[1]):
+    for g in range(y.shape[0]):
         z = load_state(y, g * states)
         gain_and_offset = (load(drive, 2 * g), load(drive, 2 * g + 1))
         leak, run_totals = load_leak(leaks, g * LEAK_ROWS), load_totals(totals, g * N_TOTALS)

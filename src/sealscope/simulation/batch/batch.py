@@ -1,7 +1,6 @@
 """Many experiments at once: eight to a vector register, over all cores, reduced to statistics while they run.
 
-Pressures, readings and wavelet details are kept for a few seconds of each run only. Memory therefore does not grow
-with the length of the runs, and with their number only by the description and the result of each.
+Pressures, readings and wavelet details are kept for a few seconds of each run only, which bounds the memory.
 """
 
 from __future__ import annotations
@@ -63,9 +62,10 @@ class Batch:
 
         `channel`: p_A or p_B; `detail`: d1, d2, d3 or d4 [Pa], or the product d3d4 of two [Pa^2].
         """
-        channel_index = _index_of(channel, CHAMBERS, "channel")
-        detail_index = _index_of(detail, QUANTITIES, "detail")
-        return np.asarray(self.rms[:, channel_index, :, detail_index])
+        for what, name, names in (("channel", channel, CHAMBERS), ("detail", detail, QUANTITIES)):
+            if name not in names:
+                raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
+        return np.asarray(self.rms[:, CHAMBERS.index(channel), :, QUANTITIES.index(detail)])
 
     @checked_call
     def changes(self, channel: str, detail: str, *, before: int = 0, after: int = -1) -> Array:
@@ -87,9 +87,7 @@ class Batch:
     def to_pandas(self) -> pd.DataFrame:
         """Convert the batch to a pandas table with one row for each run and segment.
 
-        Its columns are run, segment, start [s], stop [s], the RMS of each wavelet detail of each chamber pressure (such
-        as `d3 of p_A [Pa]`; `d3d4` of the product of two), mean_leak [L/min], the leak's coefficient, and the solver's
-        step [s]. Raises MissingExtra if pandas is not installed.
+        Raises MissingExtra if pandas is not installed.
         """
         pandas = import_library("pandas", "a table", "pandas")
         runs, _, segments, _ = self.rms.shape
@@ -104,13 +102,6 @@ class Batch:
         columns["coefficient"] = self.coefficients[run]
         columns["step [s]"] = self.steps[run]
         return pandas.DataFrame(columns)  # type: ignore[no-any-return]
-
-
-def _index_of(name: str, names: tuple[str, ...], what: str) -> int:
-    """Return the index of `name` in `names`; raise InputError if it is missing. `what`: noun for the message."""
-    if name not in names:
-        raise InputError(f"{what} must be one of {', '.join(names)}, got {name!r}")
-    return names.index(name)
 
 
 @checked_call
@@ -182,21 +173,17 @@ def simulate_batch(
     rms = np.empty((n, len(CHAMBERS), edges.size - 1, len(QUANTITIES)))
     # the sets of runs fill the arrays one by one
     batch = Batch(rms, edges, mean_leak_lpm=np.empty(n), coefficients=np.empty(n), steps=np.empty(n))
-    completed = 0.0
+    completed_runs = 0
+
+    def report(fraction: float) -> None:
+        """Report the batch's progress, given the completed `fraction` of the current set."""
+        if progress is not None:
+            progress(min(1.0, (completed_runs + fraction * len(experiment_set.members)) / n))
+
     for experiment_set in sets:
-        set_fraction = len(experiment_set.members) / n
-
-        def report(fraction: float, before: float = completed, set_fraction: float = set_fraction) -> None:
-            """Report the batch's progress, given the completed `fraction` of this set.
-
-            `before`: fraction of the batch in the sets before. Default values bind the values of this pass of the loop.
-            """
-            if progress is not None:
-                progress(min(1.0, before + fraction * set_fraction))
-
         set_error = error if experiment_set.experiment.error is None else experiment_set.experiment.error
         _run_set(experiment_set, batch, set_error, threads or os.cpu_count() or 1, report)
-        completed += set_fraction
+        completed_runs += len(experiment_set.members)
     return batch
 
 
@@ -221,11 +208,10 @@ def _run_set(
 
 
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
-    """Choose the solver's step [s] for a set of experiments that are integrated together.
+    """Choose the solver's step [s] for a set of experiments with leakage `coefficients` (runs,).
 
-    `integrate` finds the step for a pressure error of `error` [Pa rms] in the first 4 s of up to four runs, evenly
-    spread over the set. The result is the shortest of these steps and `longest_allowed_step`. `coefficients` (runs,):
-    leakage coefficients of the runs.
+    It is the shortest of `longest_allowed_step` and of the steps that `integrate` finds for a pressure error of `error`
+    [Pa rms] in the first 4 s of up to four runs, evenly spread over the set.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -236,10 +222,9 @@ def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float
 
 
 def longest_allowed_step(experiment_set: ExperimentSet, coefficients: Array) -> float:
-    """Compute the longest step [s] that resolves the rig and the leak of every run in a set of experiments.
+    """Compute the longest step [s] that resolves the rig and the leak (`coefficients`, (runs,)) of every run of a set.
 
-    `coefficients` (runs,): G [m^3/(s Pa)] of laminar leaks, C [m^3/(s Pa^0.5)] of orifices. The result is at least
-    LONGEST_STEP / MAX_STEP_REFINEMENT, the shortest step of the search in `integrate`.
+    It is at least LONGEST_STEP / MAX_STEP_REFINEMENT, the shortest step of the search in `integrate`.
     """
     from sealscope.physics.solvers.limits import longest_step
 
@@ -260,11 +245,7 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
     mean_flows = np.array([member.leak.mean or 0.0 for member in members])
 
     def measure_unit_flows(trial_coefficients: Array) -> tuple[Array, None]:
-        """Simulate the set; return each leak's mean flow [m^3/s] per unit of its coefficient (runs,), and None.
-
-        For a coefficient of 0, it is the flow that a leak of coefficient 1 would have under the pressures of the run.
-        `size_leaks` also expects a run, which is not needed here: None.
-        """
+        """Simulate the set; return the flows per unit of coefficient (runs,) that `size_leaks` needs, and no run."""
         flow_coefficients = np.where(trial_coefficients > 0, trial_coefficients, 1.0)
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, trial_coefficients))
         run = SetRun(experiment_set, run_step, trial_coefficients, flow_coefficients=flow_coefficients, bounds=None)

@@ -16,16 +16,21 @@ import numpy as np
 from sealscope.errors import InputError, SimulationFailed
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array
-from sealscope.simulation.changes import Effect, Readings, add_needed_laws, build_blocks, step_limiting_parameters
+from sealscope.simulation.changes import (
+    Effect,
+    add_needed_laws,
+    apply_effects,
+    build_blocks,
+    step_limiting_parameters,
+)
 from sealscope.simulation.commands import Command, Sine
-from sealscope.simulation.experiment import Experiment, choose_method, identity_values
-from sealscope.simulation.instruments import FILTER_REACH, anti_alias_taps, volts_per_pascal
+from sealscope.simulation.experiment import FILTER_REACH, Experiment, choose_method, identity_values
+from sealscope.simulation.instruments import anti_alias_taps, volts_per_pascal
 from sealscope.simulation.integrate import VACUUM, oversampling_of, refuse_long, refuse_unresolved, steps_per_output
 from sealscope.simulation.leaks import Leak
 from sealscope.simulation.targets_and_loads import loaded_rig_numbers, loaded_standstill_state
 
 if TYPE_CHECKING:
-    from sealscope.parameters import Rig
     from sealscope.physics.rig import RigNumbers
 
 #: Slope [1/s] of the opening (0 to 1) of a leak that opens abruptly.
@@ -101,10 +106,7 @@ def refuse_unbatchable(experiment: Experiment, row: int) -> None:
 
 
 def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
-    """Group experiments into sets for joint integration; raise InputError for any that cannot be in the batch.
-
-    The experiments of a set have the same waveform of the command, load, choices of the model, method, step and error.
-    """
+    """Group experiments into sets for joint integration; raise InputError for any that cannot be in the batch."""
     from sealscope.physics.rig import CHOICES
 
     if not experiments:
@@ -130,6 +132,7 @@ def group_experiments(experiments: Sequence[Experiment]) -> list[ExperimentSet]:
         # "pushed" is left out: it has the tables of the load, which `load` identifies
         choices = tuple(getattr(numbers, name) for name in CHOICES if name != "pushed")
         method = choose_method(experiment.rig, experiment.method)
+        # what the experiments of a set have in common
         kind = (str(identity_values(shape)), load, choices, method, experiment.step, experiment.error)
         shapes[kind] = shape
         members_by_kind.setdefault(kind, []).append(Member(row, experiment, numbers, effects, gain, offset))
@@ -152,10 +155,9 @@ def unpack_lanes(lanes: Array, runs: int) -> Array:
 def build_leak_rows(members: Sequence[Member], coefficients: Array, flow_coefficients: Array) -> Array:
     """Build the table (runs, LEAK_ROWS) of the leaks' parameters that the compiled model takes.
 
-    The columns are G and C of the leak that acts in the run, from `coefficients` (runs,); start [s] and slope [1/s] of
-    its opening; and G and C of the leak whose mean flow is computed, from `flow_coefficients` (runs,). Both arguments
-    are equal, except for leaks of coefficient 0 while coefficients are searched for: their flow is then computed for a
-    coefficient of 1 (`batch._size_leaks`).
+    `coefficients` (runs,): those of the leaks that act in the runs; `flow_coefficients` (runs,): those of the leaks
+    whose mean flow is computed. They differ for leaks of coefficient 0 while coefficients are searched for: the flow is
+    then that of a coefficient of 1.
     """
     rows = []
     for member, coefficient, flow_coefficient in zip(members, coefficients, flow_coefficients, strict=True):
@@ -212,42 +214,22 @@ def build_cells(members: Sequence[Member], n_out: int, rate: float) -> Cells:
 
 
 def with_leak_coefficient(experiment: Experiment, coefficient: float) -> Experiment:
-    """Return an experiment with its first leak only, of the given leakage coefficient; unchanged without a leak.
-
-    The `coefficient` [m^3/(s Pa), or m^3/(s Pa^0.5) for an orifice] replaces a mean flow as the leak's size.
-    """
+    """Return an experiment with its first leak only, of the given leakage coefficient; unchanged without a leak."""
     if not experiment.leaks:
         return experiment
     return replace(experiment, leaks=(replace(experiment.leaks[0], mean=None, coefficient=coefficient),))
 
 
-def build_instrument_rows(members: Sequence[Member], first: int, last: int) -> Array:
-    """Build the parameters of the instruments of p_A and p_B for the samples first <= sample < last.
+def build_instrument_rows(experiment: Experiment, first: int, last: int) -> Array:
+    """Build the parameters (2, INSTRUMENT_ROWS) of a run's instruments of p_A and p_B for first <= sample < last.
 
-    Returns an array (runs, 2, INSTRUMENT_ROWS); constants of `batch.signals` (`GAIN` to `MAX_CODE`) index the last
-    axis. Gain, offset, hum and noises may change within a run; they are stored as the value at sample `first`
-    (such as `GAIN`) and the mean change per sample until sample `last` (such as `GAIN_RISE`).
-    """
-    from sealscope.simulation.batch.signals import HUM, HUM_PHASE
-
-    ends = np.array([first, last]) / members[0].experiment.rate
-    experiments = [member.experiment for member in members]
-    samples = last - first
-    rows = np.array([_pressure_instruments(run.rig, run.readings(), ends, samples) for run in experiments])
-    for row, experiment in zip(rows, experiments, strict=True):
-        if row[:, HUM].any():
-            random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
-            row[:, HUM_PHASE] = random.random(len(CHAMBERS))
-    return rows
-
-
-def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: int) -> Array:
-    """Build the parameters (2, INSTRUMENT_ROWS) of one run's instruments, but for the phase of the hum, which is 0.
-
-    `readings`: changes of the instruments within the run; `ends` (2,): start and end [s] of the `samples` samples.
+    Constants of `batch.signals` index the last axis. Gain, offset, hum and noises may change within a run; they are
+    stored as the value at sample `first` (such as `GAIN`) and the mean change per sample (such as `GAIN_RISE`).
     """
     from sealscope.simulation.batch import signals
 
+    rig, effects = experiment.rig, experiment.instrument_effects()
+    ends = np.array([first, last]) / experiment.rate
     rows, daq = np.zeros((len(CHAMBERS), signals.INSTRUMENT_ROWS)), rig.daq
     for row, name in zip(rows, CHAMBERS, strict=True):
         sensor = getattr(rig.sensors, name)
@@ -258,15 +240,18 @@ def _pressure_instruments(rig: Rig, readings: Readings, ends: Array, samples: in
             (signals.HUM, signals.HUM_RISE, f"sensors.{name}.hum", sensor.hum, 0.0),
             (signals.COMMON, signals.COMMON_RISE, "sensors.common_noise", rig.sensors.common_noise, 0.0),
         ):
-            start_value, end_value = np.broadcast_to(readings.value(parameter, value, ends), (2,))
+            start_value, end_value = np.broadcast_to(apply_effects(value, effects, parameter, ends), (2,))
             # `addend`: the gain is 1 plus the gain error
-            row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / samples
+            row[start_row], row[rise_row] = start_value + addend, (end_value - start_value) / (last - first)
         row[signals.DRIFT_STEP] = sensor.drift / np.sqrt(daq.sample_rate)
         row[signals.HUM_CYCLES] = sensor.hum_frequency / daq.sample_rate
         row[signals.RANGE_MIN], row[signals.RANGE_MAX] = sensor.range_lo, sensor.range_hi
         row[signals.VOLTS_AT_MIN] = daq.sensor_volts_lo
         row[signals.VOLTS_PER_PASCAL] = volts_per_pascal(sensor, daq)
         row[signals.VOLTS_PER_CODE], row[signals.MAX_CODE] = daq.step, 2.0 ** (daq.bits - 1)
+    if rows[:, signals.HUM].any():
+        random = np.random.default_rng([experiment.seed, 1])  # 1: a stream independent of the noise
+        rows[:, signals.HUM_PHASE] = random.random(len(CHAMBERS))
     return rows
 
 
@@ -291,9 +276,8 @@ class SetRun:
     ) -> None:
         """Prepare the runs of a set at standstill, to be integrated with a step of at most `step` [s].
 
-        `coefficients` (runs,): leakage coefficients that act in the runs; `flow_coefficients` (runs,): those of the
-        leaks whose mean flow is computed (`build_leak_rows`); `bounds` [s]: limits of the segments for the RMS of the
-        wavelet details, None for mean flows only. Raises SimulationFailed if the step is too long for a run.
+        `coefficients`, `flow_coefficients`: as in `build_leak_rows`; `bounds` [s]: limits of the segments for the RMS
+        of the wavelet details, None for mean flows only. Raises SimulationFailed if the step is too long for a run.
         """
         from sealscope.physics.solvers.advance import EXPLICIT, IMPLICIT, step_nodes
         from sealscope.physics.solvers.limits import longest_step
@@ -337,8 +321,8 @@ class SetRun:
     def _prepare_filters(self, rate: float) -> None:
         """Set `taps` to the coefficients of each run's anti-alias filter, which includes the transducers' delays.
 
-        The solver writes `oversampling` outputs per sample of the recording, at `rate` [Hz]. A sample at output n is
-        computed from the outputs n - `taps_before` to n + `taps_after`; both numbers are set, too.
+        `rate` [Hz]: that of the solver's outputs. A sample at output n is computed from the outputs n - `taps_before`
+        to n + `taps_after`; both numbers are set, too.
         """
         sensors = [member.experiment.rig.sensors for member in self.experiment_set.members]
         delays = np.array([[getattr(group, name).delay * rate for name in CHAMBERS] for group in sensors])
@@ -370,10 +354,7 @@ class SetRun:
         self.noise_keys = pack_lanes(noise_keys(seeds), self.width)
 
     def run_all(self, threads: int, progress: Callable[[float], None] | None) -> None:
-        """Simulate all runs on `threads` threads, in parallel because compiled code releases Python's lock.
-
-        `progress`, if any, is called with the completed fraction of the set.
-        """
+        """Simulate all runs on `threads` threads; `progress` is called with the completed fraction of the set."""
         # a thread simulates the groups between two successive bounds
         n_threads = min(threads, self.n_groups)
         group_bounds = np.unique(np.linspace(0, self.n_groups, n_threads + 1).round().astype(int)).tolist()
@@ -382,9 +363,9 @@ class SetRun:
         def add_progress(fraction: float) -> None:
             """Add `fraction` to the completed fraction of the set, and report the sum; called by all threads."""
             nonlocal completed
-            if progress is not None:
-                with lock:
-                    completed += fraction
+            with lock:
+                completed += fraction
+                if progress is not None:
                     progress(completed)
 
         with ThreadPoolExecutor(threads) as pool:
@@ -395,7 +376,7 @@ class SetRun:
         """Divide the solver's outputs into chunks of at most `MAX_CHUNK_STEPS` steps, or of a single output.
 
         Returns for each chunk the first cell that it has a part of, the cell after the last, the first output and the
-        output after the last. The chunks do not depend on the cells, and so not on which runs are in the set.
+        output after the last.
         """
         max_outputs = max(1, MAX_CHUNK_STEPS // self.steps_per_output)
         edges, chunks = self.cells.bounds, []
@@ -408,18 +389,16 @@ class SetRun:
     def _run_groups(self, groups: tuple[int, int], add_progress: Callable[[float], None]) -> None:
         """Simulate the groups of runs groups[0] <= g < groups[1], chunk by chunk from standstill to the end.
 
-        A group of runs fills a vector register. If segments of time are defined (`bounds`), the pressures are sampled
-        after each chunk as the sensors read them, and the squares of their wavelet details are added to the sums of the
-        segments. `add_progress` is called after each chunk with its share of the whole set's work. A cell is a span of
-        outputs with constant parameters (`Cells`); `table` has the parameters of the chunk's cells.
+        If segments of time are defined (`bounds`), the pressures are sampled after each chunk as the sensors read them,
+        and the squares of their wavelet details are added to the sums of the segments. `add_progress` is called after
+        each chunk with its share of the whole set's work. `table` has the parameters of the chunk's cells (`Cells`).
         """
         from sealscope.physics.vector.runs import advance_lanes_imex, advance_lanes_rk4
         from sealscope.signals.streams import DetailStream
         from sealscope.simulation.batch.signals import sense_lanes
 
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
-        a, b = groups  # first group, and the group after the last
-        local_groups = (0, b - a)  # indices within the slices [a:b] of the arrays
+        a, b = groups
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
@@ -436,7 +415,7 @@ class SetRun:
                 table, cells = self.cells.table(first, last, groups, self.width), (first, last)
             cell_bounds = (np.clip(self.cells.bounds[first : last + 1], start, stop) - start) * output_steps  # in steps
             advance(
-                local_groups, state, self.step, start * output_steps, self.nodes, self._inputs_at_nodes(start, stop),
+                state, self.step, start * output_steps, self.nodes, self._inputs_at_nodes(start, stop),
                 self.gains_and_offsets[a:b], leaks, table, cell_bounds, self.numbers, output_steps, pressures, history,
                 totals,
             )  # fmt: skip
@@ -451,7 +430,7 @@ class SetRun:
                     # index in `pressures` of the first output that sample `n_read` needs; index 0 is start - history
                     first_tap = n_read * self.oversampling - self.taps_before - (start - history)
                     sense_lanes(
-                        local_groups, pressures, first_tap, self.oversampling, self.taps[a:b], n_read, end_sample,
+                        pressures, first_tap, self.oversampling, self.taps[a:b], n_read, end_sample,
                         self._sensors(groups, n_read, end_sample), self.noise_keys[a:b], offset_drifts,
                         wavelet.taps, wavelet.buffers, self.segments, self.sums[a:b],
                     )  # fmt: skip
@@ -461,11 +440,9 @@ class SetRun:
             add_progress((stop - start) / self.n_outputs * (b - a) / self.n_groups)
 
     def _inputs_at_nodes(self, start: int, stop: int) -> Array:
-        """Compute the command's waveform [V] and the load [N], if any, at the solver's nodes in all steps of a chunk.
+        """Compute the command's waveform [V] at the solver's nodes in the steps of the outputs start <= output < stop.
 
-        The nodes are times within a step; the chunk has the outputs start <= output < stop. The result has a row for
-        each step: the waveform at the nodes, followed by the load at the nodes if there is one, (steps, nodes) or
-        (steps, 2 nodes).
+        It is an array (steps, nodes) or, followed by the load [N] at the nodes if there is one, (steps, 2 nodes).
         """
         t = np.arange(start * self.steps_per_output, stop * self.steps_per_output, dtype=np.float64) * self.step
         times = t[:, None] + self.nodes
@@ -482,14 +459,17 @@ class SetRun:
         if self._constant_sensors is not None:
             return self._constant_sensors[groups[0] : groups[1]]
         members = self.experiment_set.members[groups[0] * self.width : groups[1] * self.width]
-        return pack_lanes(build_instrument_rows(members, first, last), self.width)
+        rows = [build_instrument_rows(member.experiment, first, last) for member in members]
+        return pack_lanes(np.array(rows), self.width)
 
     @cached_property
     def _constant_sensors(self) -> Array | None:
         """The instruments' parameters of all groups, as in `_sensors`; None if any of them change within a run."""
-        if any(member.experiment.readings().effects for member in self.experiment_set.members):
+        experiments = [member.experiment for member in self.experiment_set.members]
+        if any(experiment.instrument_effects() for experiment in experiments):
             return None
-        return pack_lanes(build_instrument_rows(self.experiment_set.members, 0, self.n_samples), self.width)
+        rows = [build_instrument_rows(experiment, 0, self.n_samples) for experiment in experiments]
+        return pack_lanes(np.array(rows), self.width)
 
     def _check_groups(self, groups: tuple[int, int], stop: int) -> None:
         """Raise SimulationFailed if a run of the groups groups[0] <= g < groups[1] has diverged before output `stop`.
@@ -535,11 +515,7 @@ class SetRun:
             return np.sqrt(unpack_lanes(self.sums, self.n_runs) / n_samples)
 
     def mean_flow(self) -> Array:
-        """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak while it is open, 0 if it never opens.
-
-        It is the sum of |Q_L| over the solver's outputs, divided by the sum of the leak's opening (0 to 1). A time at
-        which the leak is half open therefore counts half.
-        """
+        """Compute the mean flow |Q_L| (runs,) [m^3/s] of each run's leak, as `sizing.mean_while_open` does."""
         from sealscope.physics.vector.runs import FLOW, OPENING
 
         totals_by_run = unpack_lanes(self.totals, self.n_runs)

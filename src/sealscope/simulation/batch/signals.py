@@ -31,10 +31,9 @@ INSTRUMENT_ROWS = 19
 
 @contracted
 def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
-    """Compute the pressures [Pa] that are read back from analog-digital converters, for a group of runs at once.
+    """Compute the readings [Pa] of `pressure` [Pa] for a group of runs at once, as `instruments.digitize` does.
 
-    The transducer saturates at its range, as in `instruments.digitize`. `pressure` [Pa]; `sensor`: table of the
-    parameters of the instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel.
+    `sensor`: table of the parameters of the instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel.
     """
     range_min, max_code = load(sensor, row + RANGE_MIN), load(sensor, row + MAX_CODE)
     volts_at_min, volts_per_pascal = load(sensor, row + VOLTS_AT_MIN), load(sensor, row + VOLTS_PER_PASCAL)
@@ -49,8 +48,7 @@ def convert_lanes(pressure: Any, sensor: np.ndarray, row: int) -> Any:
 def _mains_hum(sensor: np.ndarray, row: int, sample: int, amplitude: Any) -> Any:
     """Compute the mains hum [Pa] of a pressure channel at the sample number `sample`, for a group of runs at once.
 
-    It is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`: table of the parameters of the
-    instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel; `amplitude` [Pa].
+    It is a sine, computed as 2 sin a cos a, where a is half its phase. `sensor`, `row`: as in `convert_lanes`.
     """
     cycles = load(sensor, row + HUM_PHASE) + load(sensor, row + HUM_CYCLES) * sample
     cycles = cycles - nearest_integer(cycles)  # -1/2 .. 1/2
@@ -72,9 +70,8 @@ def _read_pressure(
 ) -> Any:
     """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
-    `sensor`: table of the parameters of the instruments; `row`: first of the `INSTRUMENT_ROWS` rows for this channel;
-    `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: drift of the offset so far; `sample`: number
-    of the sample; `samples_since`: samples since the one for which the table was built.
+    `sensor`, `row`: as in `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: that
+    of the offset so far; `sample`: number of the sample; `samples_since`: since the one for which `sensor` was built.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)
@@ -107,7 +104,6 @@ def _add_squares(details: np.ndarray, first: int, n: int, bounds: np.ndarray, su
 
 @contracted
 def add_reading_squares(
-    groups: tuple[int, int],
     pressures: np.ndarray,
     first_output: int,
     factor: int,
@@ -122,11 +118,11 @@ def add_reading_squares(
     bounds: np.ndarray,
     sums: np.ndarray,
 ) -> None:
-    """Compute the readings of p_A and p_B for some groups of runs, and add their squared wavelet details to `sums`.
+    """Compute the readings of p_A and p_B for groups of runs, and add their squared wavelet details to `sums`.
 
-    The samples are first <= s < last, the groups groups[0] <= g < groups[1]. `load` and `store` count the rows of an
-    array over all axes but the last, the lanes. For each CHUNK of samples, the filtered pressures are written behind
-    the history in the buffer of the first level, and there replaced by the readings. The arrays are:
+    The samples are first <= s < last. `load` and `store` count the rows of an array over all axes but the last, the
+    lanes. For each CHUNK of samples, the filtered pressures are written behind the history in the buffer of the first
+    level, and there replaced by the readings. The arrays are:
 
     `pressures` (groups, outputs, CHANNELS, WIDTH): simulated pressures, `factor` outputs per sample. The anti-alias
     filter of sample `first` begins at output `first_output`.
@@ -146,7 +142,7 @@ def add_reading_squares(
     # the details lag the readings by half the lengths of the filters of all levels, dilated by 1, 2, 4 and 8 samples
     delay = low.shape[0] // 2 * ((1 << LEVELS) - 1)
     details = np.empty((LEVELS, CHUNK, WIDTH))
-    for g in range(groups[0], groups[1]):
+    for g in range(pressures.shape[0]):
         key = load(keys, g)
         A, B = CHANNELS * g, CHANNELS * g + 1  # numbers of both channels
         drift_A, drift_B = load(drifts, A), load(drifts, B)

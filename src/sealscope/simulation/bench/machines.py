@@ -52,10 +52,9 @@ class BenchMachine:
     def experiment(self, **arguments: Any) -> Experiment:
         """Make an experiment with this machine.
 
-        `arguments`: those of `Experiment.of`, such as leak and fault. Unless they are stated, seed, duration, command,
-        load, drifts and, for a position target, the controller are the machine's, and the piston starts where its
-        travel is centred (`centred_start`). Raises InputError as `Experiment.of` does, also if a drawn parameter is out
-        of range.
+        `arguments`: those of `Experiment.of`, such as leak and fault. By default seed, duration, command, load, drifts
+        and, for a position target, the controller are the machine's, and the piston starts at `centred_start`. Raises
+        InputError as `Experiment.of` does, also if a drawn parameter is out of range.
         """
         machine = self.rig.with_overrides(self.overrides, source=f"drawn from profile {self.profile}, seed {self.seed}")
         names = ("load", "seed", "duration", "command", "drifts")
@@ -102,18 +101,14 @@ def centred_start(rig: Rig, command: Command | Position | str, duration: float) 
 
 
 def _random_stream(seed: int, name: str) -> np.random.Generator:
-    """Make the random generator for one part of a machine, such as a nuisance (a difference between machines).
-
-    Generators with other names are independent of it. Equal seeds and names give equal generators.
-    """
+    """Make the random generator for one part of a machine, which is independent of those with other names."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
 
 
 def _draw_path(random: np.random.Generator, shapes: tuple[str, ...], duration: float, *, warms: bool = False) -> Wander:
     """Draw the course of a drift over `duration` [s]: linear with an end value of +-1, or a walk with a range of 1.
 
-    The range is maximum minus minimum. `shapes`: courses to choose from, "linear" and "wander" (a smooth random walk);
-    `warms`: True for a linear course that always rises.
+    `shapes`: courses to choose from, "linear" and "wander"; `warms`: True for a linear course that always rises.
     """
     # all numbers are drawn for either shape, so that later draws do not depend on the shape
     shape = shapes[int(random.integers(len(shapes)))]
@@ -165,13 +160,10 @@ def draw(
     duration: float = 180.0,
     family: str = "",
 ) -> BenchMachine:
-    """Draw a healthy machine like `rig` at random from a profile; equal seeds give equal machines.
+    """Draw a healthy machine like `rig`, with its duty, at random from a profile; equal seeds give equal machines.
 
-    Uncertain parameters and their drifts are drawn. The duty is drawn, too: the command and its amplitude, the closed
-    fraction of the throttles, the load and the controller. `profile`: a profile, its name or its file; `duration` [s]:
-    length of the recording, over which the parameters drift; `family`: one of the profile's families of machines, ""
-    for none. Raises InputError for a seed below 0, a duration that is not positive and finite, or an unknown rig,
-    profile or family.
+    `profile`: a profile, its name or its file; `duration` [s]: length of the recording, over which the parameters
+    drift; `family`: one of the profile's families of machines, "" for none.
     """
     from sealscope.parameters import load_rig
 

@@ -148,10 +148,7 @@ AnyNuisance = Nuisance | NuisanceChoice
 
 
 def _parse_nuisance(table: Any) -> AnyNuisance:
-    """Parse an entry of a profile as a nuisance, a property that differs between machines, in SI units.
-
-    The message of an InputError begins with the entry's name.
-    """
+    """Parse an entry of a profile as a nuisance; the message of an InputError begins with the entry's name."""
     entry = _NuisanceEntry.model_validate(table)
     try:
         return _convert_to_si(entry)
@@ -191,11 +188,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
 
 
 def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: str) -> tuple[float | str, ...]:
-    """Convert the listed values of a parameter to SI units; leave them as they are for a choice.
-
-    `choices`: the parameter's options, () for a number. Raises InputError for a value that is not among the options, or
-    for a text or a missing unit where numbers are needed.
-    """
+    """Convert the listed values of a parameter to SI units; `choices`: the parameter's options, () for a number."""
     values = entry.values or ()
     for value in values:
         if choices and value not in choices:
@@ -208,10 +201,7 @@ def _convert_values(entry: _NuisanceEntry, choices: tuple[str, ...], si_unit: st
 
 
 def _parse_drift(entry: _DriftEntry, parameters: tuple[str, ...], si_unit: str) -> DriftRange:
-    """Convert the drift in an entry to `si_unit`, or to a fraction of the parameters' values if the drift is relative.
-
-    Raises InputError if one of the `parameters` cannot drift, or if the drift's size or course is invalid.
-    """
+    """Convert the drift in an entry to `si_unit`, or to a fraction of the parameters' values if it is relative."""
     absolute = is_absolute_drift(parameters[0])
     for parameter in parameters:
         ParameterDrift(parameter, linear_path(0.0, 1.0), absolute)  # raises InputError if it cannot drift like this
@@ -331,10 +321,7 @@ def profile_names() -> tuple[str, ...]:
 
 
 def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
-    """Read a profile of the differences between healthy machines, by the name of a packaged profile or by path.
-
-    Raises InputError if there is no such profile, or if its file breaks a rule.
-    """
+    """Read a profile of the differences between healthy machines, by the name of a packaged profile or by path."""
     text = os.fspath(name_or_path)
     if text in profile_names():
         return _read_profile(_PACKAGED / f"{text}.toml", f"profiles/{text}.toml")
@@ -344,7 +331,10 @@ def load_profile(name_or_path: str | os.PathLike[str] = "bench") -> Profile:
 
 
 class _Head(BaseModel, extra="forbid"):
-    """The table `[profile]` of a file; `extends`: packaged profile whose nuisances and duty the profile inherits."""
+    """The table `[profile]` of a file.
+
+    `extends`: packaged profile whose nuisances the file inherits, and whose duty if it states none, but no families.
+    """
 
     name: _Text
     title: _Text
@@ -362,11 +352,7 @@ class _File(BaseModel, extra="forbid"):
 
 
 def _read_profile(path: Path, place: str) -> Profile:
-    """Read a profile of machines from its TOML file; `place` names the file in messages.
-
-    A file may name a packaged profile that it extends. It then inherits that profile's nuisances, and also the duty
-    (commands and loads) if it does not state one, but not the families. Raises InputError if the file breaks a rule.
-    """
+    """Read a profile of machines from its TOML file; `place` names the file in messages."""
     tree = read_toml(path, "a profile", place)
     try:
         file = convert_type(_File, tree)
