@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest, shut_at_rest, with_rests
-from sealscope.diagnosis.inference.equations.feed import feed_one_chamber
+from sealscope.diagnosis.inference.equations.feed import feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import (
     AVERAGING_TIME,
     HALF_DIFFERENCE,
@@ -579,7 +579,9 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         samples = _without_lowering(samples, recording.rate, balances[0])
         if rig.circuit.feeds_one_chamber:
             limits = find_rest_limits(samples, recording.rate, balances[0])
-            balances = (feed_one_chamber(balances[0], Signals(samples, recording.rate, rest_limits=limits)),)
+            signals = Signals(samples, recording.rate, rest_limits=limits)
+            balances = (feed_one_chamber(balances[0], signals),)
+            samples = _without_flow(samples, flag_circulation(balances[0], signals))
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
@@ -623,11 +625,15 @@ def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equati
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
     """
     signals = Signals(samples, rate)
-    is_lowering = flag_lowering(balance.left(signals), signals.step("x"), rate)
+    return _without_flow(samples, flag_lowering(balance.left(signals), signals.step("x"), rate))
+
+
+def _without_flow(samples: Mapping[str, Array], is_unknown: NDArray[np.bool_]) -> dict[str, Array]:
+    """Set the channel of the pump's flow to NaN on either side of the sampling intervals that `is_unknown` flags."""
     source = flow_source(samples)  # not None: the balance has a recorded flow
-    if source is None or not is_lowering.any():
+    if source is None or not is_unknown.any():
         return dict(samples)
-    is_touched = np.append(is_lowering, False) | np.append(False, is_lowering)  # samples on either side of an interval
+    is_touched = np.append(is_unknown, False) | np.append(False, is_unknown)
     return {**samples, source: np.where(is_touched, np.nan, samples[source])}
 
 

@@ -225,6 +225,10 @@ class FeedPriors(PriorTable):
 
     one: float  # log odds, before any recording, that the pump feeds one chamber at a time
     scatter: float  # relative scatter of the ratio of flow to speed in either direction, a standard deviation
+    # of a pump that turns while the piston rests
+    circulates: float  # log odds, before any recording, that its flow circulates to the tank
+    held: float  # mean flow if it holds the load, over that in motion: the median of a log-normal distribution
+    spread: float  # standard deviation of the logarithm of this fraction
 
 
 class RestPriors(PriorTable):

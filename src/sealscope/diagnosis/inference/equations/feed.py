@@ -9,9 +9,12 @@ from __future__ import annotations
 from functools import partial
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import MOTIONS, Equation, Term
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 
 
@@ -42,6 +45,31 @@ def motions_of_side(equation: Equation, side: str) -> list[str]:
     if not equation.fed_outward:
         return [name for name in MOTIONS if name.endswith(f"{side} carries")]
     return [name for name, (outward, _) in MOTIONS.items() if outward == (equation.fed_outward == side)]
+
+
+def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
+    """Flag the sampling intervals (n - 1,) in which the pump's flow probably circulates to the tank, past the cylinder.
+
+    Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
+    load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as
+    a fraction f of that in motion: a flow that circulates has any fraction up to 1, that of a pump that holds the load
+    a log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`). `feed.circulates`: log
+    odds, before any recording, of a flow that circulates.
+    """
+    prior = INFERENCE.feed
+    flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
+    is_moving = signals.moving(equation.left) > 0.0
+    circulates = np.zeros(len(flow), dtype=bool)
+    if not (is_moving.any() and is_held.any()):
+        return circulates
+    flow_in_motion = float(np.nanmean(flow[is_moving]))
+    for first, length in find_runs(is_held).tolist():
+        hold = slice(first, first + length)
+        fraction = float(np.nanmean(flow[hold])) / flow_in_motion
+        deviation = np.log(fraction / prior.held) / prior.spread
+        log_density_if_held = -0.5 * deviation**2 - np.log(fraction * prior.spread * np.sqrt(2.0 * np.pi))
+        circulates[hold] = prior.circulates - log_density_if_held > 0.0
+    return circulates
 
 
 def _carried_increments(signals: Signals, *, term: Term, equation: Equation) -> Array:
