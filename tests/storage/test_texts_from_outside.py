@@ -44,7 +44,7 @@ def test_a_message_is_one_line_of_bounded_length(kind: type[SealscopeError]) -> 
         (f"duration = 1{'0' * 400}", "2^53"),
         ("channels = [['p_A']]", "channels[1], 'p_A'"),
         (f'rig = "{"thesis" * 900}"', "rig"),
-        ("false_alarm = 1e-320", "1e-15"),
+        ("false_alarm = 1e-320", "false_alarm, greater than or equal, 1e-320"),
     ],
 )
 def test_settings_of_a_plan(entry: str, words: str, tmp_path: Path) -> None:

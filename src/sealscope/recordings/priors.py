@@ -98,7 +98,7 @@ class HoldPriors(PriorTable):
 class ReadingPriors(PriorTable):
     """Limits beyond which pressures and speeds cannot come from one hydraulic machine."""
 
-    noise: float  # share of white noise in a pressure's variance, above which the pressure is taken for mere noise
+    noise: float  # white noise's share of the variance of a pressure, above which it is taken for mere noise
     pressure: float  # [Pa] pressures that stay below it are in another unit
     # the comparison of the motor speed with the rate of the motor angle
     rate: float  # [Hz] both are averaged to this rate
