@@ -260,14 +260,18 @@ class RecordedBalance:
         """Compute the pump's flow [m^3/s] beyond the one that moves the piston, shape (n - 1,), at least 0.
 
         It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
-        the area of the side with the higher pressure. Both are magnitudes, averaged over `LOST_FLOW_TIME`.
+        the area of the side with the higher pressure or, in an open circuit, of the side that the pump feeds. Both are
+        magnitudes, averaged over `LOST_FLOW_TIME`.
         """
-        recording = self.recording
-        is_A_higher = recording["p_A"][1:] > recording["p_B"][1:]
-        area = np.where(is_A_higher, abs(sides.area_A), abs(sides.area_B))
+        recording, fed_outward = self.recording, self.equations[0].fed_outward
+        step = np.diff(recording["x"])
+        moves_A = recording["p_A"][1:] > recording["p_B"][1:]
+        if fed_outward:
+            moves_A = (step >= 0.0) == (fed_outward == "A")
+        area = np.where(moves_A, abs(sides.area_A), abs(sides.area_B))
         flow, displaced = (
             np.abs(average_over(LOST_FLOW_TIME, volume * recording.rate, recording.rate))
-            for volume in (self._pumped, area * np.diff(recording["x"]))
+            for volume in (self._pumped, area * step)
         )
         return np.asarray(np.maximum(flow - displaced, 0.0))
 
