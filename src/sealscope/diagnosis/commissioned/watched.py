@@ -20,6 +20,7 @@ from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.formats.columns import ChannelMap
 from sealscope.storage.toml_file import read_toml
 
@@ -86,7 +87,9 @@ def _with_measured_displacement(rig: Rig, healthy: tuple[SummarisedRecording, ..
     """
     if rig.states(_DISPLACEMENT) or not rig.states(*_AREAS):
         return rig
-    summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy)
+    # a flow meter needs no displacement, and does not measure it
+    by_pump = (recording for recording in healthy if flow_source(recording.units) not in METERS)
+    summaries = (recording.summaries.get(VOLUME_BALANCE, {}) for recording in by_pump)
     # measured over assumed displacement, 0 if not measured
     scales = [scale for summary in summaries if (scale := float(summary.get("scale", 0.0))) > 0.0]
     if not scales:
@@ -129,5 +132,7 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
     *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
-    conductance = float(leak_coefficient * float(summary["scale"]))  # `scale`: true over computed flow
+    # true over computed flow; 0 if it is unknown: the stream computes its flows with the same assumed sizes
+    scale = float(summary["scale"]) or 1.0
+    conductance = float(leak_coefficient * scale)
     return conductance if np.isfinite(conductance) else None

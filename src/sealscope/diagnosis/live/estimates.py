@@ -195,12 +195,13 @@ def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
     """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
 
     Warming of the oil raises a conductance by the factor `warmest` at most, which takes the time `shift` [h] (table
-    `oil` of `priors.toml`); cooling lowers it as much. A negative conductance is an error: the upper limit is then 0.
+    `oil` of `priors.toml`); cooling lowers it as much. A negative conductance is an error of the estimate: the limits
+    are then the conductance itself and 0.
     """
     oil, before = INFERENCE.oil, leak.conductance_before
     hours = max(0.0, t - leak.onset_s) / 3600.0
     max_ratio = float(oil.warmest ** min(1.0, hours / oil.shift))
-    return EstimatedInterval(before, before / max_ratio, max(before, 0.0) * max_ratio)
+    return EstimatedInterval(before, min(before, before / max_ratio), max(before, 0.0) * max_ratio)
 
 
 def mean_flow(flows: Array, errors: Array) -> Estimate:
