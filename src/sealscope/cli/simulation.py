@@ -70,10 +70,10 @@ def simulate(
 
 def _parse_map(text: str) -> tuple[str, str]:
     """Split an option `--map CHANNEL=NAME` into channel and name; raise InputError for any other text."""
-    channel, delimiter, name = text.partition("=")
-    if not (channel and delimiter and name):
+    channel, _, name = map(str.strip, text.partition("="))
+    if not (channel and name):
         raise InputError(f"--map must be CHANNEL=NAME, got {text}")
-    return channel.strip(), name.strip()
+    return channel, name
 
 
 def parameters(

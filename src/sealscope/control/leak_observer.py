@@ -106,8 +106,8 @@ def _update_with_block(m: Any, dp_sum: float) -> None:
     # oil in the chamber is compressed by the pressure change, incoming oil by the mean pressure difference
     compressed = (V * dp_side + m.D * intake_angle * dp_integral * m.rate / m.length) / m.K
     leaked = pumped - swept - compressed
-    # uniform error of one encoder count (1/12) at both ends, noise of the averaged pressures, errors of the model
-    noise = (side_area * m.x_step) ** 2 / 6.0 + _MEAN_NOISE * (V / m.K * m.noise) ** 2
+    # at both ends a uniform error of one encoder count (1/12) and the noise of an averaged pressure; the model's errors
+    noise = (side_area * m.x_step) ** 2 / 6.0 + 2.0 * _MEAN_NOISE * (V / m.K * m.noise) ** 2
     variance = noise + (_COMPRESSION_ERROR * compressed) ** 2 + (_SWEPT_ERROR * swept) ** 2
     row = (dp_integral, compressed, swept)  # the model is leaked = row . state
     innovation = leaked - (row[0] * state[0] + row[1] * state[1] + row[2] * state[2])

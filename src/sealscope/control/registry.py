@@ -107,8 +107,8 @@ def _find_module_file(module: str) -> Path | None:
         name = ".".join(parts[:depth])
         specs = (finder.find_spec(name, folders) for finder in sys.meta_path)
         spec = next((spec for spec in specs if spec is not None), None)
-        if spec is None:
-            return None
+        if spec is None or (depth < len(parts) and spec.submodule_search_locations is None):
+            return None  # not found, or inside a module that is no package
         folders = spec.submodule_search_locations
     return Path(spec.origin) if spec is not None and spec.origin else None
 

@@ -177,9 +177,14 @@ class MockUp(NamedTuple):
         target = ["-target", platform.target] if compiler.cross_compiles else []
         flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
         command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
-        process = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+        name = " ".join(compiler.command)
+        try:
+            process = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+        except subprocess.TimeoutExpired:
+            rule = f"the C compiler ({name}) must build the unit for {system} within {_COMPILE_TIMEOUT:g} s"
+            raise InputError(f"{rule}, got none by then") from None
         if process.returncode:
-            name, messages = " ".join(compiler.command), process.stderr[-500:]
+            messages = process.stderr[-500:]
             raise InputError(f"the C compiler ({name}) could not build the unit for {system}: {messages}")
         return output.read_bytes()
 

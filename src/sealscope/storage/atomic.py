@@ -14,7 +14,7 @@ from pathlib import Path
 
 from sealscope.errors import InputError
 
-#: Length to which the file's name is cut in the name of its temporary file, as file systems limit names to 255 bytes.
+#: Bytes to which the file's name is cut in the name of its temporary file, as file systems limit names to 255 bytes.
 _MAX_NAME = 60
 #: Name of a temporary file: .TARGET.COMPUTER-PROCESS.RANDOM.part.
 _TEMPORARY = re.compile(
@@ -27,6 +27,11 @@ _MAX_AGE = 86_400.0
 def _computer_hash() -> str:
     """Compute 6 hexadecimal digits that identify this computer in names of temporary files: a hash of its name."""
     return sha256(platform.node().encode()).hexdigest()[:6]
+
+
+def _cut_name(name: str) -> str:
+    """Cut a file's name to `_MAX_NAME` bytes, without the rest of a letter that is cut apart."""
+    return os.fsencode(name)[:_MAX_NAME].decode("utf-8", "ignore")
 
 
 def check_folder(file: Path) -> None:
@@ -49,7 +54,7 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         if target.is_dir():
             raise InputError(f"a file to write must not be a folder, got {target}")
         # the name tells `remove_temporaries` which process of which computer fills the file
-        prefix = f".{target.name[:_MAX_NAME]}.{_computer_hash()}-{os.getpid()}."
+        prefix = f".{_cut_name(target.name)}.{_computer_hash()}-{os.getpid()}."
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=".part", dir=target.parent)
         os.close(handle)
     except OSError as error:
@@ -94,8 +99,8 @@ def remove_temporaries(folder: Path, target: str | None = None) -> None:
     """
     paths = folder.rglob(".*.part") if target is None else folder.glob(".*.part")
     for path in paths:
-        match = _TEMPORARY.fullmatch(path.name)  # has the target's name, cut to `_MAX_NAME` characters
-        if match is None or (target is not None and match["target"] != target[:_MAX_NAME]):
+        match = _TEMPORARY.fullmatch(path.name)  # has the target's name, cut by `_cut_name`
+        if match is None or (target is not None and match["target"] != _cut_name(target)):
             continue
         with suppress(OSError):
             is_abandoned = match["computer"] == _computer_hash() and not _is_alive(int(match["process"]))

@@ -224,10 +224,11 @@ def build_timeline(
         points.append(TrendPoint(**fields, group=-1 if note else next(used_groups), note=note))
     scales: list[float | None] = []  # of the first reading of each group
     for point in points:
+        scale = None if point.scale is None or point.scale <= 0.0 else point.scale
         if point.group == len(scales):  # a new group, as they are numbered in the order of their first reading
-            scales.append(point.scale)
+            scales.append(scale)
         elif point.group >= 0 and scales[point.group] is None:
-            scales[point.group] = point.scale  # the first that is known
+            scales[point.group] = scale  # the first that is known
     differences = [""] * len(scales)
     for number, scale in enumerate(scales[1:], 1):
         percent = 0.0 if scale is None or scales[0] is None else 100.0 * (scale / scales[0] - 1.0)

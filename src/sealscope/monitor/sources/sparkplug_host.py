@@ -101,7 +101,7 @@ class _Birth:
         """Find the sampling rate [Hz] in the settings, else in the birth; raise RefusedMessage if it is not > 0."""
         metric = self.metrics.get(self.names.get(_RATE))
         rate = actuator.rate or (math.nan if metric is None else metric.value)
-        if not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
+        if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
             rule = f"{actuator.name} must have a rate > 0 Hz, in its settings or as the metric {_RATE!r}"
             raise RefusedMessage(blocks.NO_CLOCK, f"{rule}, got {str(rate)[:40]}")
         return float(rate)
@@ -269,7 +269,7 @@ class SparkplugHost:
                 series = [piece.get(channel, np.full(piece["t"].size, np.nan)) for piece in pieces]
                 values[channel] = np.concatenate(series)
         for name, channel in channel_of.items():
-            if channel in SLOW and isinstance(last := birth.metrics[name].value, (int, float)):
+            if channel in SLOW - values.keys() and isinstance(last := birth.metrics[name].value, (int, float)):
                 values[channel] = np.full(n_samples, float(last))
         for channel, array in values.items():
             unit = birth.metrics[birth.names[channel]].unit or actuator.units.get(channel)

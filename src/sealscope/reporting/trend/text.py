@@ -59,7 +59,7 @@ def headline(trend: Trend) -> str:
 def verdict_sentence(trend: Trend) -> str:
     """Format the verdict of a trend, or another cause than a leak, as a sentence for the heading of its page."""
     if trend.decision.summary != trend.verdict:  # the summary names another cause than a leak
-        return trend.decision.summary.capitalize()
+        return trend.decision.summary[0].upper() + trend.decision.summary[1:]  # keeps other capitals
     if trend.verdict == "no leak":
         key = "fell" if trend.repairs else "no leak"
     elif trend.alarm is None or trend.wear is None:
