@@ -129,5 +129,6 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
     *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
-    conductance = float(leak_coefficient * float(summary["scale"]))  # `scale`: true over computed flow
+    # `scale`: true over computed flow, or 0 (and so the conductance) if no flow can be stated in L/min
+    conductance = float(leak_coefficient * float(summary["scale"]))
     return conductance if np.isfinite(conductance) else None
