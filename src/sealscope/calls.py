@@ -81,7 +81,7 @@ def take_fields_of(arguments_class: Callable[P, V]) -> Callable[[Callable[[V], R
 
     `arguments_class`: the dataclass, whose fields are declared by `argument`. The function is written with one
     parameter, an instance of it; its callers pass the fields. The decorator describes these in a section "Parameters"
-    of the docstring. Wrong arguments raise InputError (`checked_call`).
+    before the section "Returns" of the docstring, which must exist. Wrong arguments raise InputError (`checked_call`).
     """
     lines: list[str] = []
     for declared_field in fields(arguments_class):  # type: ignore[arg-type]

@@ -53,12 +53,13 @@ _log = logging.getLogger(__name__)
 def is_known_version(version: str) -> bool:
     """Return True if a numba version, such as "0.61.2", has the private names that `numba_private` uses."""
     first, after = KNOWN_VERSIONS
+    # [:3]: without a suffix such as rc1
     return first <= tuple(int(digits) for digits in re.findall(r"\d+", version)[:3]) < after
 
 
 @cache
 def _compiler() -> ModuleType:
-    """Import the module that compiles laws: `numba_private` for `KNOWN_VERSIONS` of numba, else `numba_pipeline`."""
+    """Import the module that compiles: `numba_private` for the `KNOWN_VERSIONS` of numba, else `numba_pipeline`."""
     if is_known_version(numba.__version__):
         return import_module("sealscope.numba_private")
     low, high = (".".join(map(str, version)) for version in KNOWN_VERSIONS)
@@ -73,7 +74,7 @@ def source_hash(root: Path) -> str:
     for package in _COMPILED_PACKAGES:
         # .toml: numbers, such as priors, that are compiled into kernels as constants
         files = sorted(path for path in (root / package).rglob("*") if path.suffix in (".py", ".toml"))
-        for path in files or [root / package]:
+        for path in files or [root / package]:  # an entry that is itself a file contains no `files`
             digest.update(path.relative_to(root).as_posix().encode() + b"\0")
             digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -140,7 +141,7 @@ def cache_directory() -> Path | None:
                 _make_private(base)
             else:
                 base.mkdir(mode=0o700, parents=True, exist_ok=True)
-                _check_owner(base.resolve(), forbidden=0o022)  # others cannot write
+                _check_owner(base.resolve(), forbidden=0o022)  # others cannot write; `base` may be a link
             _make_private(directory.parent)
             _make_private(directory)
             os.utime(directory)  # `_prune` keeps the folders that were used last
@@ -156,7 +157,7 @@ def cache_directory() -> Path | None:
 
 
 def kernel(function: _F) -> _F:
-    """Compile a function that Python calls, without Python objects and without the GIL, and cache its code."""
+    """Compile a function that Python calls, without Python objects and GIL; cache its code if there is a folder."""
     return _compiler().compile_kernel(function, cache_directory())  # type: ignore[no-any-return]
 
 
@@ -183,7 +184,8 @@ def large_law(function: _F) -> _F:
 def contracted(function: _F) -> _F:
     """Compile a small function like `law`, with fused multiply-adds and divisions by reciprocals allowed.
 
-    The results' last digits then depend on the processor, but not on the division of samples into blocks or vectors.
+    The results' last digits then depend on the processor, and may differ between numbers and vectors (`physics.lanes`),
+    but do not depend on the division of samples into blocks.
     """
     return _compile_law(function, fastmath={"contract", "arcp"})
 

@@ -68,14 +68,14 @@ class Unit(NamedTuple):
 
 
 def _build_unit(row: Mapping[str, Any]) -> Unit:
-    """Build the Unit of a row of `units.toml`."""
+    """Build the Unit of a row of `units.toml`: its keys are those of `_DEFAULTS`, and base units with their powers."""
     powers = {base: Fraction(power) for base, power in row.items() if base not in _DEFAULTS}
     factor, pi_power, offset = (Fraction(row.get(name, default)) for name, default in _DEFAULTS.items())
     return Unit(factor, pi_power, tuple(sorted(powers.items())), offset)
 
 
 def _absolute_unit(unit: Unit) -> Unit:
-    """Build the unit of absolute pressure that belongs to `unit`, a unit of gauge pressure, as SI values are."""
+    """Build the unit of absolute pressure from `unit`, that of gauge pressure; in SI, pressures are gauge pressures."""
     return unit._replace(offset=-_TABLES["absolute"]["atmosphere"] / unit.factor)
 
 
@@ -132,7 +132,7 @@ def _parse_name(name: str) -> Unit:
         raise InputError(f"got {name}, which is no known unit") from error
     if not is_proportional:
         raise InputError(f"got {name}, which is not proportional to an SI unit")
-    result = Unit(Fraction(repr(float(factor))))
+    result = Unit(Fraction(repr(float(factor))))  # `repr`: the decimal number, such as 0.3048, not the nearest double
     for base_name, power in base._units.items():
         # pint's name of a base unit is a word, such as meter; a unit that `units.toml` lacks is a dimension of its own
         unit = _ATOMS.get(_SPELLINGS.get(base_name, base_name), Unit(powers=((base_name, Fraction(1)),)))
@@ -243,12 +243,12 @@ def same_dimension(unit: str, other: str) -> bool:
 
 
 def is_familiar(unit: str) -> bool:
-    """Test whether a unit is known without pint, alone or as a quotient, such as `bar`, `psig` and `cm3/s`.
+    """Test whether a unit is a name that is known without pint or a quotient of these, such as `psig` and `cm3/s`.
 
-    Pint also knows ordinary words, such as `rod`, which is 5 m.
+    Products and powers with ^ are not recognised. Pint also knows ordinary words, such as `rod`, which is 5 m.
     """
     names = {*_ATOMS, *_SPELLINGS} - {""}
-    parts = [unit] if unit in names else unit.split("/")
+    parts = [unit] if unit in names else unit.split("/")  # a name may contain a slash, such as r/min
     for part in parts:
         without_power = part.rstrip("23")
         without_mark = part[:-1] if part.endswith(("a", "g")) else part  # "a": absolute, "g": gauge pressure
@@ -301,8 +301,9 @@ def to_si(
     """Convert `values` (any shape, or one number) in `unit` to doubles in `si_unit`.
 
     One number is converted exactly and rounded once, except for units with pi, such as rpm. An array is converted with
-    an error of up to 2 units in the last place, or more for a unit with an offset, such as degF. Raises InputError for
-    a unit of another dimension; the message states `name`, the unit, the expected dimension and the file `place`.
+    an error of up to 2 units in the last place, or more for a unit with an offset, such as degF; with equal units, an
+    array of doubles is returned itself. Raises InputError for a unit of another dimension; the message states `name`,
+    the unit, the expected dimension and the file `place`.
     """
     scalar = isinstance(values, int | float)
     if unit == si_unit:
@@ -356,7 +357,7 @@ def parse_quantity(
     if unit.startswith("[") and unit.endswith("]"):
         unit = unit[1:-1]
     number = float(match["number"])
-    if not math.isfinite(number) or number == 0:  # exact arithmetic is for finite numbers; 1e-999999 is 0
+    if not math.isfinite(number) or number == 0:  # 1e-999999, 0 as a double, would be a huge fraction
         result = to_si(number, unit, si_unit, name=name, place=place)
     elif unit == si_unit:
         result = number

@@ -150,7 +150,7 @@ class _HoldDraws:
         n_missed = 0
         for seed in range(N_HEALTHY, N_HEALTHY + _N_DRAWS):  # the healthy holds have the seeds before
             rise = held_rise(draw_hold(self._rig, self._hold, conductance, self._flow, seed), self._healthy)
-            n_missed += rise is None or not rise.chance < self._max_false_alarm
+            n_missed += rise is None or not rise.chance < self._max_false_alarm  # `not <`: a chance of NaN is a miss
             if n_missed > self._max_missed:  # further draws cannot change the answer
                 return False
         return True
@@ -176,7 +176,7 @@ def _decay_rate_per_conductance(rig: Rig) -> float:
     It is K (1/V_A + 1/V_B), with the oil's usual bulk modulus K and the chambers' volumes V, dead volume included.
     """
     oil, cylinder = INFERENCE.held_oil, rig.cylinder
-    length = cylinder.L * (0.5 + oil.dead)  # half the stroke, and the dead volume of a chamber
+    length = cylinder.L * (0.5 + oil.dead)  # half the stroke, and the length of a chamber's dead volume
     return float((1.0 / cylinder.A_A + 1.0 / cylinder.A_B) / (length * oil.compressibility))
 
 

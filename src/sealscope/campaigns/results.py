@@ -37,7 +37,7 @@ def prior_knowledge(plan: AnyPlan) -> dict[str, PriorKnowledge]:
     """Collect the information that a plan gives to each of its detectors, by the detector's name.
 
     A scorer that compares two parts of a record knows the true onset of simulated records, because they are split
-    there. Detectors that are not scorers assume the plan's rig.
+    there. Detectors that are not scorers assume the plan's rig, if it states one.
     """
     knowledge = {}
     for name in plan.detectors:

@@ -78,8 +78,9 @@ class RecordingPlan(NamedTuple):
     """A planned recording, and the duties (commands and loads) that were compared for it.
 
     - `target` [m^3/(s Pa)]: conductance of the leak to detect, None to detect the smallest possible leak
-    - `for_detection`: the shortest recording that detects this leak, or the last one tried if none does
-    - `for_separation`: the shortest recording that also tells this leak from a leak of the pump, or the last one tried
+    - `for_detection`: the shortest recording that detects this leak, or the last one tried if none does; without a
+      target, the best of `compared`
+    - `for_separation`: likewise, the shortest recording that also tells this leak from a leak of the pump
     - `compared`: results of all duties, the usual duty first
     - `usual_pressure` [Pa]: mean pressure difference under the usual duty, at which flows are stated
     - `false_alarm`, `detection`: wanted probabilities of an alarm without the leak and with it

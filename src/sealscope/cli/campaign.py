@@ -108,7 +108,10 @@ def report(plan: PlanArgument, folder: FolderOption = None, data: DataOption = N
 
 
 def _campaign_folder(plan: AnyPlan, stated: Path | None) -> Path:
-    """Choose the folder of a campaign: `stated` or, if that is None, `sealscope-campaigns/NAME`, but no link."""
+    """Choose the folder of a campaign: `stated` or, if that is None, `sealscope-campaigns/NAME`.
+
+    Raises InputError if this default is a symbolic link or in one, which could lead to a folder of someone else.
+    """
     if stated is not None:
         return stated
     folder = Path("sealscope-campaigns") / plan.name

@@ -52,6 +52,7 @@ def commission(
         def add_recordings(machine: CommissionedMachine) -> CommissionedMachine:
             """Add the files to the healthy recordings of a machine; after a repair, note it and drop earlier ones."""
             if repair_s is not None:
+                # before recordings are added: none is taken from the time of a confirmed leak, which the mark ends
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:

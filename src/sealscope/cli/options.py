@@ -161,7 +161,7 @@ class StatedMachine:
             options = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
             options |= {"--area": area, "--displacement": displacement, "--limit": limit}
             for name, value in options.items():
-                if value is not None and value != []:
+                if value is not None and value != []:  # []: a repeatable option that the call does not have
                     raise InputError(f"{name} cannot be combined with --machine, whose file states it")
             known_machine = read_machine(machine)
             return cls(known_machine, rig=known_machine.rig, limit=known_machine.limit)
@@ -171,7 +171,7 @@ class StatedMachine:
         )  # fmt: skip
         check_request(stated_machine.channel_map, rate)
         check_request(stated_machine._rig_map, rate)
-        RepairLimit.parse(limit)
+        RepairLimit.parse(limit)  # raises if invalid
         return stated_machine
 
     @property
@@ -185,7 +185,10 @@ class StatedMachine:
         return bool(self.channel_map or self._rig_map)
 
     def read(self, file: Path) -> Recording:
-        """Read the recording in a file, or on standard input for the file `-`; raise UnreadableFile for a folder."""
+        """Read the recording in a file, or on standard input for the file `-`.
+
+        With --machine, folders have been replaced by their files; without it, a folder raises UnreadableFile.
+        """
         if self.commissioned is None and file.is_dir():
             remedy = "name its files, or state its machine by --machine"
             raise UnreadableFile(f"a recording must be a file, got a folder: {remedy} ({file})")

@@ -149,7 +149,8 @@ def _matches_fail_on(reason: str, diagnosis: Diagnosis) -> bool:
 def _is_time_series(files: Sequence[Path], starts: Sequence[float | None]) -> bool:
     """Return True if files look like recordings of one machine over time.
 
-    Their names must differ only in numbers, and their `starts` [s] must be known and lie an hour or more apart.
+    There must be `_MIN_SERIES_FILES` or more, whose names differ only in numbers, and whose `starts` [s] are all known
+    and lie an hour or more apart.
     """
     known = sorted(start for start in starts if start is not None)
     if len(known) < max(_MIN_SERIES_FILES, len(files)):
@@ -247,7 +248,7 @@ def report(
     has_folder = (len(files) > 1 and not join) or output.is_dir()
     input_files = {path.resolve() for path in (*files, *stated.baseline)}
     pages: dict[Path, Path] = {}
-    for file in files[:1] if join else files:
+    for file in files[:1] if join else files:  # joined files have one page
         page = output / f"{file.stem}.html" if has_folder else output
         if page.resolve() in input_files:
             raise InputError(f"a page must not replace a recording, got {page}")
@@ -350,8 +351,8 @@ def inspect(
 def _resolve_map(channel_map: ChannelMap, files: Sequence[Path], recording: Recording) -> dict[str, str]:
     """Return the column of each channel in `channel_map`; `auto` is replaced by the columns that it found by name.
 
-    `recording`: read by this map from `files`. With `auto` the result is empty if it was converted from another file:
-    it then states that file's columns, and its own have the channels' names.
+    `recording`: read by this map from `files`. With `auto` the result is empty for a recording that was converted from
+    another file: its provenance states that file's columns, while its own columns have the channels' names.
     """
     from sealscope.recordings.formats.columns import explicit_columns, reconstruct_map, uses_names
 

@@ -73,7 +73,10 @@ def reproduce(
 
 
 def _list_items(patterns: Sequence[str], sheet: Path | None) -> None:
-    """Print ids and titles of the items that match `patterns`; mark those whose data file `sheet` is missing."""
+    """Print ids and titles of the items that match `patterns`; mark those that need the data sheet if it is missing.
+
+    `sheet`: folder of the data sheet, None for the default places (`find_sheet`).
+    """
     from sealscope.thesis.engine.items import load_items, select_items
     from sealscope.thesis.sheet import MISSING, find_sheet
 

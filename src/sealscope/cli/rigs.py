@@ -93,7 +93,7 @@ def new(
 def _parse_size(text: str | None, si_unit: str, default_unit: str, option: str, label: str = "") -> float:
     """Parse the text of an option to a number in `si_unit`; a text without a unit is in `default_unit`.
 
-    If `text` is missing and a `label` is stated, the user is asked for the value at the terminal, with this label.
+    If `text` is missing, the user is asked for it at the terminal with the `label`; without one it raises InputError.
     """
     from sealscope.units import parse_quantity
 

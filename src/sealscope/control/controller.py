@@ -61,7 +61,7 @@ class Started:
         """Leakage flow [m^3/s] compensated at the last sample; AttributeError if the controller reports none."""
         flow = float(self._law.memory[0])
         if math.isnan(flow):
-            raise AttributeError("compensated")
+            raise AttributeError("compensated")  # `getattr` then finds none, as in a Python function without it
         return flow
 
 
@@ -99,7 +99,7 @@ class _PythonLaw:
 def start_law(controller: Controller) -> CompiledLaw:
     """Start a controller for one run; return its control law in the form that compiled code can call.
 
-    This is the controller's machine code (`compiled`), or else a law that calls the Python function of `start`.
+    This is the controller's machine code (`compiled`); if it has none, a law that calls the Python function of `start`.
     """
     law: CompiledLaw | None = controller.compiled() if hasattr(controller, "compiled") else None
     return _PythonLaw(controller.start()).law if law is None else law

@@ -18,10 +18,11 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 
-#: Smallest pressure drop across a valve over the supply pressure, to keep the voltage finite under any load.
+#: Least assumed pressure drop across a valve, as a fraction of the supply pressure: the voltage stays finite.
 _MIN_VALVE_FRACTION = 0.1
-_OVERLAP_GAIN = 4.0  # gain by which a small voltage is increased until the overlap of the valve's edges is passed
-#: Parameters and filter state of `drive_voltage`: those of a pump's drive, then those of a servo valve (Q_N > 0).
+_OVERLAP_GAIN = 4.0  # multiple of a small voltage that is added to it to pass the overlap of the valve's edges
+#: Parameters and filter state of `drive_voltage`: those of a pump's drive, then those of a servo valve. For a pump Q_N
+#: is 0.
 DRIVE = record_dtype(
     *("displacement", "omega_per_volt", "shortfall", "decay", "droop", "high_passed", "previous_speed"),
     *("Q_N", "dp_N", "u_N", "p_s", "dead_volts"),
@@ -134,7 +135,7 @@ class Drive:
         return np.asarray((omega_d + self.shortfall * (y - droop_speed)) / (1.0 + self.shortfall))
 
     def coefficients(self, rate: float, dead_volts: float = 0.0) -> Any:
-        """Make the parameters for `drive_voltage`, a record (1,) `DRIVE`; it is called at `rate` [Hz].
+        """Make the parameters, a record (1,) `DRIVE`, for calls of `drive_voltage` at `rate` [Hz].
 
         `dead_volts` is for `ValveDrive` alone.
         """

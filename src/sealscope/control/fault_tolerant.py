@@ -46,12 +46,12 @@ def _tolerant_law(memory: Any, sample: Any) -> Any:
 
     The leakage flow is G times the averaged p_A - p_B; it is stored as `compensated`. If the leak is not known
     (`is_known` = 0), G slowly follows a target: the conductance that the observer estimates minus the assumed one, or 0
-    while this difference is not significant. While G is not 0, the voltage is limited to +-u_max. `memory`, `sample`:
-    addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
+    while this difference is not significant or based on too few blocks. While G is not 0, the voltage is limited to
+    +-u_max. `memory`, `sample`: addresses of a record `_MEMORY`, which is updated, and of the numbers of a `Measured`.
     """
     m, measured = _memory_at(memory), measured_at(sample)
     u = call_at(int(m.inner), int(m.inner_memory), address_of(sample))
-    if math.isnan(m.mean_A):
+    if math.isnan(m.mean_A):  # the first sample
         m.mean_A, m.mean_B = measured.p_A, measured.p_B
     m.mean_A += m.pressure_gain * (measured.p_A - m.mean_A)
     m.mean_B += m.pressure_gain * (measured.p_B - m.mean_B)
@@ -86,10 +86,10 @@ class FaultTolerant:
 
     The voltage is that of the controller `inner`, plus the one at which the `drive` delivers the leakage flow G dp.
     Here dp is p_A - p_B, averaged over some milliseconds. A Kalman filter (`update_observer`, with the model `balance`)
-    estimates the conductance between the chambers. G [m^3/(s Pa)] is this estimate minus `G_assumed`. G stays 0 until
-    this difference exceeds 4 standard errors and the leak would move the piston by half an encoder count a second.
-    Without a leak the voltages are therefore exactly those of `inner`. The compensated flow [m^3/s] is reported as
-    `compensated`.
+    estimates the conductance between the chambers. G [m^3/(s Pa)] is `known` or, if this is None, the estimate minus
+    `G_assumed`. It then stays 0 until this difference exceeds 4 standard errors and the leak would move the piston by
+    half an encoder count a second. While G is 0, the voltages are exactly those of `inner`. The compensated flow
+    [m^3/s] is reported as `compensated`.
     """
 
     inner: Controller

@@ -70,7 +70,8 @@ class Flatness:
     the pump's leakage G dp, the compression C d(dp)/dt of the oil, and the speed that the drive loses under dp.
 
     The friction is F_f(v) = F_C tanh(v/v_th) + F_v v. F_load is the force of the measured pressures minus (M a + F_f),
-    averaged over time. A speed of the target above `v_max` is taken as a jump, to which only `feedback` responds.
+    averaged over time. A speed of the target above `v_max` is taken as a jump, to which only `feedback` responds. A
+    change of the speed by a tenth of `v_max` or more within a sample is a jump, too, with a = 0.
 
     Source: J. Levine, Analysis and Control of Nonlinear Systems: A Flatness-based Approach, Springer 2009, chapter 6.
     """

@@ -25,7 +25,7 @@ _WALK, _RELATIVE_WALK = 1e-15, 0.03
 #: outlier with the same sign, a leak has opened suddenly.
 _OUTLIER_SDS = 4.0
 _LAG = 0.01  # time constant [s] of the average of all four signals
-#: Parameters (`Balance`) and state of the observer. `length`: samples in a block; `turned_forward`, `turned_back`:
+#: Parameters (`Balance`) and state of the observer. `length`: intervals in a block; `turned_forward`, `turned_back`:
 #: rotation within the block in either direction [rad]; `outlier_G`: change of conductance that the last tested block
 #: implies if it is an outlier, else 0; `means`: averages of angle, position, p_A and p_B up to now; `begin`: these
 #: averages when the block began; `state`: conductance [m^3/(s Pa)], relative errors of 1/K and of the area; `P`: its

@@ -195,7 +195,7 @@ def _frequency_response(response: Array, z: NDArray[np.complex128]) -> NDArray[n
     last_value = response[-1]
     transient = response - last_value
     is_relevant = np.abs(transient) > 1e-9 * np.abs(response).max()
-    n = int(np.flatnonzero(is_relevant)[-1]) + 1 if is_relevant.any() else 0
+    n = int(np.flatnonzero(is_relevant)[-1]) + 1 if is_relevant.any() else 0  # up to the last relevant value
     blocks = np.zeros((math.ceil(n / _BLOCK), _BLOCK))  # the transient in rows, the last one padded by zeros
     blocks.ravel()[:n] = transient[:n]
     block_sums = z[:, None] ** -np.arange(float(_BLOCK)) @ blocks.T

@@ -110,6 +110,7 @@ def _find_module_file(module: str) -> Path | None:
         if spec is None or (depth < len(parts) and spec.submodule_search_locations is None):
             return None  # not found, or inside a module that is no package
         folders = spec.submodule_search_locations
+    # the origin of a built-in module is a word, not a file: the caller refuses it
     return Path(spec.origin) if spec is not None and spec.origin else None
 
 

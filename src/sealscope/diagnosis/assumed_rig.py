@@ -77,9 +77,9 @@ def _shows_valve_supply(rig: Rig | None, recording: Recording) -> bool:
     """Return True if a recording shows the supply of a servo valve.
 
     That is so if no flow and no pump is recorded, only the command, and if p_1 exceeds both chamber pressures by
-    `supply.margin` (`priors.toml`) in the fraction `supply.above` of the samples: at the port of a pump, p_1 is about
-    the pressure of one chamber. Pressures in raw counts cannot be compared, and a displacement that `rig` states is
-    that of a pump that feeds the chambers: the result is then False.
+    `supply.margin` (`priors.toml`) in more than the fraction `supply.above` of the samples that have all three: at the
+    port of a pump, p_1 is about the pressure of one chamber. Pressures in raw counts cannot be compared, and a
+    displacement that `rig` states is that of a pump that feeds the chambers: the result is then False.
     """
     states_pump = rig is not None and rig.states("pump.q_b")
     if states_pump or flow_source(recording.channels) != "u":

@@ -130,6 +130,7 @@ class Examination:
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)
         # the detector states fractions of the examined part; converted to fractions of the whole recording
+        # (`judged_until` to a lower bound of it, which is exact if the part begins with the first sample)
         judged_until = self.judged_until * evidence.judged_until
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
@@ -164,8 +165,9 @@ def diagnose(
         Probability of `leak` on a leak-free recording, 1e-4 to 0.2.
     rig : Rig, str or path-like, optional
         Sizes of the machine: a Rig, the name of a packaged rig or the path of a TOML file. By default the rig of the
-        thesis is used. It counts as stated for a recording that was simulated with the same sizes. For any other
-        recording it is a mere assumption, and L/min are stated only if a flow meter was recorded.
+        thesis is used, or that of a servo valve if the recording shows one (`infer_rig`). It counts as stated for a
+        recording that was simulated with the same sizes. For any other recording it is a mere assumption, and L/min are
+        stated only if a flow meter was recorded.
     limit : str, optional
         Smallest leak that calls for a repair: a flow (``"5 mL/min"``) or a creep speed of the piston
         (``"8 mm/min"``, the default).

@@ -151,6 +151,7 @@ class MockUp(NamedTuple):
     def _write_sources(self, folder: Path, version: Version) -> list[Path]:
         """Write the FMU's sources (C, LLVM code and headers of FMI `version`) to a folder; return the files' paths."""
         interface = files("sealscope.fmu") / "c"
+        # indices in `values`; those of inputs and outputs fall outside its range
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
         # 1 for a parameter that is a variable of the FMU, 0 for one that keeps its value
         present = [int(k in value_indices) for k in range(len(self.values))]
@@ -202,7 +203,7 @@ def write_fmu(
     """Write a functional mock-up unit (FMU) that simulates a rig in co-simulation.
 
     The FMU contains the compiled equations of `simulate`, and needs no Python. Its inputs are the command, a leak,
-    external leakage and a load, its outputs states, flows and powers; every parameter of the equations can be tuned.
+    external leakage and a load, its outputs states, flows and powers; the parameters of the rig's parts can be tuned.
 
     Parameters
     ----------
@@ -339,6 +340,7 @@ def write_sensor_fmu(
 
 
 def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
+    """Load a rig; raise InputError if it is not pump-controlled."""
     machine = load_rig(rig)
     check_circuit_property("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
     return machine

@@ -83,7 +83,8 @@ def _at_imex_nodes(a: float, b: float, t: float, h: float) -> tuple[float, float
 class RigChoice(NamedTuple):
     """The equations and the solver that are compiled into the FMU of a rig; the rig's parameters remain variables."""
 
-    laws: tuple[bool | tuple[bool, ...], ...]  # of `physics.rig.CHOICES`: equation that the rig has, or if it has one
+    # by `physics.rig.CHOICES`: truth values, then for each optional law (True,) if the rig has it, else ()
+    laws: tuple[bool | tuple[bool, ...], ...]
     exponent: float  # 1 if the closed fraction of a throttle is a fraction of its area, 2 if of its diameter
     literal_metering: bool  # True if eqs. (4.9)-(4.12) of the thesis are taken as printed
     implicit: bool  # True for the implicit-explicit method, False for Runge-Kutta

@@ -126,12 +126,12 @@ def _check_experiment(experiment: Experiment) -> None:
     """Raise InputError for an experiment that an FMU cannot run."""
     if experiment.target is not None:
         raise InputError(f"an FMU must have a command, not a target, got {experiment.command}")
-    if experiment.effects():
+    if experiment.effects():  # drifts and faults of the machine, not of its instruments
         raise InputError(
             "an experiment with an FMU may have faults and drifts of sensors only: the FMU contains the machine"
         )
     for leak in experiment.leaks:
-        if leak.coefficient is None:
+        if leak.coefficient is None:  # the leak is stated by its flow
             raise InputError(
                 f"an FMU's leak must be a conductance, 'G = 6e-13 from 20 s' or 'C = 2e-10', got {leak}: the FMU "
                 "computes its flow"
@@ -152,7 +152,7 @@ def _read_description(path: Path) -> Any:
 
 
 def _map_variables(path: Path, variables: Mapping[str, Any], names: Mapping[str, str]) -> dict[str, str]:
-    """Find the FMU's variable for each channel and input that it has; return the variables' names.
+    """Find the FMU's variable for each channel and input that it has; return the variables' names by channel or input.
 
     `path`: the FMU's file, for messages; `variables`: all its variables by name; `names`: variables of those channels
     and inputs that have another name in the FMU. Raises InputError if `names` has an unknown channel or variable.

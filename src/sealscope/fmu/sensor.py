@@ -391,7 +391,7 @@ def _fit_to_waiting(m: Any) -> None:
         _load_block(m, m.waiting_grams[k])
         add_block(model, m.waiting_sizes[k, _BLOCK_ROWS], weight=1.0, has_stepped=False)
     fit_coefficients(model)
-    for k in range(LEARNED):
+    for k in range(LEARNED):  # is_learned: False below, as the blocks are in the sums already
         _load_block(m, m.waiting_grams[k])
         m.precisions[k], _, _, _ = estimate_leak(model, m.waiting_sizes[k, _BLOCK_ROWS], is_learned=False)
     m.usual_precision = median(m.precisions, LEARNED)
@@ -426,7 +426,7 @@ def _update_with_block(m: Any, b: int, n_rows: float, pressure: float) -> None:
     discarded, and the first fit is repeated. `n_rows`, `pressure`: as in `_append_conductance`.
     """
     model, motion_square = m.model, m.gram[b, _RESPONSE, _RESPONSE]
-    if m.usual_precision > 0.0:
+    if m.usual_precision > 0.0:  # after the first fit
         motion = relative_motion(motion_square, n_rows, model.numbers)
         m.n_moving = m.n_moving + 1.0 if motion > 1.0 / STANDSTILL else 0.0
         if m.n_moving >= N_WAKING:

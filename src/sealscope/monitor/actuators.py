@@ -78,7 +78,8 @@ class _Actuator:
     verdict: RecordingVerdict | None = None  # on the last recording, None also if newer results replace it
     # last samples during an alarm, which may become a healthy recording
     alarm_samples: list[Recording] = field(default_factory=list)
-    recorder: StreamRecorder | None = None  # None for files, and for machines that are not commissioned
+    # None for files, for machines that are not commissioned, and for `recording_s` = 0
+    recorder: StreamRecorder | None = None
 
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
@@ -122,7 +123,7 @@ class _Actuator:
     def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
         """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
 
-        None, for a file without a verdict, only replaces the earlier verdict. For a stream, a verdict that does not
+        None, for samples without a verdict, only replaces the earlier verdict. For a stream, a verdict that does not
         decide is dropped once there is an estimate of a block, which tells more, and the verdict `no leak` is dropped
         if its bound does not exclude the leak of the alarm. Otherwise `no leak` makes the detector withdraw its leak.
         """
@@ -168,7 +169,7 @@ class _Actuator:
         return save_attributes(self, ("watch", "judge", *_RESULT_TYPES, "n_stored", "recorder"))
 
     def load_state(self, state: Mapping[str, Any]) -> None:
-        """Restore detector, recorder and last results, but not the alarm, from the `state` of a checkpoint."""
+        """Restore detector, recorder and last results from a checkpoint's `state`; not its alarm and `n_stored`."""
         self.watch = Watch.from_state(state["watch"])
         restore_attributes(self, _RESULT_TYPES, state, _RESULT_TYPES)
         if self.recorder is not None and state["recorder"] is not None:
@@ -243,7 +244,8 @@ class WatchedActuators:
     def __init__(self, settings: list[ActuatorSettings], store: MonitorStore, keep_days: float = 90.0) -> None:
         """Restore the actuator of each of the `settings` from the database, or create it if it is not stored."""
         self.store, self.settings = store, {setting.name: setting for setting in settings}
-        self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())  # arrival of each one's last block [s]
+        # arrival of each one's last block [s], at first the start of the monitor
+        self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
         # change_number: see `_notify_change`; closed: set to True when open web pages must end
@@ -278,9 +280,10 @@ class WatchedActuators:
     def _load_checkpoint(self, actuator: _Actuator, settings_json: str, state: Mapping[str, Any]) -> bool:
         """Restore an actuator from the settings and `state` of its checkpoint, and judge the samples since then again.
 
-        The detector (`watch`) starts anew if another version of Sealscope saved its state, or if its rig or learning
-        time has changed. A pump displacement within 5 % of the stored one counts as the same, measured again. Returns
-        True if a new checkpoint must be saved, because the detector starts anew or the settings have changed.
+        The detector (`watch`) starts anew if its state has another `STATE_VERSION`, and the samples are then not judged
+        again, or if its rig or learning time has changed. A pump displacement within 5 % of the stored one counts as
+        the same, measured again. Returns True if a new checkpoint must be saved, because the detector starts anew or
+        the settings have changed.
         """
         settings, name = actuator.settings, actuator.settings.name
         fresh = actuator.watch
@@ -295,7 +298,8 @@ class WatchedActuators:
         stored_settings = None
         with suppress(ValidationError):  # another version may have written them in another form
             stored_settings = WatchSettings.model_validate_json(settings_json)
-        n_judged = state.get("n_stored", 0)  # number of the last block whose effect the state includes
+        # number of the last block whose effect the state includes; an old state without it includes no pending block
+        n_judged = state.get("n_stored", 0)
         for number, samples, follows, verdict in self.store.pending(name):
             if number <= n_judged:
                 if actuator.recorder is not None:
@@ -498,7 +502,8 @@ class WatchedActuators:
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last stored summary of each actuator in the settings, by name.
 
-        The state is "no data" if unknown, or if it reports no leak and no block has come for `no_data_s` seconds.
+        The state is "no data" if unknown, or if it reports no leak and no block has come for `no_data_s` seconds. An
+        actuator without a stored summary is left out.
         """
         stored_summaries, now = self.store.summaries(), time.monotonic()
         summaries = {}

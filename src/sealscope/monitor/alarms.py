@@ -49,7 +49,7 @@ class Alarm:
     level: Level
     state: AlarmState
     raised_s: float
-    updated_s: float  # time of the last change
+    updated_s: float  # time of the last judged block, verdict or mark
     onset_s: float  # begin of the leak
     onset_interval_s: Interval
     leak_lpm: float | None  # None if unknown
@@ -76,7 +76,7 @@ class Alarm:
 
     @property
     def shelved(self) -> bool:
-        """True if the alarm was shelved at its last change; a shelved alarm is not announced."""
+        """True if the alarm was shelved at the time `updated_s`; a shelved alarm is not announced."""
         return self.shelved_until_s > self.updated_s
 
     @property
@@ -225,7 +225,7 @@ class AlarmJudge:
         (`RecordingVerdict.is_rare`). For a stream (`is_stream`), the attribute `evidence`, collected from its
         recordings, must reach 1/alpha, where alpha is the allowed false-alarm probability of one recording. The alarm
         is an error if the leak is over the repair limit, by the state in the verdict. The verdict `no leak`, or a leak
-        below the warning threshold, ends an active alarm, and only then resets `evidence`.
+        below the warning threshold, ends an active alarm and resets `evidence`; without such an alarm `evidence` stays.
 
         The events are those of `update`. Returns None for the verdict `cannot tell`, or if no alarm was active and none
         is raised.
@@ -320,6 +320,7 @@ def latest_alarms(alarms: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
 def rank_actuators(summaries: Mapping[str, Mapping[str, Any]], alarms: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Sort the summaries of actuators by urgency; add to each the `name` and the open `alarm`, None if there is none.
 
+    The order is by severity of the state, then new alarms first, then by rarity of the alarm and size of the leak.
     `summaries`: by name of the actuator; `alarms`: the open alarms, for each actuator the latest first.
     """
 

@@ -70,13 +70,13 @@ class Service:
         """
         self.settings, self.once = settings, once
         self._queue: BoundedQueue[SourceBlock | RefusedMessage | None] = BoundedQueue(_QUEUE_BLOCKS, _QUEUE_BYTES)
-        self._unstored: list[SourceBlock | RefusedMessage | None] = []
+        self._unstored: list[SourceBlock | RefusedMessage | None] = []  # of the present transaction
         self._stdin = stdin or (sys.stdin.buffer if sys.stdin is not None else BytesIO())
         self._extra_sources = [*sources]
         self._refused = self._n_waits = self._n_sources = 0
         self._is_database_blocked = False  # True while the database refuses blocks
         with ExitStack() as resources:  # released after an error
-            if "://" not in settings.database:
+            if "://" not in settings.database:  # a file; the database of a server is not locked
                 if not Path(settings.database).parent.is_dir():
                     raise InputError(f"the monitor's database must be in a folder that exists, got {settings.database}")
                 busy = f"the database must belong to one monitor, but another one is running ({settings.database})"
@@ -122,7 +122,7 @@ class Service:
 
     def queue_load(self) -> QueueLoad:
         """Count the blocks and bytes in the queue and in the present transaction, and the waits of sources so far."""
-        unstored = [*self._unstored]
+        unstored = [*self._unstored]  # a copy, as another thread changes the list
         n_blocks, n_bytes = self._queue.size()
         n_bytes += sum(block.bytes for block in unstored if block is not None)
         return QueueLoad(n_blocks + len(unstored), n_bytes, self._n_waits)

@@ -152,6 +152,7 @@ def decode_payload(data: bytes) -> SparkplugPayload:
 
 
 def _get_fields(message: Any, *names: str) -> list[Any]:
+    """List the fields `names` of a protobuf message, None for one that is not set."""
     return [getattr(message, name) if message.HasField(name) else None for name in names]
 
 
@@ -161,7 +162,7 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
     value = None if field is None else getattr(entry, field)
     if not isinstance(entry.name, str) or (field == "string_value" and not isinstance(value, str)):
         raise ValueError("a text must be UTF-8")  # protobuf returns a damaged text as bytes
-    properties = zip(entry.properties.keys, entry.properties.values, strict=False)
+    properties = zip(entry.properties.keys, entry.properties.values, strict=False)  # a sender may state fewer values
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
     name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
     metric = SparkplugMetric(name, value, alias=alias, timestamp=timestamp, unit=unit or None)

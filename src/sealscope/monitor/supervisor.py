@@ -154,7 +154,7 @@ class Supervisor:
         part = self.part(name)
 
         def work_with_timer() -> None:
-            # `work` may run as long as the monitor
+            # `work` may run as long as the monitor: the outage ends before `work` does
             timer = threading.Timer(_WORKING_S, part.end_outage)
             timer.daemon = True
             timer.start()

@@ -97,7 +97,10 @@ class RecordingVerdict:
         return bool(self.verdict == NO_LEAK)
 
     def excludes(self, leak_lpm: float | None) -> bool:
-        """Return True if a leak of this flow [L/min] is above `bound_lpm`, or if one of them is unknown."""
+        """Return True unless a leak of this flow [L/min] is at most `bound_lpm`, and so possible beside `no leak`.
+
+        If the flow or the bound is unknown, nothing contradicts the verdict `no leak`: the result is True.
+        """
         return self.bound_lpm is None or leak_lpm is None or self.bound_lpm < leak_lpm
 
     @property
@@ -156,7 +159,10 @@ class RecordingVerdict:
         )
 
     def restate_block(self, block: BlockEstimate) -> BlockEstimate:
-        """Replace the leak in the estimate of a block by the leak of the whole recording, none before its onset."""
+        """Replace the leak in the estimate of a block by the leak of the whole recording, none before its onset.
+
+        Without a leak, the interval is 0 to `bound_lpm` if this is known.
+        """
         is_before_onset = self.onset_s is not None and block.t < self.onset_s
         if self.leaks and not is_before_onset:
             return replace(block, leak_lpm=self.leak_lpm, leak_interval_lpm=self.leak_interval_lpm)
@@ -165,6 +171,7 @@ class RecordingVerdict:
 
 
 def _parse_interval(ends: Any) -> Interval | None:
+    """Convert the ends of an interval to floats; return None if it or one of its ends is unknown."""
     return None if ends is None or None in ends else (float(ends[0]), float(ends[1]))
 
 

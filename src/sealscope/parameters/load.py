@@ -152,7 +152,7 @@ def _read_layers(
     tree = read_toml(path, "a rig file", place)
     if "machine" in tree:
         tree = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
-        if not set(tree) - {"map"}:
+        if not set(tree) - {"map"}:  # no tables of a rig: neither a rig nor sizes were stated at commissioning
             raise InputError(f"a machine's file must state an area to be a rig, got none: commission it anew ({place})")
     rig_table = tree.pop("rig", {})
     if not isinstance(rig_table, dict):

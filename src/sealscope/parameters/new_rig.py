@@ -51,7 +51,8 @@ def rig_text(name: str, area_A: float, area_B: float, stroke: float, displacemen
         V_gas=f"{1e3 * GAS_OVER_ROD * abs(area_A - area_B) * stroke:.4g}",
         G_check=f"{base.makeup.G_check * _volume_ratio(base, area_A, area_B, stroke):.4g}",
     )
-    return text if is_single_rod else text[: text.index("\n[makeup]")]  # equal areas need no make-up valves
+    # equal areas need no make-up valves, whose table is the last one
+    return text if is_single_rod else text[: text.index("\n[makeup]")]
 
 
 def valve_rig_text(

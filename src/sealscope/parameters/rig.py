@@ -311,9 +311,9 @@ class Rig(Part):
         scale = max(A_A, A_B) / max(cylinder.A_A, cylinder.A_B)
         scaled_values: dict[str, float] = {}
         if cylinder.volumes == "position":
-            dead_volume = max(cylinder.V - 0.5 * max(cylinder.A_A, cylinder.A_B) * cylinder.L, 0.0)
+            dead_volume = cylinder.V - 0.5 * max(cylinder.A_A, cylinder.A_B) * cylinder.L  # > 0 by `_check_parts`
             scaled_values["cylinder.V"] = 0.5 * max(A_A, A_B) * cylinder.L + scale * dead_volume
-            scaled_values["cylinder.V_rod"] = max(0.5 * (A_A - A_B) * cylinder.L, 0.0)
+            scaled_values["cylinder.V_rod"] = max(0.5 * (A_A - A_B) * cylinder.L, 0.0)  # 0 if the rod is on side A
         if self.makeup.check_valves != "absent":
             min_gas = GAS_OVER_ROD * abs(A_A - A_B) * cylinder.L
             scaled_values["makeup.V_gas"] = max(scale * self.makeup.V_gas, min_gas)

@@ -14,7 +14,7 @@ from sealscope.units import P_ATM
 
 @law
 def mid_stroke_volumes(c: Any) -> tuple[float, float]:
-    """Compute the oil volumes [m^3] of sides A and B at mid-stroke, each with its hose; `c`: such as `Rig.cylinder`."""
+    """Compute the oil volumes [m^3] of sides A and B at mid-stroke, with hoses; `c`: `Rig.cylinder` or `RigValues`."""
     return c.V + c.V_hose_A, c.V - c.V_rod + c.V_hose_B
 
 

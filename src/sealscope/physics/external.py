@@ -20,7 +20,7 @@ def external_leakage(p: float, G_ext: float) -> float:
 
 @contracted
 def accumulator_pressure(V_up: float, p_charge: float, V_gas: float) -> float:
-    """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil volume V_up [m^3], < 0 to it.
+    """Compute the pressure [Pa gauge] of a gas accumulator that has delivered the oil V_up [m^3], < 0 if taken in.
 
     The gas has the volume `V_gas` [m^3] at `p_charge` [Pa gauge], and p_abs (V_gas + V_up) is constant (isothermal).
     """

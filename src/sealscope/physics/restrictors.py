@@ -23,8 +23,8 @@ def series_coefficient(c: float, c_line: float, opening: Any) -> Any:
     """Compute the flow coefficient C [m^3/(s Pa^0.5)] of a throttle in series with a shut-off valve.
 
     1/C^2 = 1/c^2 + (1/opening^2 - 1)/c_line^2, with the flow coefficients `c` of the throttle and `c_line` of the free
-    line. The valve opens the fraction `opening` of the line's area, in Python also an array: fully open C = c but for
-    rounding, shut C = 0.
+    line, both > 0. The valve opens the fraction `opening` of the line's area, in Python also an array: fully open C = c
+    but for rounding, shut C = 0.
 
     Source: Merritt, Hydraulic Control Systems, 1967, section 3.4: pressure drops of orifices in series add.
     """
@@ -60,7 +60,7 @@ def _solve_scaled_flow(b: float, a: float) -> float:
     """
     w = b / (a + 1.0)  # first guess, with r = 1
     w = b / (a + select(w < 2.0, 1.0 + 0.25 * w * w, w))  # better, with r(w) approximated for small and for large w
-    for _ in range(50):
+    for _ in range(50):  # a limit that is not reached: with a and b up to 1e10 at most 13 iterations are needed
         square = w * w
         r = math.sqrt(0.5 * (square + math.sqrt(square * square + 4.0)))
         r_2 = r * r

@@ -138,7 +138,7 @@ def throttle_flow_coefficients(v: RigValues, exponent: float, literal: bool) -> 
     throttled_A = free * (1.0 - v.closed_A) ** exponent  # eq. (4.8)
     throttled_B = free * (1.0 - v.closed_B) ** exponent
     free_A, free_B = free, free
-    if v.open_A < 1.0:
+    if v.open_A < 1.0:  # a fully open valve changes nothing; the formula would add a rounding error
         free_A = restrictors.series_coefficient(free, free, v.open_A)
         throttled_A = restrictors.series_coefficient(throttled_A, free, v.open_A)
     if v.open_B < 1.0:
@@ -242,13 +242,13 @@ def vapour_floor(q: float, p: RigNumbers) -> float:
 
 @contracted
 def pressures_of(y: State, p: RigNumbers) -> Pressures:
-    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] in the state `y`, none below the vapour pressure."""
+    """Compute the pressures p_A, p_B, p_1, p_2 [Pa] in the state `y`, at least that of vapour if the oil boils."""
     return vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), vapour_floor(y[P_1], p), vapour_floor(y[P_2], p)
 
 
 @contracted
 def speed_error(y: State, u: float, p: RigNumbers) -> float:
-    """Compute the motor's speed error [rad/s]: the speed set by `u` [V] or, with a valve, its supply's, minus y's."""
+    """Compute the speed error [rad/s] of the motor: set speed, by `u` [V] or of a valve's supply, minus that in `y`."""
     if len(p.valved) > 0:
         return p.omega_P - y[OMEGA]  # type: ignore[no-any-return]
     return p.omega_per_volt * u - y[OMEGA]  # type: ignore[no-any-return]
@@ -268,8 +268,8 @@ def friction_force(y: State, applied: float, p: RigNumbers) -> tuple[float, floa
     """Compute the friction force [N] on the piston against +x, and the rate [m/s] at which LuGre's bristles deflect.
 
     The force is that of eqs. (4.20)-(4.22), unless the rig has Karnopp's law (`sticking`) or LuGre's (`bristled`); the
-    rate is 0 for the other laws. Friction along -x is multiplied by the parameter `backward`. `applied` [N]: sum of all
-    other forces on the piston along +x.
+    rate is 0 for the other laws. Friction of motion along -x is multiplied by the parameter `backward`. `applied` [N]:
+    sum of all other forces on the piston along +x.
     """
     v = y[VELOCITY]
     F_C = friction.coulomb_friction(
@@ -435,7 +435,7 @@ def make_up_flows(y: State, p: RigNumbers) -> tuple[float, float]:
         G_check = p.G_check if p.made_up else 0.0 * p.G_check
         makeup_1 = external.check_valve_flow(p_up - p_1, p.p_crack, G_check)
         makeup_2 = external.check_valve_flow(p_up - p_2, p.p_crack, G_check)
-    if len(p.relieved) > 0:
+    if len(p.relieved) > 0:  # `Rig` allows relief valves only with a make-up
         makeup_1 = makeup_1 - external.check_valve_flow(p_1 - p_up, p.p_relief, p.G_relief)
         makeup_2 = makeup_2 - external.check_valve_flow(p_2 - p_up, p.p_relief, p.G_relief)
     return makeup_1, makeup_2
@@ -489,7 +489,7 @@ def supply_compliance(p_1: float, p: RigNumbers) -> float:
     """Compute the compliance [m^3/Pa] of the supply line: the oil it takes in per unit rise of its pressure.
 
     It is (V_1 + V_oil)/K + V_gas/(n p_abs) at the supply pressure `p_1` [Pa gauge], with the oil's bulk modulus K, the
-    gas V_gas, its polytropic exponent n, and the oil V_oil = V_acc - V_gas in the supply's accumulator.
+    gas volume V_gas, its polytropic exponent n, and the oil V_oil = V_acc - V_gas in the supply's accumulator.
     """
     V_gas = external.gas_volume(p_1, p.p_pre, p.V_acc, p.n_acc)
     oil_compliance = (p.V_1 + p.V_acc - V_gas) / bulk_modulus(p_1, p)
@@ -525,7 +525,7 @@ def valve_rates(y: State, Q_1: float, p: RigNumbers) -> Pressures:
 def rates_without_throttles(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> State:
     """Compute the state's rates dy/dt from all physical laws but the throttles' flows; arguments: as in `rates`."""
     p_A, p_B, x, v = vapour_floor(y[P_A], p), vapour_floor(y[P_B], p), y[POSITION], y[VELOCITY]
-    if len(p.sticking) > 0:
+    if len(p.sticking) > 0:  # a stuck piston neither moves nor displaces oil, whatever small v the state has
         v = friction.stuck_velocity(v, p.v_th)
     dp_pump = pump_difference(y, p)
     error = speed_error(y, u, p)  # the rate of the state I, its integral; eq. (4.2) of the thesis
@@ -588,8 +588,8 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
     """Compute the rates dy/dt of all states of the rig from its physical laws.
 
     `y`: state in the order of `STATES`; `u` [V]: command; `G` [m^3/(s Pa)], `C` [m^3/(s Pa^0.5)]: conductance and flow
-    coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load over time in addition to the rig's own,
-    which counts only if `p.pushed` is not empty.
+    coefficient of the leakage past the piston (`piston_leakage`); `F` [N]: load over time in addition to the rig's own;
+    it counts only if `p.pushed` is not empty.
     """
     dy = rates_without_throttles(y, u, G, C, F, p)
     if len(p.throttled) > 0:
@@ -602,7 +602,7 @@ def rates(y: State, u: float, G: float, C: float, F: float, p: RigNumbers) -> St
 def observe(y: State, u: float, G: float, C: float, p: RigNumbers, row: np.ndarray) -> None:
     """Write all outputs of the rig to `row` (21,), in the order of `OUTPUTS`; other arguments: as in `rates`.
 
-    No pressure written is below the vapour pressure.
+    The pressures are those of `pressures_of`, so that a `row` does not contain the full state of boiling oil.
     """
     n = len(y)
     for m in range(n):

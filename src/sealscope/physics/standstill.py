@@ -70,6 +70,7 @@ def stand_still(y: Any, x: float, force: float, p: RigNumbers) -> int:
     y[P_A] = y[P_1] = p_A
     y[P_B] = y[P_2] = p_B
     y[CURRENT] = pump_torque(p_A - p_B, p.q_b) / p.C_m
+    # with K_i = 0 no voltage holds the current at rest: the pump then begins to turn
     y[INTEGRAL] = p.R_c * y[CURRENT] / p.K_i if p.K_i > 0.0 else 0.0
     if not min(p_A, p_B) >= -P_ATM:  # also for NaN
         return BELOW_VACUUM
@@ -135,7 +136,7 @@ def initial_state(rig: Rig, x_0: float, push: float = 0.0) -> np.ndarray:
 def _fill_standstill_state(rig: Rig, y: np.ndarray, x: float, force: float, p: RigNumbers) -> np.ndarray:
     """Fill the state `y` (14,), all zeros, with the equilibrium of a rig whose servo valve is centred; return `y`.
 
-    `x` [m]: position; `force` [N]: load against +x.
+    `x` [m]: position; `force` [N]: load against +x. Raises InputError if the supply or the drive cannot hold the load.
     """
     motor = rig.motor
     p_1, p_A, p_B = supply_at_standstill(force, x, p)

@@ -52,13 +52,13 @@ def estimate_period(signal: Array, rate: float) -> float | None:
         return None
     resampled = signal[: n * stride].reshape(-1, stride).mean(axis=1)
     resampled = resampled - resampled.mean()
-    if not np.any(resampled):
+    if not np.any(resampled):  # constant
         return None
     spectrum = np.abs(np.fft.rfft(resampled, 2 * n)) ** 2  # with n zeros added: lags do not wrap around
     correlation = np.fft.irfft(spectrum)[:n] / np.arange(n, 0, -1)  # divided by the number of products at each lag
     correlation = correlation / correlation[0]
     max_lag = min(n // _MIN_REPETITIONS, int(_CYCLE.longest * rate / stride))
-    negative = np.flatnonzero(correlation[:max_lag] < 0)
+    negative = np.flatnonzero(correlation[:max_lag] < 0)  # none if a sample is missing, as then all lags are NaN
     if negative.size == 0:
         return None
     first = int(negative[0])  # beyond the peak at lag 0

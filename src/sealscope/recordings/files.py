@@ -223,7 +223,7 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
     """
     with ExitStack() as folders:
         inner, kind = file, _detect_format(file)
-        max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0
+        max_bytes = max_unpacked_size(file) if kind in _ARCHIVES else 0  # of each layer; a plain file has none
         try:
             for _ in range(_MAX_NESTING):  # such as a .tar.gz, an archive in an archive
                 if kind in _ARCHIVES:
@@ -266,7 +266,7 @@ def check_target(file: Path) -> None:
 
 @checked_call
 def write(recording: Recording, path: str | os.PathLike[str]) -> None:
-    """Write a recording; it reads back as the same recording, to the bit.
+    """Write a recording; all of it but `bridged` reads back unchanged, to the bit.
 
     Parameters
     ----------

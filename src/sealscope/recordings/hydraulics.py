@@ -24,7 +24,8 @@ def find_implausibility(recording: Recording) -> str | None:
     - Pressures in Pa stay below `readings.pressure` of `priors.toml`, as those in another unit would.
     - p_A - p_B, or the only chamber pressure that varies, is nothing but noise.
 
-    Constant and absent channels are ignored: a chamber may rest at charge pressure. Raw counts may have any range.
+    Constant and absent channels are ignored: a chamber may rest at charge pressure. Raw counts may have any range. The
+    chamber pressures must have no missing samples, which would count as noise.
     """
     # the third difference of `_is_noise` needs four samples
     names = [name for name in chambers_of(recording) if len(recording) > 3 and not is_constant(recording[name])]
@@ -49,7 +50,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
 
     Speed and angle are averaged to `readings.rate` of `priors.toml`. Returns None if the least-squares factor is
     between 1 / m and m, with m = `readings.misfit`. Also None if the speed hardly correlates with the rate of the
-    angle, if either channel is absent or in raw counts, or if samples are missing or fewer than `readings.samples`.
+    angle, if either channel is absent or in raw counts, or if averages are missing or fewer than `readings.samples`.
     """
     if not {"theta", "omega"} <= {name for name, unit in recording.units.items() if unit != COUNTS}:
         return None
@@ -59,7 +60,7 @@ def _describe_speed_mismatch(recording: Recording) -> str | None:
     if theta.size < _PRIORS.samples or not np.isfinite(theta + omega).all():
         return None
     turning_rate = np.gradient(theta, n_mean / recording.rate)
-    product, square = abs(float(turning_rate @ omega)), float(turning_rate @ turning_rate)  # the sign does not matter
+    product, square = abs(float(turning_rate @ omega)), float(turning_rate @ turning_rate)  # a unit changes no sign
     ratio = product / max(square, np.finfo(float).tiny)  # least-squares scale of the speed
     is_correlated = product >= _PRIORS.correlation * np.sqrt(square * float(omega @ omega)) > 0.0
     if not is_correlated or 1.0 / _PRIORS.misfit <= ratio <= _PRIORS.misfit:

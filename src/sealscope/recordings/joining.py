@@ -71,7 +71,10 @@ def _parse_file_name(name: str) -> float | None:
 
 
 def _time_zero(recording: Recording) -> float | None:
-    """Find the time of t = 0 [s since 1970] in the entry `start_epoch_s` or else `start` of the provenance, or None."""
+    """Find the time of t = 0 [s since 1970] in the entry `start_epoch_s` or else `start` of the provenance, or None.
+
+    A `start_epoch_s` outside of March 1973 to the year 5138 (`counts_from_1970`) is ignored.
+    """
     epoch = recording.provenance.get("start_epoch_s")
     if isinstance(epoch, Real) and counts_from_1970(float(epoch)):
         return float(epoch)

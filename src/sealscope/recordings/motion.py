@@ -28,7 +28,7 @@ _QUANTUM_SAMPLES = 2**15
 
 
 def is_constant(values: Array) -> bool:
-    """Test whether all samples (n,) are equal; False if one is NaN."""
+    """Test whether all samples (n,), one or more, are equal; False if one is NaN or infinite."""
     return bool(np.ptp(values) == 0)
 
 
@@ -47,9 +47,9 @@ class Holds(NamedTuple):
 def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
 
-    A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; `rate`: sampling rate [Hz]. The
-    first sample of a hold is a reading and not flagged. `before`: value of a hold just before these samples, NaN if
-    there is none; a first run of this value continues the hold, and is flagged from its first sample on.
+    A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; a missing sample ends a run. The
+    first sample of a hold is a reading and not flagged. `rate`: sampling rate [Hz]; `before`: value of a hold just
+    before these samples, NaN if there is none. A first run of this value continues the hold: all of it is flagged.
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
@@ -60,8 +60,8 @@ def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
     flags = np.repeat(is_hold, lengths)
     first_samples = edges[:-1][is_hold]
     flags[first_samples[1:] if continues else first_samples] = False
-    # the last run may grow into a hold: the flags after its first sample, which stays a reading, may still change
-    pending = len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values))
+    # a last run that is no hold may grow into one: the flags after its first sample, which stays a reading, may change
+    pending = len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values))  # min: 0 without samples
     return Holds(flags, pending)
 
 
@@ -69,7 +69,8 @@ def describe_hold(recording: Recording) -> str | None:
     """Describe a chamber pressure that does not move, although its noise should move it; None if there is none.
 
     Such a pressure repeats one value for too long (`find_holds`), or follows a straight line throughout. A pressure
-    that is constant throughout, or has at most 64 samples, is skipped. No sample may be missing.
+    that is constant throughout (`quality.inspect` reports it), or has at most 64 samples, is skipped. No sample may be
+    missing.
     """
     for name in chambers_of(recording):
         values = recording[name]
@@ -92,14 +93,14 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
 
 
 def smallest_step(values: Array) -> float:
-    """Find the smallest step between sorted `values` (n,) that exceeds `ROUNDING` times their range; 0 if none does."""
+    """Find the smallest step of sorted `values` (n > 0,) that exceeds `ROUNDING` times their range; 0 if none does."""
     steps = np.diff(values)
     steps = steps[steps > ROUNDING * (values[-1] - values[0])]
     return float(steps.min()) if steps.size else 0.0
 
 
 def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of a channel (n,), thinned if it is long; 0 for a constant channel."""
+    """Estimate the quantisation step of finite values (n > 0,), thinned if they are many; 0 if all are equal."""
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 

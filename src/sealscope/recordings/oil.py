@@ -41,7 +41,7 @@ def _stated_oil_temperature(recording: Recording) -> float | None:
     limits = RECORDINGS.oil
     for label, text in sorted(recording.remarks.items(), key=lambda remark: not names_oil(remark[0])):
         name, unit_of_name = find_name_and_unit(Label.parse(label))
-        match = _TEMPERATURE.search(f"{text} {unit_of_name or ''}")
+        match = _TEMPERATURE.search(f"{text} {unit_of_name or ''}")  # the unit is in the text or in the name
         # a name without letters may be the hour of a clock
         if match is None or not any(map(str.isalpha, name)) or not is_oil_temperature(name):
             continue

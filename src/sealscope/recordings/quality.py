@@ -111,10 +111,10 @@ def _time_findings(recording: Recording) -> list[Finding]:
     add("duplicated_time", timed[equal_steps + 1], text)
     if positive_steps.size:
         median_step = float(np.median(positive_steps))
-        sampling_step = step
+        sampling_step = step  # from sample to sample; `step` below: from time stamp to time stamp
         if abs(median_step / step - 1.0) > _CLOCK.rate:
             # stamps of a coarse clock repeat, and their positive steps are about two sampling steps long
-            n_repeats = steps.size * (1.0 - step / median_step)  # if no sample is lost
+            n_repeats = steps.size * (1.0 - step / median_step)  # expected if no sample is lost; half is enough
             if not (step < median_step < 2.5 * step and equal_steps.size > 0.5 * n_repeats):
                 text = f"time stamps show {1.0 / median_step:.6g} Hz, the recording's rate is {recording.rate:g} Hz"
                 add("rate_mismatch", timed[:1], text, "fatal")
@@ -156,7 +156,7 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     means = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
     steps = np.diff(means)
     creep_rate = float(np.median(steps)) * _CREEP.parts / duration
-    # if the median is 0, the ratios are not finite, and the steps not even
+    # if the median is 0, or a part has no values, the ratios are not finite, and the steps not even
     is_even = np.all((steps / np.median(steps) > _CREEP.even[0]) & (steps / np.median(steps) < _CREEP.even[1]))
     if not (is_even and abs(creep_rate) >= _CREEP.rate):
         return []
@@ -283,9 +283,9 @@ def uniform_segments(recording: Recording, channels: Sequence[str] | None = None
         steps = np.diff(recording.t) * recording.rate
         is_even = (steps > _MIN_STEP) & (steps < _MAX_STEP)
     continues = is_complete[1:] & is_complete[:-1] & is_even
-    # the slices [:n] and [-n:] drop the added True if there are no samples
+    # without samples, n = 0, [:n] drops the added True; there are then no stops, as there are no starts
     starts = np.flatnonzero(is_complete & np.r_[True, ~continues][:n])
-    stops = np.flatnonzero(is_complete & np.r_[~continues, True][-n:]) + 1 if n else starts
+    stops = np.flatnonzero(is_complete & np.r_[~continues, True]) + 1 if n else starts
     return [slice(int(a), int(b)) for a, b in zip(starts, stops, strict=True)]
 
 
@@ -309,10 +309,9 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
 
     With `low_end` False only the high end is examined. An end is clipped in two cases:
 
-    - Far more samples have this value than any of the five nearest values, and the signal enters or leaves the longest
-      run of samples with this value (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a run of 20
-      or more. This excludes a square wave, and the crest of a slow quantised signal, whose nearest values are nearly
-      as frequent.
+    - Five samples or more have this value, over five times as many as any of the five nearest values, and the signal
+      enters or leaves the longest run of them (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a
+      run of 20 or more. This excludes crests of a slow quantised signal, whose nearest values are nearly as frequent.
     - One of the runs `stuck` (k, 2), first index and length of each as from `find_stuck`, has this value.
 
     A channel with fewer than three different values, such as a square wave, has no clipped end.
@@ -322,7 +321,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     stuck_values = np.empty(0) if stuck is None else values[stuck[:, 0]]
     ends = values.min(), values.max()
     max_count = max(np.count_nonzero(values == end) for end in ends)
-    if max_count < _RAIL.samples and not np.isin(stuck_values, ends).any():
+    if max_count < _RAIL.samples and not np.isin(stuck_values, ends).any():  # neither case: no need to sort
         return []
     distinct, counts = np.unique(values, return_counts=True)
     if distinct.size < 3:
@@ -335,6 +334,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
             continue
         runs = find_runs(values == distinct[index])
         first, length = runs[np.argmax(runs[:, 1])]  # the longest
+        # a run that begins or ends the channel has no jump there: its own value is taken
         before, after = values[max(first - 1, 0)], values[min(first + length, values.size - 1)]
         jump = max(abs(before - distinct[index]), abs(after - distinct[index]))
         is_crowded = counts[index] >= _RAIL.samples and counts[index] > _RAIL.crowd * counts[nearest].max()
@@ -351,7 +351,8 @@ def fast_length(count: int) -> int:
     The result equals `scipy.fft.next_fast_len(count, real=True)`, but scipy.fft is not loaded.
     """
     odd_factors = (3**i * 5**j for i in range(40) for j in range(28) if 3**i * 5**j < 2 * count)
-    # each odd factor times the smallest power of two that makes the product >= count; 3**40 and 5**28 exceed any count
+    # each odd factor times the smallest power of two that makes the product >= count; 3**40 and 5**28 exceed any count.
+    # `default`: for 0, for which there is no factor
     return min((factor << max(0, (-(-count // factor) - 1).bit_length()) for factor in odd_factors), default=count)
 
 

@@ -159,7 +159,7 @@ class Recording:
         return f"Recording({channels}; {self._format_extent()})"
 
     def _repr_html_(self) -> str:
-        """Render minimum, mean, maximum and missing samples of each channel as a table for notebooks."""
+        """Render a table for notebooks: minimum, mean, maximum of each channel's finite samples, number of others."""
         rows = []
         for name, values in self.channels.items():
             finite = values[np.isfinite(values)]

@@ -85,7 +85,7 @@ class _Process:
             value, remote_traceback = pickle.load(process.stdout)
             is_spent = bool(pickle.load(process.stdout))
         except (EOFError, OSError, pickle.UnpicklingError):
-            # a process that a signal has ended returns minus the number of the signal
+            # the timer has fired; or the alarm's signal, whose negative number is returned, has ended the process
             timed_out = not killer.is_alive() or process.wait() == -getattr(signal, "SIGALRM", 0)
             failure = f"took more than {limit:g} s" if timed_out else "crashed"
             raise CrashedSubprocessError(f"the library that reads it {failure}") from None
@@ -195,7 +195,7 @@ def _serve() -> None:
             value, error_traceback = _run_work(work, arguments)
             _set_limits(seconds=0.0, memory=MAX_MEMORY, disk=MAX_UNPACKED)  # until the next request
             responses.write(pickle.dumps((value, error_traceback), protocol=5))
-            del work, arguments, value
+            del work, arguments, value  # so that `_is_spent` does not count them
             pickle.dump(_is_spent(), responses)
             responses.flush()
     with suppress(OSError):  # nobody else removes the temporary folder if the program was killed

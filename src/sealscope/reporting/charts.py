@@ -94,7 +94,8 @@ class Chart(NamedTuple):
 def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
     """Convert a channel of a recording to its display unit; return the unit and the values (n,).
 
-    Pressures are shown in `pressure_unit`, other channels in the unit of the log or, if it has none, as `display_unit`.
+    Pressures are shown in `pressure_unit`, other channels in the unit of the log or, if it has none, temperatures in
+    degC and the others as `display_unit`.
     """
     si_unit = recording.units[name]
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
@@ -123,6 +124,7 @@ def detail_unit(unit: str, name: str, pressure_unit: str) -> tuple[str, float]:
 
     For the product d3d4, both are squared.
     """
+    # an unknown `pressure_unit` is passed on, since `display_unit` refuses it
     display, scale = display_unit(unit, _DETAIL_UNITS.get(pressure_unit, pressure_unit))
     return (f"{display}²", scale**2) if name == PRODUCT else (display, scale)
 
@@ -331,7 +333,7 @@ def _render_still(
         low, high = low - pad, high + pad  # the axis needs a length
     margin = 0.04 * (high - low)
     low, high = chart.limits or (low - margin, high + margin)
-    lines = [np.clip(line, low, high) for line in lines]
+    lines = [np.clip(line, low, high) for line in lines]  # values beyond the limits are drawn at the frame
     ends = (span[0], span[1] if span[1] > span[0] else span[0] + 1)  # [s], 1 s if the axis has no length
     # the margin below has room for the labels of the time axis
     picture = Picture(860.0, float(chart.height), ends, (low, high), margins=(0.0, 0.0, 0.0, 20.0))

@@ -141,8 +141,9 @@ def _why_no_flow(diagnosis: Diagnosis) -> str:
         return say(f"how_much.{'too_small' if is_too_small else 'channels'}")
     if raw_counts(diagnosis):
         return say("how_much.counts")
-    if diagnosis.machine is None or diagnosis.machine.stated:
+    if diagnosis.machine is None or diagnosis.machine.stated:  # withheld for another reason than unknown sizes
         return say("how_much.reason")
+    # with a measured ratio of displacement to area, the area alone is enough
     return say(f"how_much.{'machine' if diagnosis.measured_ratio is None else 'machine_or_area'}")
 
 
@@ -165,7 +166,7 @@ def machine_text(machine: AssumedMachine | None) -> str | None:
 
 
 def how_bad(diagnosis: Diagnosis) -> str | None:
-    """Format the severity of the leak as a percentage of the repair limit, or as a multiple from 10 times the limit on.
+    """Format the severity of the leak: its ratio to the repair limit in percent, or as a multiple if it may reach 10.
 
     If this ratio is not known, the text asks for the piston area if a limit was stated, else it is the fraction of the
     pump's flow, unless `how_much` states it. None if there is no leak or its size is not known.
@@ -189,7 +190,7 @@ def _format_range(low: float, high: float) -> str:
 
 
 def other_sizes(diagnosis: Diagnosis) -> str | None:
-    """Format the known ones among leak in mL/min, fraction of the pump's flow, and equal creep speed; None for none."""
+    """Format the leak in mL/min, as a fraction of the pump's flow and as a creep speed, if known; None if none is."""
     severity = diagnosis.severity
     if severity is None:
         return None
@@ -228,7 +229,10 @@ def total_leakage(diagnosis: Diagnosis, *, basis: bool = True) -> str | None:
 
 
 def _leakage_fraction(leakage: TotalLeakage, pressure: str) -> str:
-    """Format a total leakage as a fraction of the pump's flow, with its smallest detectable step; `pressure`: text."""
+    """Format a total leakage as a fraction of the pump's flow, or "not measured", with its smallest detectable step.
+
+    `pressure`: text of the pressure at which it was measured.
+    """
     is_known = leakage.pump_share is not None
     key = "share" if is_known else "not_measured"
     text = say(f"leakage.{key}", share=_format_percent(leakage.pump_share), pressure=pressure)
@@ -299,13 +303,14 @@ def false_alarms(diagnosis: Diagnosis) -> str:
 
 
 def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
-    """List the recommended next steps as sentences, most useful first; one of them names faults of the data."""
+    """List the recommended next steps as sentences, most useful first; one names faults of the data, if any."""
     severity_level = None if diagnosis.severity is None else diagnosis.severity.level
     deciding_detector = diagnosis.methods[0].detector if diagnosis.methods else ""  # the deciding method is first
     # an unknown level is treated as the middle one, `plan`
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
     if diagnosis.verdict == "leak":
+        # `next_check` tests a named cause by the piston's creep, else it repeats the recording: the other comes second
         steps = [diagnosis.next_check, say("next.repeat" if has_named_cause else "next.creep"), step_once_confirmed]
     elif has_named_cause:
         steps = [diagnosis.next_check, say("next.resolved")]
@@ -433,7 +438,8 @@ _FILE_COLUMNS = 22
 def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     """Format a diagnosis as a line of a table with file, date, verdict and leak flow [L/min], then what to do.
 
-    `start_s` [s since 1970]: start of the recording, None for a blank date.
+    For a plain `no leak`, there is nothing to do. `start_s` [s since 1970]: start of the recording, None for a blank
+    date.
     """
     file = PurePath(diagnosis.file).name
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()

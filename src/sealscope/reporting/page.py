@@ -98,7 +98,10 @@ def report(
 
 
 def _choose_rig(diagnosis: Diagnosis, rig: Rig | str | os.PathLike[str] | None) -> Rig | None:
-    """Choose the rig whose values the page shows: `rig`, else that of the diagnosis; None if it is only assumed."""
+    """Choose the rig whose values the page shows: `rig`, else the packaged rig that the diagnosis names.
+
+    The result is None if the rig is only assumed, or if the diagnosis names no packaged one.
+    """
     if rig is not None:
         loaded_rig = load_rig(rig)
         return loaded_rig if states_rig(loaded_rig) else None

@@ -106,7 +106,7 @@ class Picture:
             self.draw(style, self._path(*outline) + "z")
 
     def box(self, style: str, begin: float, end: float, low: float | None = None, high: float | None = None) -> None:
-        """Draw a box from `begin` to `end` on the x axis and from `low` to `high` on the y axis, None for its end."""
+        """Draw a box from `begin` to `end` on the x axis and `low` to `high` on the y axis, None for the axis's end."""
         left, top = float(self.x(begin)), 0.0 if high is None else float(self.y(high))
         bottom = self.height if low is None else float(self.y(low))
         right, bottom = max(float(self.x(end)), left + _MIN_BOX), max(bottom, top + _MIN_BOX)
@@ -143,7 +143,7 @@ class Picture:
 
 
 def ticks(low: float, high: float, count: int) -> list[float]:
-    """List about `count` round values from `low` to `high`, multiples of 1, 2 or 5 times a power of ten."""
+    """List about `count` round values from `low` to `high` > `low`, multiples of 1, 2 or 5 times a power of ten."""
     min_step = (high - low) / count
     power = 10.0 ** np.floor(np.log10(min_step))
     # 0.999 and 1e-9: rounding errors must not change the step or leave out an end

@@ -73,7 +73,7 @@ def build_circuit(rig: Rig | None, recorded: Container[str], machine: AssumedMac
 def _cylinder_parts(areas: tuple[float, float]) -> tuple[str, str, float]:
     """Determine the type of a cylinder, its sides with a rod ("A", "B" or "AB"), and the drawn height of the rod.
 
-    A single rod over the bore is the ratio of the diameters, sqrt(1 - smaller/larger area).
+    The height of a single rod over that of the bore is the ratio of their diameters, sqrt(1 - smaller/larger area).
     """
     ratio = min(areas) / max(areas)
     if ratio >= _MIN_DOUBLE_ROD_RATIO:

@@ -37,7 +37,8 @@ class DrawnTimes:
     def reduce(self, values: Array) -> Array:
         """Reduce the values (n,) of a channel to the points (m,) that are drawn at the times `t`.
 
-        Each bucket gives its minimum and maximum, the minimum first if its last value is not below its first.
+        Each bucket gives minimum and maximum of its finite values, NaN without any. The minimum comes first if the
+        bucket's first and last value are finite and the last is not below the first.
         """
         values = np.where(np.isfinite(values), values, np.nan)
         low = np.fmin.reduceat(values, self.starts)
@@ -55,7 +56,7 @@ def _interleave(first: Array, second: Array, sizes: NDArray[np.int64]) -> Array:
 
 
 def ordered_time(t: Array, rate: float) -> tuple[Array, bool]:
-    """Return the time stamps `t` [s] and False, or sample number / `rate` and True if `t` does not increase."""
+    """Return the time stamps `t` [s] and False, or sample number / `rate` and True if not all are finite and rising."""
     by_sample = not (np.all(np.isfinite(t)) and np.all(np.diff(t) > 0))
     return (np.arange(t.size) / rate, True) if by_sample else (t, False)
 
@@ -65,10 +66,11 @@ def choose_drawn_times(
 ) -> DrawnTimes:
     """Choose the times at which a chart draws a recording: about `points`, and all samples around the time `near`.
 
-    Minimum and maximum of a bucket (`DrawnTimes`) are drawn at the times of its first and last sample. Full buckets
-    have equal numbers of samples, so a drawn peak is at most one bucket away from its true time. At the longest gaps in
-    time, at most `points` / 20, a new bucket starts, and a point interrupts the line. `near` [s]: time around which
-    `near_samples` samples are all drawn, each in a bucket of its own; None for the start of the recording.
+    Minimum and maximum of a bucket (`DrawnTimes`) are drawn at the times of its first and last sample, so a drawn peak
+    is at most one bucket away from its true time. At the longest gaps in time, at most `points` / 20, a new bucket
+    starts, and a NaN interrupts the line. `t` (n,) [s]: times of at least one sample; `points` >= 20; `near` [s]: time
+    around which `near_samples` samples, by default none, are all drawn, each in a bucket of its own; None for the start
+    of the recording.
     """
     n = t.size
     t, by_sample = ordered_time(t, rate)
@@ -78,7 +80,7 @@ def choose_drawn_times(
     steps = np.diff(t)
     gaps = np.flatnonzero(steps > _GAP_RATIO / rate) + 1  # indices of the samples after the gaps
     max_gaps = points // 20
-    if gaps.size > max_gaps:
+    if gaps.size > max_gaps:  # keep the longest; the time step before sample k is `steps[k - 1]`
         gaps = np.sort(gaps[np.argsort(steps[gaps - 1])[-max_gaps:]])
     # each sample of `fine` has a bucket to itself; the sample after them starts the next bucket
     single_samples = np.arange(fine.start, min(fine.stop + 1, n))
@@ -86,6 +88,7 @@ def choose_drawn_times(
     stops = np.append(starts[1:], n)
     sizes = stops - starts
     first_points = np.append(0, np.cumsum(np.where(sizes > 1, 2, 1)))  # index of each bucket's first point
+    # a bucket starts at each of `gaps`; `breaks` are indices of points before the insertion
     breaks = first_points[np.searchsorted(starts, gaps)]
     # the point that interrupts the line has the time of the last sample before the gap
     times = np.insert(_interleave(t[starts], t[stops - 1], sizes), breaks, t[gaps - 1])

@@ -250,8 +250,8 @@ def is_absolute_drift(parameter: str) -> bool:
 class ParameterDrift:
     """A parameter that drifts: value(t) = value (1 + shape(t)), or value + shape(t) in its SI unit if `absolute`.
 
-    `parameter`: bare or dotted name of a parameter of the machine, of noise, hum, offset, gain or scale error of a
-    sensor, or `friction`, for all friction forces together; value: its value in the rig. `absolute` must be
+    `parameter`: bare or dotted name of a parameter of the machine; of a sensor's noise, hum, offset, gain error or
+    scale error; or `friction`, for all friction forces together; value: its value in the rig. `absolute` must be
     `is_absolute_drift(parameter)`. Raises InputError for a parameter that cannot drift, such as `cylinder.L`.
     """
 

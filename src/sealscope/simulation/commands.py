@@ -21,7 +21,7 @@ def format_number(value: float) -> str:
 
 
 class Command(Protocol):
-    """A command to the servo drive: a voltage over time. Its `str` is the text that `parse_command` reads."""
+    """A command to the servo drive: a voltage over time. Its `str` is the text for `parse_command`, if there is one."""
 
     def volts(self, t: Array) -> Array:
         """Compute the voltage u [V] at times t >= 0 [s], for an array t of any shape."""
@@ -90,7 +90,7 @@ class Trapezoid:
             )
 
     def volts(self, t: Array) -> Array:
-        """Compute the voltage u [V] of the trapezoid at times t [s]."""
+        """Compute the voltage u [V] of the trapezoid at times t [s]; 0 before t = 0."""
         time_in_period = np.mod(np.maximum(t, 0.0), self.period)
         rise, fall = time_in_period / self.rise, (time_in_period - 0.5 * self.period) / self.rise  # completed fractions
         return np.asarray(self.level * (np.clip(rise, 0.0, 1.0) - np.clip(fall, 0.0, 1.0)))

@@ -42,7 +42,10 @@ _Kind = TypeVar("_Kind", Leak, Fault)
 
 
 def choose_method(rig: Rig, method: Method) -> Literal["rk4", "imex"]:
-    """Choose the integration method of a rig: `method` as stated, or for `auto` imex with throttles, rk4 without."""
+    """Choose the integration method of a rig: `method` as stated, or for `auto` imex with throttles, rk4 without.
+
+    Raises InputError for a method that does not suit the rig: imex without throttles or with the integrator `euler`.
+    """
     if method not in ("auto", "rk4", "imex"):
         raise InputError(f"method must be auto, rk4 or imex, got {method!r}")
     is_throttled = rig.line.orifices == "present"
@@ -95,7 +98,7 @@ def check_circuit(rig: Rig) -> None:
 
 @dataclass(frozen=True, repr=False)
 class Experiment:
-    """All inputs of a simulated run; equal experiments give recordings that are equal byte for byte.
+    """All inputs of a simulated run; equal experiments give, on one processor, recordings that are equal byte for byte.
 
     `Experiment.of` makes one from texts with units. The sampling rate is the rig's `daq.sample_rate`.
 
@@ -150,7 +153,7 @@ class Experiment:
         if not abs(self.x_0) <= half_stroke:
             raise InputError(f"x_0 must be within the stroke, -{half_stroke:g} m to {half_stroke:g} m, got {self.x_0}")
         step = LONGEST_STEP if self.step is None else self.step
-        if step > 0 and self.duration / step > MAX_STEPS:
+        if step > 0 and self.duration / step > MAX_STEPS:  # `integrate_run` refuses other steps
             origin = f"at least, of {step:g} s" if self.step is None else f"step = {step:g} s"
             raise InputError(
                 f"a run must have at most {MAX_STEPS} steps of the solver, got {self.duration / step:.4g} ({origin})"
@@ -306,7 +309,7 @@ class Experiment:
         return np.arange(round(self.duration * self.rate)) / self.rate
 
     def onset(self) -> float | None:
-        """Compute the time [s] at which the first leak opens; None if no leak of a size > 0 opens within the run."""
+        """Compute the time >= 0 [s] at which the first leak opens; None if no leak of size > 0 opens within the run."""
         sized_leaks = [leak for leak in self.leaks if (leak.mean or leak.coefficient or 0.0) > 0]
         onsets = [onset for leak in sized_leaks if (onset := leak.opening.onset()) < self.duration]
         return max(0.0, min(onsets)) if onsets else None

@@ -116,6 +116,7 @@ class FaultRow:
         any other size 0.
         """
         if size := groups.get("size"):
+            # "Pa" is a stand-in for an unknown channel, which `Fault` refuses
             unit = CHANNEL_UNITS.get(groups["at"] or "", "Pa") if self.is_sensor_fault else self.unit
             return parse_quantity(size, unit, name=self.what)
         if percent := groups.get("percent"):

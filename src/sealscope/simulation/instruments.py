@@ -117,10 +117,10 @@ def read_pressure(
 ) -> Array:
     """Compute the readings [Pa] of one pressure channel from the filtered `pressure` [Pa] at `rate` [Hz].
 
-    The errors are, in turn: gain; offset, drift, mains hum, noise of the channel and of all channels (`common_noise`
-    [Pa]); saturation and conversion to digits (`digitize`); stuck samples, which repeat a reading; lost samples, NaN.
-    `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig, because faults
-    and drifts may change it within the run.
+    The errors are, in turn: gain; offset, drift (a random walk), mains hum, noise of the channel and of all channels
+    (`common_noise` [Pa]); saturation and conversion to digits (`digitize`); stuck samples, which repeat a reading; lost
+    samples, NaN. `parameter(symbol, value)` computes a parameter of the sensor over time from its `value` in the rig,
+    because faults and drifts may change it within the run.
     """
     n = pressure.size
     t = np.arange(n) / rate
@@ -195,7 +195,7 @@ def record(experiment: Experiment, trajectory: Any, u: Array, factor: int) -> Re
     common_noise = common_noise_sd * random["common"].standard_normal(n)
     channels: dict[str, Array] = {
         "u": u,
-        "omega": np.diff(theta, prepend=theta[:1]) * rate,
+        "omega": np.diff(theta, prepend=theta[:1]) * rate,  # 0 at the first sample, which has no earlier angle
         "theta": theta,
         "x": quantize(x, sensors.x.resolution),
     }
@@ -214,5 +214,5 @@ def record(experiment: Experiment, trajectory: Any, u: Array, factor: int) -> Re
     for fault in experiment.faults:
         if (span := fault.stuck_span()) is not None:
             stuck = np.flatnonzero((t >= span[0]) & (t < span[1]))
-            channels[fault.at][stuck] = channels[fault.at][stuck[:1]]
+            channels[fault.at][stuck] = channels[fault.at][stuck[:1]]  # [:1]: the first reading, none in an empty span
     return Recording(t, channels, CHANNEL_UNITS, rate)

@@ -265,6 +265,7 @@ def integrate_run(
                     excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break  # a shorter step is tried at once
+        # the check is passed, or no other step is to be tried
         if excess <= 1.0 or n_steps >= max_steps or (step is not None and experiment.allow_unresolved):
             volts = None if run.feedback is None else run.feedback.volts(n_out)
             compensated = None if run.feedback is None else run.feedback.compensated_flow(n_out)
@@ -355,7 +356,7 @@ class _Integration:
         """
         from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
 
-        y = rows[first, : len(STATES)].copy()  # the first outputs are the state
+        y = rows[first, : len(STATES)].copy()  # the state, except pressures below that of vapour (`observe`)
         fine = np.empty((end - first, len(OUTPUTS)))
         self.advance(y, first, end, 2 * n_steps, fine, origin=first)
         pressures = slice(P_A, P_2 + 1)
@@ -417,8 +418,8 @@ def refuse_unresolved(p: RigNumbers, h: float, method: str) -> None:
 def comparison_windows(n_out: int, rate: float) -> list[tuple[int, int]]:
     """Choose the time windows in which the solver's step is checked, as pairs (start, stop) of output indices.
 
-    They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless this would overlap the window before
-    or exceed the run. The run has `n_out` outputs at `rate` [Hz].
+    They are the first 2 s, and 1 s from 50 % and from 90 % of the run on, unless such a window would overlap the one
+    before, exceed the run or contain no output. The run has `n_out` outputs at `rate` [Hz].
     """
     windows = [(0, min(n_out, round(FIRST_WINDOW * rate)))]
     length = round(LATER_WINDOW * rate)
@@ -465,6 +466,7 @@ class StepErrorCheck:
             return pressure_error / self._tolerance
         recorded_rms = np.sqrt(self._squares / self._samples + self._noise_variances)
         coarse_rms, fine_rms = recorded_rms[:, ::2], recorded_rms[:, 1::2]  # both alternate in the columns
+        # 1.0: where the finer run has neither a detail nor noise, the other's RMS itself is the error
         detail_error = float(np.max(np.abs(coarse_rms - fine_rms) / np.where(fine_rms > 0, fine_rms, 1.0)))
         self.detail_error = max(self.detail_error, detail_error)
         return max(pressure_error / self._tolerance, detail_error / DETAIL_TOLERANCE)

@@ -124,8 +124,8 @@ class Leak:
 def parse_opening(groups: Groups) -> Polyline:
     """Build the opening of a leak or fault from the times in its text, the named groups of a pattern such as `WHEN`.
 
-    It grows from `start` to `stop`. Otherwise it begins at `since`, by default at 0 s, ends at `until`, by default
-    never, and takes `ramp` to open, by default no time.
+    It grows from `start` to `stop` if they are stated. Otherwise it begins at `since`, by default at 0 s, ends at
+    `until`, by default never, and takes `ramp` to open and to shut, by default no time.
     """
     if groups.get("start") is not None:
         return growing_opening(parse_seconds(groups["start"]), parse_seconds(groups["stop"]))

@@ -240,6 +240,8 @@ def powers(outputs: Mapping[str, Array], rig: Rig) -> dict[str, Array]:
 def compare_trajectories(experiment: Experiment, coarse: Trajectory, fine: Trajectory) -> tuple[Difference, ...]:
     """Compare two runs of an experiment, `coarse` at a solver step and `fine` at a shorter one.
 
+    Both must have `oversampling` outputs per sample, as by `integrate_run` without a `rate`.
+
     Returns the differences, within the duration of the recording, of
 
     - speed, angle, position and velocity, by their rms difference, without a tolerance;

@@ -54,8 +54,8 @@ def next_coefficient(mean: float, previous: tuple[float, float], latest: tuple[f
     for no run. If the `latest` coefficient is 0, its flow is the one that a coefficient of 1 would give in that run.
 
     The next coefficient is on the straight line through both runs on logarithmic scales. The line's slope is limited to
-    0.1 .. 1, because a leak's flow grows with its coefficient, at most in proportion, and 1 if the previous run was
-    without a leak.
+    0.1 .. 1, because a leak's flow grows with its coefficient, at most in proportion. It is 1 if the previous run had
+    no leak or nearly the same coefficient.
     """
     c_0, q_0 = previous
     c_1, q_1 = latest

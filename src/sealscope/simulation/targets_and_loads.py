@@ -83,7 +83,10 @@ class Force:
 
 
 def loaded_rig_numbers(rig: Rig, load: Force | None) -> RigNumbers:
-    """Build the parameters of the compiled model for a rig with an additional `load` (`pushed`), if any."""
+    """Build the parameters of the compiled model for a rig with an additional `load`, if any.
+
+    Their `pushed` has the tables of the load, or one element, True, if the load is over time only (`rates`).
+    """
     from sealscope.physics.rig import rig_numbers
 
     numbers = rig_numbers(rig)
@@ -160,7 +163,7 @@ def command_or_target(text: str) -> Command | Position:
 def _read_force(path: str, words: str) -> Force:
     """Read a load from a CSV file with the column ``F [N]`` and one of ``t [s]``, ``x [m]``, ``v [m/s]``, in any unit.
 
-    The load is linear between the rows and constant beyond them. Beside a column of times, which begin at the first,
+    The load is linear between the rows and constant beyond them. Times are moved so that the first is 0; beside them,
     columns of x and v are ignored. `words`: text of the load. Raises InputError for any other table.
     """
     with open_regular(path, "a recorded load") as file:
@@ -217,7 +220,8 @@ def parse_force(text: str) -> Force:
     over_x, signal = _extract_terms(normalized, "x")
     over_v, signal = _extract_terms(signal, "v")
     if over_x or over_v:
-        signal = re.sub(r"^\+(?=.)", "", signal.strip())  # the plus that joined the signal to a term before it
+        # remove the plus that joined the signal to a term before it; a lone plus stays, and is refused
+        signal = re.sub(r"^\+(?=.)", "", signal.strip())
         if not signal:
             return Force(_NO_FORCE, normalized, over_x, over_v)
     return Force(_parse_signal(signal, _FORCES, "load"), normalized, over_x, over_v)

@@ -83,6 +83,7 @@ def _file_mode(target: Path) -> int:
 
 
 def _sync(path: Path, flags: int) -> None:
+    """Write a file or folder, opened with the `flags` of `os.open`, from the system's buffers to the disk."""
     descriptor = os.open(path, flags)
     try:
         os.fsync(descriptor)

@@ -48,7 +48,7 @@ def restore_array(value: Any, name: str) -> NDArray[np.float64]:
     """
     try:
         shape = tuple(int(size) for size in value["shape"])
-        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:
+        if min(shape, default=0) < 0 or np.prod(shape, dtype=float) > _MAX_SIZE:  # float: no overflow
             raise ValueError(f"got shape {shape}")
         data = b64decode(value["f8"], validate=True)
         return np.frombuffer(data, dtype="<f8").reshape(shape).astype(np.float64)
@@ -97,6 +97,7 @@ def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
 
 
 def _save_value(value: Any) -> Any:
+    """Convert the value of an attribute by the rules of `save_attributes`."""
     if callable(getattr(value, "state", None)):
         return value.state()
     if isinstance(value, np.ndarray):
@@ -114,7 +115,8 @@ def restore_attributes(
     - A saved array must have the shape of the present one, except where the present one has an axis of length 0. If
       `owner` is a named tuple, its arrays are filled in place. The rule on shapes holds for each array of a list.
     - An attribute with a method `load_state` restores itself.
-    - A saved None leaves an attribute unchanged if its present value is a float or None: `to_plain` saves NaN as None.
+    - A saved None leaves an attribute unchanged if its present value is a float or None: `to_plain` saves NaN and
+      infinite numbers as None.
     - Any other value must have the type that `kinds` states, by default the type of the present value.
 
     Raises InputError if an attribute is missing in `state` or breaks one of these rules.

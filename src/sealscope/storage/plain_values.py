@@ -27,6 +27,7 @@ def parse_json(text: str | bytes) -> Any:
 
 
 def _parse_finite(text: str) -> float:
+    """Parse a number, or a constant of JSON such as NaN; raise ValueError unless it is finite."""
     number = float(text)
     if not math.isfinite(number):
         raise ValueError(f"a number must be finite, got {text[:40]}")
@@ -34,6 +35,7 @@ def _parse_finite(text: str) -> float:
 
 
 def _parse_whole(text: str) -> int:
+    """Parse a whole number; raise ValueError if its size exceeds 2^53."""
     if len(text) > len(f"-{MAX_WHOLE}") or abs(int(text)) > MAX_WHOLE:  # `int` takes long for long texts
         raise ValueError(f"a whole number must be at most 2^53, got {text[:40]}")
     return int(text)
@@ -41,6 +43,7 @@ def _parse_whole(text: str) -> int:
 
 @cache
 def _type_adapter(kind: Any) -> Any:
+    """Build pydantic's validator of a type, once for each type, as building is slow."""
     from pydantic import TypeAdapter
 
     return TypeAdapter(kind)

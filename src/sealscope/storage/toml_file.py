@@ -140,7 +140,7 @@ def _parse_value(value: Any, kind: Any, place: str) -> Any:
 
 
 def _check_keys(keys: Collection[str], names: Collection[str], optional: Collection[str], place: str) -> None:
-    """Check that the `keys` of a table are `names`, of which those in `optional` may be missing."""
+    """Check that the `keys` of a table are `names`, of which `optional` may be missing; raise InputError otherwise."""
     for name in keys:
         if name not in names:
             raise InputError(f"{place} must be {', '.join(names)}, got {name!r}")

@@ -60,7 +60,10 @@ def judge_recordings(plan: RecordedPlan, folder: Path, progress: ProgressCallbac
 
 
 def _stroke_direction(recording: Recording) -> str:
-    """Classify a recording as strokes "out" (p_A higher on average) or "in" (p_B higher), or else as "both"."""
+    """Classify a recording as strokes "out" (p_A well above p_B on average) or "in" (well below), else as "both".
+
+    It is "both", too, if a chamber's pressure was not recorded.
+    """
     if not all(name in recording for name in CHAMBERS):
         return "both"
     dp = recording["p_A"] - recording["p_B"]

@@ -53,10 +53,10 @@ class Statement:
 
     @classmethod
     def from_evidence(cls, evidence: Evidence) -> Statement:
-        """Copy the stored fields from a detector's evidence; numbers that are not finite become None."""
+        """Copy the stored fields of a detector's evidence; a number or an interval that is not finite becomes None."""
         values = {field.name: getattr(evidence, field.name) for field in fields(cls)}
         for name, value in values.items():
-            numbers = value if isinstance(value, tuple) else (value,)
+            numbers = value if isinstance(value, tuple) else (value,)  # both ends of an interval must be finite
             if any(isinstance(number, float) and not math.isfinite(number) for number in numbers):
                 values[name] = None
         return cls(**values)
@@ -66,7 +66,7 @@ class Statement:
         """Cause that the detector names: a leak of `LEAKS`, another fault, "none" or "cannot tell".
 
         With the verdict `leak` it is `cause` if that is in `LEAKS`, otherwise "piston leak". With any other verdict it
-        is the fault that `cause` names, such as an external leak; without a fault it is "cannot tell" for that verdict,
+        is `cause` if that is not in `LEAKS`, such as an external leak; otherwise it is "cannot tell" for that verdict,
         and "none" for `no leak`.
         """
         if self.verdict == "leak":
@@ -77,7 +77,7 @@ class Statement:
 
     @property
     def ranking_score(self) -> float | None:
-        """The score, by which records are ranked (ROC); None if `named_cause` is no leak, such as a sensor fault."""
+        """The score, by which records are ranked (ROC); None if `named_cause` is another fault or "cannot tell"."""
         return self.score if self.named_cause in (*LEAKS, NO_CAUSE) else None
 
 

@@ -99,8 +99,8 @@ def score_details(log_rms: LogRms, plan: SimulatedPlan | RecordedPlan) -> dict[s
 def _score_over_threshold(statement: Statement) -> float | None:
     """Compute the score of `diagnose` relative to its threshold: their ratio, or difference for a threshold <= 0.
 
-    This makes records comparable, although the verdict of each may come from another detector with another scale.
-    Returns None if there is no threshold or no score for ranking.
+    For such a threshold, a ratio would not rise with the score. Records become comparable, although the verdict of each
+    may come from another detector with another scale. Returns None if there is no threshold or no score for ranking.
     """
     score, threshold = statement.ranking_score, statement.threshold
     if score is None or threshold is None:

@@ -86,7 +86,7 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
         if experiment.rate != rate:
             raise refusal(f"one sampling rate, {rate:g} Hz, got {experiment.rate:g} Hz by a factor")
         try:
-            refuse_unbatchable(experiment, row=0)
+            refuse_unbatchable(experiment, row=0)  # `row`: number of the run in the message
         except InputError as error:
             raise refusal(f"runs that can be simulated side by side, got: {error}") from None
 
@@ -94,8 +94,8 @@ def check_plan(plan: SimulatedPlan, cases: Sequence[CampaignCase]) -> None:
 def iter_batch_rows(plan: SimulatedPlan, cases: Sequence[CampaignCase], threads: int) -> Generator[CaseRow, None, None]:
     """Simulate the cases of a plan batch by batch, and yield a row with the scores, or the error, for each case.
 
-    A row does not depend on the other cases, except as `simulate_batch` states of leakage coefficients that converge
-    badly.
+    A row depends on other cases of its batch only where the common search for leakage coefficients converges badly
+    (`simulate_batch`). In each batch, the cases whose experiment cannot be built come first.
     """
     choose_step = make_step_chooser(plan)
     for start in range(0, len(cases), BATCH_SIZE):
@@ -140,8 +140,8 @@ def _run_batch(plan: SimulatedPlan, pairs: Sequence[tuple[CampaignCase, Experime
 def _size_leaks(experiments: Sequence[Experiment], threads: int) -> list[Experiment]:
     """Find the leak coefficients that give the planned mean flows, in short runs; return the completed experiments.
 
-    A solver's step that is unstable with the leak is shortened. If the short runs fail, the error is raised; only a
-    single experiment is tried again, with a step that `integrate_run` chooses.
+    Each has at most one leak (`check_plan`). A solver's step that is unstable with the leak is shortened. If the short
+    runs fail, the error is raised; only a single experiment is tried again, with a step that `integrate_run` chooses.
     """
     sized_experiments = list(experiments)
     leaky = [k for k, experiment in enumerate(experiments) if experiment.leaks]

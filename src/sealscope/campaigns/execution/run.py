@@ -38,7 +38,7 @@ def run(
     - `cluster`: address of a Dask scheduler to use instead
     - `retry`: True to run failed cases again
     - `progress`: called with the numbers of cases done, of all cases, and of failed ones
-    - `batch`: True to simulate cases side by side, with `jobs` threads, instead
+    - `batch`: True to simulate cases side by side with `jobs` threads, not one by one in processes
     - `trust`: True to run controllers that the plan names by file or module, whose code may be hostile
 
     Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,

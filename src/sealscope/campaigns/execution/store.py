@@ -59,7 +59,8 @@ class CampaignProgress:
 def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
     """Collect the inputs on which all rows (results) of a campaign depend, as plain JSON values.
 
-    `mode`: how the records are simulated, `RUN_BY_RUN` or `batches.IN_BATCHES`.
+    Title and version of Sealscope are added for readers only. `mode`: how the records are simulated, `RUN_BY_RUN` or
+    `batches.IN_BATCHES`.
     """
     detectors = [parse_detector_name(name) for name in plan.detectors]
     # scores of scorers depend neither on the false-alarm probability nor on the assumed rig

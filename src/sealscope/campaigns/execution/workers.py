@@ -83,7 +83,7 @@ def iter_results(
 def iter_rows(
     results: Generator[tuple[Item, Result | None], None, None], make_lost: Callable[[Item], Result]
 ) -> Generator[Result, None, None]:
-    """Yield the results of `iter_results`, and `make_lost(item)` for an item whose process died."""
+    """Yield the results (true values) of `iter_results`, and `make_lost(item)` for an item whose process died."""
     with closing(results):
         for item, row in results:
             yield row or make_lost(item)

@@ -42,7 +42,7 @@ class Judgement:
 
     - `leak_free`: number of leak-free records from which the `thresholds` of scorers are set, 0 if none is set
     - `judged`: number of judged records that have a result
-    - `failed`: rows with an error, on which the verdict of every detector is `cannot tell`
+    - `failed`: all rows with an error; on those to judge the verdict of every detector is `cannot tell`
     - `table`, `overall`: fractions of alarms for each size of the leak, and for all sizes together
     - `onsets`, `flows`: errors of the onsets and leak flows that detectors state
     - `causes`: confusion matrices of the causes that detectors name
@@ -82,9 +82,9 @@ def judge(
     """Collect all detectors' verdicts on the rows (results of records) with `use` "judge", and compute statistics.
 
     Scorers without a fixed threshold get one from the leak-free rows of the same duty (`compute_thresholds`). Records
-    with a fault other than a leak count only in `causes` and `faults`. In `table`, `overall` and `faults` the detectors
-    are followed by two references, which always or never raise an alarm. Raises InputError if there is no row to judge,
-    or too few leak-free rows to set a threshold.
+    with a fault other than a leak count only in `judged`, `failed`, `causes` and `faults`. In `table`, `overall` and
+    `faults` the detectors are followed by two references, which always or never raise an alarm. Raises InputError if
+    there is no row to judge, or too few leak-free rows to set a threshold.
 
     - `false_alarm`, `promise`: wanted false-alarm probability, and how the thresholds keep it (`Promise`)
     - `confidence`: probability for the promise "bound", and confidence level of all intervals

@@ -73,7 +73,7 @@ def _iter_stating(verdicts: Verdicts) -> Iterator[tuple[str, float, list[tuple[J
 def _errors(
     estimates: Sequence[tuple[float | None, float, tuple[float, float] | None]], confidence: float
 ) -> EstimateErrors:
-    """Compute the errors of estimates, given as (estimate or None, true value, interval or None) of each record."""
+    """Compute the errors of one estimate or more, given as (estimate or None, true value, interval or None) each."""
     numbers = [
         (math.nan if value is None else value, true_value, *(interval or (math.nan, math.nan)))
         for value, true_value, interval in estimates
@@ -94,7 +94,7 @@ def iter_cause_confusions(verdicts: Verdicts, confidence: float) -> Iterator[Nam
         if not other_causes or not any(name in record.row.statements for record in single_cause_records):
             continue
         truth = [_true_cause(record) for record in single_cause_records]
-        # rows of the matrix: the true causes, then causes that are only named
+        # rows of the matrix: the true causes, then causes that are only named; `cannot tell` has a column, but no row
         causes = [cause for cause in (NO_CAUSE, PISTON_LEAK) if cause in truth] + other_causes
         named_causes = [record.named_cause for record in single_cause_records]
         causes += sorted(set(named_causes) - set(causes) - {CANNOT_TELL})

@@ -26,7 +26,7 @@ class PriorKnowledge:
     """The information that a detector is given before it judges a record.
 
     `onset`: True if it knows the true onset of the leak; `channels` that it may read; `rig`: name of the rig that it
-    assumes, "" for none.
+    assumes, "" if the plan states none.
     """
 
     onset: bool
@@ -99,7 +99,7 @@ def build_tables(
             for row in judgement.causes
             for true_cause, fractions in zip(row.confusion.rows, row.confusion.shares, strict=True)
             for cause, fraction in zip(row.confusion.columns, fractions, strict=True)
-            if fraction.n
+            if fraction.n  # records with the true cause; 0 for a cause that is only named
         ),
         "families": ({"of": row, "part": part, "detector": row.detector} for row in judgement.families),
     }
@@ -109,6 +109,7 @@ def build_tables(
         cells: TableRow = {}
         for column, content in columns.items():
             is_known = content.startswith("known ")  # of the information that the row's detector was given
+            # None, for empty cells, for the reference detectors (`add_references`)
             source = knowledge.get(resolve_attribute(row, "detector")) if is_known else row
             cells |= _build_cells(column.format(unit=unit), content, source, factors)
         return cells

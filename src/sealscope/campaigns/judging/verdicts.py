@@ -72,7 +72,7 @@ def compute_thresholds(
     for name in scorers:
         for duty, group in leak_free.items():
             scores = [score for row in group if (score := row.score(name)) is not None]
-            if scores and len(group) >= needed:
+            if scores and len(group) >= needed:  # without a threshold, the verdict is `cannot tell`
                 scores += [min(scores)] * (len(group) - len(scores))  # for the records without a score
                 thresholds[name, duty] = quantile_threshold(scores, false_alarm, confidence, promise)
     return thresholds

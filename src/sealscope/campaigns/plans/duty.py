@@ -50,9 +50,10 @@ def check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
 
 
 def check_controllers(plan: SimulatedPlan, trust: bool) -> None:
-    """Check that every controller of a plan is trusted, and build those that are not built in.
+    """Check that every controller of a plan is trusted, and that those not built in can be built for the plan's rig.
 
-    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True.
+    A plan may be hostile, so code that it names (`FILE.py:NAME`, `MODULE:NAME`) is run only if `trust` is True;
+    built-in and installed controllers are trusted. Raises InputError otherwise.
     """
     names = [str(level) for level in plan.factors.get(CONTROLLER, ())]
     if plan.machine_profile is not None:

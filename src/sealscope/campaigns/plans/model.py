@@ -45,6 +45,7 @@ def _validate_pattern(pattern: str) -> str:
     parts = Path(pattern).parts
     if not parts or Path(pattern).is_absolute() or ".." in parts:
         raise ValueError("must be a pattern within the folder")
+    # a name cannot contain NUL, `glob` refuses ** within a name, and several ** would search the same folders again
     if "\0" in pattern or any("**" in part and part != "**" for part in parts) or pattern.count("**") > 1:
         raise ValueError("must be a pattern of names with at most one **, which stands for whole folders")
     return pattern
@@ -168,7 +169,7 @@ class SimulatedPlan(_Plan):
     - `onset_s` [s]: start of the leaks, nan for half of the duration
     - `seed`: number from which the seeds of all records derive
     - `keep_recordings`: True to store the recordings
-    - `factors`: by name, the levels (values) of each factor; records are made for every combination of levels
+    - `factors`: by name, the levels (values) of each factor; a group's records take their combinations in turn
     - `part`: purpose of the plan, such as development or judging
 
     The factors `command`, `controller` and `load` set how the machine is moved and loaded, `closed` how far the
@@ -218,8 +219,8 @@ class RecordingSet(_TomlTable):
     - `files`: pattern of the file names
     - `use`: `calibrate` for healthy recordings from which thresholds are set, `judge` for recordings to be judged
     - `size`: size of the leak in the plan's `unit`, 0 for healthy recordings
-    - `first`, `end`: position of the first file that is used, and one past that of the last; the files are ordered by
-      the numbers in their names and counted from 1
+    - `first`, `end`: position of the first file that is used, and one past that of the last, by default all files; they
+      are ordered by the numbers in their names and counted from 1
     - `label`: name of the set in tables, by default the pattern
     """
 

@@ -148,7 +148,7 @@ def _check_factors(plan: SimulatedPlan) -> None:
     With a factor `controller`, all commands must be targets of the piston's position, not voltages.
     """
     for name, levels in plan.factors.items():
-        if len({repr(level) for level in levels}) < len(levels):
+        if len({repr(level) for level in levels}) < len(levels):  # `repr` tells the number 1 from the text "1"
             raise InputError(f"factors.{name} must hold each level once ({plan.place})")
         for level in levels:
             _check_entry(f"factors.{name}", plan.place, partial(check_level, plan, name, level))

@@ -111,6 +111,7 @@ class Scorer:
         ending = " over the record, as its logarithm"
         if self.compares_parts:
             ending = ", as change of its logarithm from the first to the second part"
+        # a fixed threshold is that of a sign rule, 0
         return text + ending + ("; any change at all" if self.threshold is not None else "")
 
     def score(self, log_rms: LogRms, channels: Collection[str]) -> float | None:

@@ -373,7 +373,10 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
 
 
 def _iter_lines(path: Path) -> Iterator[Line]:
-    """Yield the complete lines of a file of summaries after the first; raise InputError for a file of another kind."""
+    """Yield the lines of a file of summaries after the first; raise InputError for a file of another kind.
+
+    A line without a checksum and a blank is skipped. One whose JSON is cut off is yielded: `parse_summary` finds that.
+    """
     noun = "a file of healthy summaries"
     try:
         with open_regular(path, noun) as file:
@@ -388,7 +391,7 @@ def _iter_lines(path: Path) -> Iterator[Line]:
                 if not row:
                     return
                 checksum, blank, data = row.rstrip(b"\n").partition(b" ")
-                if len(checksum) == _DIGITS and blank:  # otherwise the line is incomplete, and is skipped
+                if len(checksum) == _DIGITS and blank:
                     yield Line(checksum.decode("ascii", "replace"), data)
             raise InputError(f"{noun} must have at most {_MAX_SUMMARIES} summaries, got more ({path})")
     except InputError:

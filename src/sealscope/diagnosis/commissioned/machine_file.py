@@ -253,8 +253,8 @@ def _hash_parts(tree: Mapping[str, Any]) -> dict[bytes, str]:
         return sha256(json.dumps(value, sort_keys=True, default=str).encode()).digest()[:16]
 
     statements = {name: value for name, value in tree["machine"].items() if name not in _REWRITTEN}
-    rig_tables = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
-    parts = {hash_value([statements, rig_tables]): "another statement of the machine"}
+    rig_and_map = {name: table for name, table in tree.items() if name not in MACHINE_TABLES}
+    parts = {hash_value([statements, rig_and_map]): "another statement of the machine"}
     parts |= {hash_value(row["summary"]): f"another recording, {row['file']}" for row in tree["healthy"]}
     return parts | {hash_value(row): f"another mark of {row['alarm']}" for row in tree.get("alarms", ())}
 
@@ -382,7 +382,7 @@ def _format_value(value: Any) -> str:
         return "{ " + ", ".join(members) + " }"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(map(_format_value, value)) + "]"
-    if isinstance(value, float):
+    if isinstance(value, float):  # as TOML, unlike JSON, has nan and inf
         return repr(value)
     if isinstance(value, str):  # names of files may contain bytes that are not UTF-8
         value = value.encode("utf-8", "backslashreplace").decode()

@@ -159,7 +159,7 @@ class Case:
     def alarms(self) -> tuple[LeakTest, ...]:
         """Tests whose p-value is below their allowed false-alarm probability, the one that fits the leak best first."""
         alarms = [test for test in self.tests if test.chance < test.probability]
-        return tuple(alarms if self.has_onset_within else reversed(alarms))
+        return tuple(alarms if self.has_onset_within else reversed(alarms))  # WITHIN is the first of `tests`
 
     @property
     def has_onset_within(self) -> bool:
@@ -190,6 +190,7 @@ class Case:
         leak = self.leak
         if leak is None:
             return None
+        # without healthy recordings, as in a test by the limit, `rise_flow` is the total leakage
         return leak.step_flow if alarm.name == WITHIN else leak.rise_flow
 
     @cached_property

@@ -160,7 +160,7 @@ def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:
     min_factor, max_factor = leak.flow_factors
     low, high = min_factor * max(flow.value - half_width, 0.0), max_factor * (flow.value + half_width)
     interval = low * leak.lpm_per_flow, high * leak.lpm_per_flow
-    # a leak is no negative flow, of which noise may make an estimate
+    # noise may make the estimate negative, but a leak flows towards the lower pressure only
     return {**fields, "leak_lpm": max(flow.value, 0.0) * leak.lpm_per_flow, "leak_interval_lpm": interval}
 
 
@@ -168,7 +168,7 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
     """Compute the 95 % upper bound of a leak's mean flow [m^3/s], infinite ("any size") if it is of no use.
 
     If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. A bound is
-    of no use without measured leakage, or if it is not below the mean flow of a moving pump.
+    of no use without measured leakage, or if it is not below the pump's mean flow, unless that is 0 or unknown.
     """
     leak = case.leak
     if leak is None:
@@ -186,9 +186,10 @@ def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
 def _bound_and_limit(case: Case, bound: float) -> tuple[float, float]:
     """Return the 95 % upper bound of a leak, and the largest bound that still allows the verdict `no leak`.
 
-    If leakage is measured, both are flows [m^3/s], the first being the argument `bound`. Otherwise both are changes of
-    the logarithm of the pressures' ringing (RMS of their wavelet details); the bound is then infinite if the ringing
-    was not measured, if a test raised an alarm, or if the sampling rate is too low.
+    If leakage is measured, both are flows [m^3/s], the first being the argument `bound`; the second is 0 if the pump's
+    flow is 0 or unknown, as no bound > 0 is then small enough. Otherwise both are changes of the logarithm of the
+    pressures' ringing (RMS of their wavelet details); the bound is then infinite if the ringing was not measured, if a
+    test raised an alarm, or if the sampling rate is too low.
     """
     if case.leak is not None:
         _, delivered_flow = case.leak.pump_flow  # mean over the time in which the pump delivers
@@ -227,6 +228,7 @@ def _add_tests(case: Case, evidence: Evidence, judging: LeakTest | None) -> Evid
     parts = []
     if len(case.tests) > 1:
         for test in case.tests:
+            # an alarm without the verdict `leak` has a better explanation
             has_alarm = evidence.verdict == LEAK and test.chance < test.probability
             part = Evidence(LEAK if has_alarm else NO_LEAK, reason=test.name, detector=test.name)
             parts.append(_with_result(part, test))

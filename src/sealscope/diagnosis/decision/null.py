@@ -58,7 +58,7 @@ class HealthyNull:
     def uncalibrated_chance(self, key: str, chance: float) -> float:
         """Invert `calibrate`: compute the p-value that a detector must state so that the calibrated one is `chance`.
 
-        If no p-value is small enough, the smallest positive float is returned.
+        If no p-value is small enough, the smallest normal float is returned.
         """
         max_surprisal = -np.log(np.finfo(float).tiny)
         if self.calibrate(key, np.exp(-max_surprisal)) >= chance:

@@ -109,10 +109,10 @@ def validate_report(report: Any, name: str) -> Observed:
 
 
 def log_failure(name: str, distribution: str | None, error: Exception) -> str:
-    """Describe the error of the detector `name` in one line, and log it with the traceback, once per process.
+    """Describe the error of the detector `name` in one line, and log it with the traceback, each line once per process.
 
     `distribution` is the package of a plug-in, None for a built-in detector, whose arithmetic errors are due to
-    impossible readings, not to a defect: they are logged at the debug level.
+    impossible readings, not to a defect: they are logged at the debug level, each time.
     """
     if distribution is None and isinstance(error, ArithmeticError | np.linalg.LinAlgError):
         _log.debug("%s cannot be computed", name, exc_info=True)

@@ -145,7 +145,7 @@ class BlockStream(SavedAttributes):
         `samples`: arrays by channel name, NaN where missing, or empty to add none; `last`: true if no samples follow.
         The first `n_first` blocks are returned together. A block is complete when it is followed by the samples on
         which its rows, speeds and rests depend. With `last` true, the samples for its rows suffice, and fewer than
-        `n_first` blocks are returned.
+        `n_first` blocks may be returned.
         """
         if samples:
             self._pieces.append(samples)
@@ -196,10 +196,11 @@ class BlockStream(SavedAttributes):
     def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
         """Compute for each volume balance the log odds that the recorded flow has the right sign.
 
+        The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1).
         `rows`: for each balance the rows (r, m) of its regression. Three symptoms of correct wiring are tested, and
         their log odds (`_sign_log_odds`) are added:
 
-        - Oil leaks from high to low pressure.
+        - Oil leaks from high to low pressure: the leak's coefficient is positive with either `flow_sign`.
         - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy.
           The mean force, weighted by abs(flow), is subtracted first, since a constant load also correlates with a
           motion in one direction. The same test is made with p_A - p_B instead of the force, and the two log odds are
@@ -208,11 +209,11 @@ class BlockStream(SavedAttributes):
         """
         odds_by_balance = []
         for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
-            left = balance.flow_sign * values[:, columns.left]
+            left = balance.flow_sign * values[:, columns.left]  # flow into A
             motion = values[:, list(columns.piston)].sum(axis=1)
             leak_z = _leak_z_score(values.T @ values, columns, len(values))
             log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
-            if (flow := np.abs(left)).any():
+            if (flow := np.abs(left)).any():  # else there is no mean weighted by the flow
                 loads = [_load_pressure(values, columns, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
                 work_z = [_z_score((load - np.average(load, weights=flow)) * left) for load in loads]
                 log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.work) for z in work_z]))
@@ -225,7 +226,8 @@ class BlockStream(SavedAttributes):
     def _shows_motion(self, rows: Sequence[Array]) -> bool:
         """Return True if flow and motion correlate by `sense.moves` (`priors.toml`) standard errors, in either sense.
 
-        `rows`: for each balance the rows (r, m) of its regression. Also True if no balance has a position.
+        `rows`: for each balance the rows (r, m) of its regression. Also True if no balance has a term of the piston's
+        motion: then the first blocks determine the signs.
         """
         z_scores = [
             _z_score(values[:, list(columns.piston)].sum(axis=1) * values[:, columns.left])
@@ -239,7 +241,8 @@ class BlockStream(SavedAttributes):
 
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
         weights. The first call also determines absolute minus gauge pressures, and the speeds below which the machine
-        rests; the first one in which the piston moves, the signs of the left sides. They hold for all blocks.
+        rests. The first call with motion determines the signs of the left sides, for a whole recording its only call.
+        Later blocks keep all of these.
         """
         length = self._length
         n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
@@ -332,7 +335,8 @@ class BlockStream(SavedAttributes):
         if self._drops_rests:
             reach = SPAN * self._stride  # length of a test function, on either side of motion [samples]
             is_moving = signals.moving(self._balances[0].left) > 0.0
-            is_far = ~extend_flags(is_moving, 2 * reach + 1)[reach:-reach]  # extended to either side
+            # `extend_flags` extends flags forwards by twice the reach; the slice shifts them back by once
+            is_far = ~extend_flags(is_moving, 2 * reach + 1)[reach:-reach]
             time_far = np.asarray(is_far[without_margins] * signals.dt)
             # a row counts if its test function contains no interval far from motion
             is_counted &= weak_form_rows([time_far], self._rate).values[:, 0] == 0.0
@@ -411,8 +415,9 @@ def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.
 
     A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside. A load that
     sinks by a leak is slower, so the piston must be faster than the fraction `rest.lowers` (`priors.toml`) of its mean
-    speed in motion, for `MIN_REST` or longer. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3], NaN
-    where missing, and of the position [m]; `rate`: sampling rate [Hz].
+    speed in motion, for `MIN_REST` or longer. The flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond
+    either end. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3], NaN where missing, and of the
+    position [m]; `rate`: sampling rate [Hz].
     """
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
     is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
@@ -444,7 +449,7 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
     """Return the samples (n,) of those channels `names` that are recorded, with clipped pressures as NaN.
 
     Holes, i.e. long gaps of missing samples, keep the values with which the inspection filled them
-    (`corrections.gaps`); the additional entry `HOLE` is then 1 there and 0 elsewhere. If p_A or p_B is clipped, the
+    (`corrections.gaps`); the additional entry `HOLE` is then 1 there and 0 elsewhere. If a pressure is clipped, the
     additional entry `CLIPPED_DIFFERENCE` is p_A - p_B as recorded, for the pressure level of a block: clipped values
     are closer to the true ones than the mean of the other samples.
     """
@@ -570,7 +575,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     source = flow_source(names)
     # only a recorded flow of a pump shows whether valves cut the pump off
     may_shut = balances[0].name == CYLINDER and not balances[0].by_command and source != "q_supply"
-    channels = {"x", "p_A", "p_B", str(source)}
+    channels = {"x", "p_A", "p_B", str(source)}  # no channel is named "None"
     channels |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = bridged_samples(recording, channels)
     if balances[0].by_command:
@@ -675,7 +680,8 @@ def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[floa
 
     `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The estimated offset
     is removed from the Gram matrices, which assumes terms that are linear in it. If it exceeds `NEGLIGIBLE_OFFSET`
-    standard deviations of its prior, the blocks are computed again after subtracting it, and the rest is removed.
+    standard deviations of its prior, the blocks are computed again after subtracting it, and the error that remains
+    is estimated and removed.
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded

@@ -125,7 +125,8 @@ class Blocks:
     def merge(self, max_blocks: int = MAX_BLOCKS) -> Blocks:
         """Merge neighbouring blocks in groups of equal size, so that at most `max_blocks` blocks remain.
 
-        The last group may be smaller. Gram matrices and numbers of rows are added; flow and pressures are averaged.
+        The last group may be smaller. Gram matrices and numbers of rows are added; flows are averaged with the numbers
+        of rows as weights (0 without rows), and pressures with `pressure_weights`.
         """
         group_size = -(-len(self) // max_blocks)  # rounded up
         if group_size <= 1:
@@ -266,11 +267,12 @@ class ColumnRoles:
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
         """Compute the prior precisions (c,) of the differences of c coefficients from those of other recordings.
 
-        `indices` (c,): columns of the coefficients; `coefficients` (c,): their values in the other recordings;
-        `leak_coefficient`: the leak's value there [m^3/(s Pa)]. The prior deviation is the magnitude of the coefficient
-        times `between_deviation`, or for the leak times `between.pump` (`priors.toml`). That of a flow offset that
-        repeats in all recordings (`between_deviation` 0) is the leak's flow at the pressure `zero.pressure`, the
-        standard deviation of a sensor offset of p_A - p_B. The precision is infinite if the deviation is 0.
+        `indices` (c,): columns of the coefficients, each the leak's or with a finite `between_deviation`;
+        `coefficients` (c,): their values in the other recordings; `leak_coefficient` [m^3/(s Pa)]: the leak's value
+        there. The prior deviation is the magnitude of the coefficient times `between_deviation`, or for the leak times
+        `between.pump` (`priors.toml`). That of a flow offset that repeats in all recordings (`between_deviation` 0) is
+        the leak's flow at the pressure `zero.pressure`, the standard deviation of a sensor offset of p_A - p_B. The
+        precision is infinite if the deviation is 0.
         """
         is_leak = np.array(indices) == self.names.index(LEAK)
         deviations = np.abs(coefficients) * np.where(is_leak, INFERENCE.between.pump, self.between_deviation[indices])
@@ -304,8 +306,9 @@ class ColumnRoles:
         """Compute the prior standard deviation of the leak coefficient of `column` in a healthy machine.
 
         It is infinite if no pressure drives the flow of this column, and for a laminar leak if `healthy_conductance`
-        is. The coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`.
-        This conductance is at most that of a healthy piston, since the pump's leakage is laminar.
+        is. The coefficient of an orifice is converted from a laminar conductance by equal mean flows over `blocks`, or
+        equals it without a pressure difference. This conductance is at most that of a healthy piston, since the pump's
+        leakage is laminar.
         """
         driver = self.drivers[column]
         pressure, root = float(np.mean(blocks.mean_pressure())), float(np.mean(blocks.mean_root()))
@@ -462,7 +465,7 @@ class _NormalEquations(NamedTuple):
 
     def eliminate_tested(self) -> tuple[Array, Array, float]:
         """Return `gram`, `moment` and `left_square` after elimination of the tested coefficient, free in each block."""
-        energy = np.maximum(self.energy, np.finfo(float).tiny)
+        energy = np.maximum(self.energy, np.finfo(float).tiny)  # where it is 0, `coupling` and `tested_moment` are 0
         gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
         moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
         return gram, moment, self.left_square - float((self.tested_moment**2 / energy).sum())
@@ -561,7 +564,8 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     level = roles.level_deviations(total)[nuisance]
     magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation, which `constants` may exceed
     offset_deviation = roles.offset_deviation(test, blocks)
-    # prior standard deviations of constants and drifts, last of the offset: without a prior if it has no effect
+    # prior standard deviations of constants and drifts; last those of the offset, whose drift is 0, and whose constant
+    # has no prior if the offset has no effect
     deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
     deviations[:-1, 0] = level
     deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
@@ -642,7 +646,7 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
     # the leak's column is (p_A - p_B) dt, that of the flow offset is dt
     mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
-    fit = _fit_equation(blocks, 0, roles)
+    fit = _fit_equation(blocks, 0, roles)  # before `gram`, a view of these blocks, changes
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]

@@ -25,15 +25,16 @@ from sealscope.recordings.recording import Array
 EXPONENTS = (1.0, 0.75, 0.5)
 #: Number of relative growths of a step that are tried, besides zero.
 N_GROWTHS = 6
+#: Smallest divisor, and base of a power, where a block has no pressure difference.
 _TINY = np.finfo(float).tiny
 
 
 def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dict[float, Array]:
     """Compute the conductance that a leak with the flow |p_A - p_B|^e appears to have in each of K blocks.
 
-    For an orifice, e = 1/2, this regression coefficient r follows from the Gram matrices. For the other exponents it is
-    approximated by r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The result maps each exponent e of `EXPONENTS` to
-    an array (K,) [Pa^(e - 1)].
+    For an orifice, e = 1/2, it is the regression coefficient r of its column on that of the laminar leak. For the other
+    exponents it is approximated by r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The result maps each exponent e
+    of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)  # sum over the equations
@@ -55,7 +56,8 @@ def law_flows(blocks: Blocks) -> dict[float, Array]:
 def law_priors() -> Array:
     """Return the prior probability of each leak law, i.e. of each exponent in `EXPONENTS`, shape (3,).
 
-    Laminar flow (e = 1) has the probability `size.laminar` (`priors.toml`); the other exponents are equally probable.
+    Laminar flow (e = 1, the first) has the probability `size.laminar` (`priors.toml`); the other exponents are equally
+    probable.
     """
     laminar: float = INFERENCE.size.laminar
     n_others = len(EXPONENTS) - 1
@@ -71,11 +73,12 @@ def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnR
     `leak` is returned unchanged.
     """
     shape = apparent_conductances(blocks, columns)[0.5]
-    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block; it may be negative
     total_weight = float(leak.precision.sum())
     mean_shape = float(weights @ shape) / max(float(weights.sum()), _TINY)
     if not (mean_shape > 0.0 and total_weight > 0.0):
         return leak
+    # mean conductance; its sign does not matter, since it scales a standard deviation
     conductance = abs(float(leak.vector.sum())) / total_weight
     return leak._replace(disturbance=INFERENCE.healthy.turbulent * conductance, shape=shape / mean_shape)
 
@@ -88,7 +91,7 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     is the mean over the blocks, weighted by their information. `leak`: likelihood of the leak's coefficient in the
     blocks. Return None if too few blocks determine this coefficient.
     """
-    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block
+    weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block; it may be negative
     shapes = apparent_conductances(blocks, columns)
     tests = []
     for exponent, prior in zip(EXPONENTS, law_priors(), strict=True):
@@ -96,11 +99,15 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
         test = step_test(leak, shape=shapes[exponent] / max(mean_shape, _TINY))
         if test is not None:
             tests.append(test.share_alarms(float(prior)))
+    # of equal p-values, such as 1, the highest score counts
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
 def growth_priors() -> list[tuple[float, float]]:
-    """List possible relative growths of a leak from its onset to the recording's end, as (growth, probability)."""
+    """List possible relative growths of a leak from its onset to the recording's end, as (growth, probability).
+
+    The first is 0, a leak that stays constant, with the probability `growth.steady` (`priors.toml`).
+    """
     prior = INFERENCE.growth
     growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
     probability = (1.0 - prior.steady) / N_GROWTHS

@@ -150,7 +150,8 @@ class LeakMeasure:
     - `rise_flow`: mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if
       unknown.
     - `rise_onset`: onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning.
-    - `step_rise`: this leakage, and the evidence for its causes; None without healthy recordings.
+    - `step_rise`: the rise, and the evidence that a step within the recording explains it; None without healthy
+      recordings.
     - `excess`: total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if
       unknown.
     - `bound_flow`: 95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested.

@@ -174,7 +174,8 @@ class StepTest:
     def detectable_step(self, chance: float, power: float = 0.9) -> float:
         """Compute the smallest step that is detected with the probability `power`, in the unit of the coefficient.
 
-        `chance`: probability that the test finds a step where there is none; it sets the threshold of the score.
+        It is for an onset with the median standard error. `chance`: probability that the test finds a step where there
+        is none; it sets the threshold of the score.
         """
         threshold_z = np.sqrt(self.threshold(chance))  # the score is about the square of a z score
         return float((threshold_z + NormalDist().inv_cdf(power)) * np.median(self.deviation))
@@ -193,7 +194,8 @@ def bound_steps(weights: Array, size: Array, deviation: Array, probability: floa
     """Compute the upper bound of a step: the quantile of its size at `probability`, given that the size is > 0.
 
     `weights`, `size`, `deviation` (k,): for each of k onsets its probability, and the size of the step there with its
-    standard error. If practically no step up is possible, the result is the largest conceivable size, but at least 0.
+    standard error. If a step up has the probability 0 by rounding, or all sizes are below 0 by 12 standard errors, the
+    result is the largest conceivable size, but at least 0.
     """
     from scipy.special import ndtr
 
@@ -273,7 +275,7 @@ class NullLaw(NamedTuple):
     share: float = 1.0
 
     def chance(self, score: float) -> float:
-        """Compute the probability P that a coefficient without a step has a higher score, divided by `share`."""
+        """Compute the probability P of a higher score without a step, divided by `share`; at most 1."""
         from scipy.special import betainc
 
         m = self.dimensions
@@ -310,8 +312,8 @@ def step_sizes(
 
     The coefficient also has a level, a slope and a random walk, whose likeliest variance is used at each onset.
     `onsets` (o,): indices of the onsets in `StepTest.onsets`; `shape` (K,): change of the coefficient in each block by
-    a unit step; `growth`: as in `step_shapes`. Returns the log likelihood ratio of the step to no step, its size, and
-    the standard error of the size, (o,) each.
+    a unit step; `growth`: as in `step_shapes`. Returns the log likelihood ratio of the step to no step, its size
+    (negative where only a step down would fit), and the standard error of the size, (o,) each.
     """
     whitened = _whiten_blocks(information)
     assert whitened is not None  # else there is no step test with onsets
@@ -473,7 +475,7 @@ def _build_whitening(
     design = (vectors * root).T  # matrix from the coefficient in all blocks to z
     priors = np.diag(1.0 / np.array(scales))[np.isfinite(scales)]  # each is one more estimate, of 0
     fixed = np.vstack([design @ np.column_stack(changes), priors])
-    # the remaining columns of the full Q span the complement of level, slope and shape
+    # the remaining columns of the full Q span the complement of level, slope and shape; the priors' rows multiply 0
     complement = np.linalg.qr(fixed, mode="complete")[0][:n_informative, len(scales) :].T
     transform = complement @ design
     # covariance of a walk with steps of variance 1, which is min(k, l) for blocks k and l counted from 1

@@ -54,7 +54,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
     if not equations:
         return blocks
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
-    # usual standard deviation of the offset [Pa], smaller for pressures in counts
+    # prior standard deviation of the offset of good sensors [Pa], smaller for pressures in counts
     unit = columns[0].offset_deviation(columns[0].leak, blocks)
     offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
     gram = blocks.gram.copy()
@@ -67,7 +67,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
 
 
 def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals: Array) -> float:
-    """Find the most probable sensor offset of p_A - p_B, in units of its usual standard deviation.
+    """Find the most probable sensor offset of p_A - p_B, in units of its prior standard deviation.
 
     `residuals` (n,): whitened residuals of leak and constant flow in K blocks. Column k of `leak_steps` (n, K) is their
     change by a unit step of the leak's coefficient from block k on. Such a step also lowers the constant flow, in

@@ -52,8 +52,8 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
       coefficient describes the holds as well.
 
     If all holds are short and the pump is off at other times, the machine is a press, whose pump builds up the pressure
-    through open valves in these holds. If its valves are certainly shut at rest (`is_certain`), holds count as motion:
-    the column `HOLDING` is added to the column `TURNING` before it is set to zero.
+    through open valves in these holds. If its valves are certainly shut at rest (`is_certain`, by their log odds),
+    holds count as motion: the column `HOLDING` is added to the column `TURNING` before it is set to zero.
     """
     names = (*roles.names, "left")  # the last column is the left side of the balance
     if not shut:

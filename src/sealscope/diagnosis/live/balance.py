@@ -137,7 +137,7 @@ class LiveBalance(SavedAttributes):
     method = "volumes"
     data = VOLUMES
     states_level = True
-    min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, whatever its law
+    min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, and its flow measured, whatever its law
     block_seconds = BLOCK_SECONDS
     has_begun = True
     SAVED = ("_precision", "_moving", "_waiting", "_rate", "_signals")
@@ -275,7 +275,8 @@ class LiveBalance(SavedAttributes):
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
         """Estimate the leakage conductance in a block; a `NotJudged` if the estimate is too uncertain at standstill.
 
-        With `updates_model`, the block updates the other coefficients.
+        In motion, too, the precision must be above 0 and not NaN. With `updates_model`, the block updates the other
+        coefficients.
         """
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
@@ -297,7 +298,10 @@ class LiveBalance(SavedAttributes):
         )
 
     def relearn(self, since: float = math.inf) -> None:
-        """Drop the coefficients, and learn new ones from stored and later blocks that begin at `since` [s] or later."""
+        """Drop the coefficients, and learn new ones from all later blocks and the stored ones from `since` [s] on.
+
+        These are the stored blocks that begin at `since` or later, by default none.
+        """
         for model in self._models:
             for values in model:
                 values[:] = 0.0

@@ -32,7 +32,7 @@ class RiseExplanation(NamedTuple):
 
     is_leak: bool
     is_outside: bool = False  # True if oil leaks almost surely to the outside
-    other_events: str = ""  # names of the events that explain the increase instead of a leak
+    other_events: str = ""  # the events that explain the increase instead of a leak, in words
 
 
 #: The blocks do not explain the rise yet.
@@ -48,8 +48,9 @@ def explain_rise(observables: Sequence[Observable], data: str, onset: Interval, 
     to the outside from a sensor fault; until then, only a leak past piston or pump counts as a leak.
 
     The result is a leak if leaks are more probable than all other events together, else the most probable explanation
-    without a leak. It is `UNKNOWN` if no change of the kind `data` is significant (p-value below `_MAX_CHANCE`), or if
-    a leak, although more probable, affects none of the significant changes.
+    without a leak, inside or outside. It is `UNKNOWN` if there is no such explanation, if no change of the kind `data`
+    is significant (p-value below `_MAX_CHANCE`), or if a leak, although more probable, affects none of the significant
+    changes.
     """
     leak_names = ALARMING if is_settled else LEAK_EVENTS
     leak_events = [event for event in load_events() if event.name in leak_names]

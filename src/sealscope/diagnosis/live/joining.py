@@ -62,7 +62,7 @@ class SampleRun(NamedTuple):
     t: Array  # (n,): times [s]
     channels: Mapping[str, Array]
     rate: float  # sampling rate [Hz]
-    follows: bool  # True if there is no gap between these samples and those before them
+    follows: bool  # True if there is no gap, nor a change of the rate, between these samples and those before them
 
 
 @dataclass
@@ -125,7 +125,7 @@ class SampleJoiner(SavedAttributes):
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.
 
-        Times that are missing, late or repeated are dropped and counted, and so are clocks set back. The caller must
+        Times that are missing, late or repeated are dropped and counted; clocks set back are counted. The caller must
         set `newest` to the last time of each run before asking for the next run.
         """
         with np.errstate(all="ignore"):  # comparisons with NaN are False, which leads to the search below
@@ -157,7 +157,10 @@ class SampleJoiner(SavedAttributes):
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why samples do not suffice to watch an actuator by the channels `names`; "" if they suffice."""
+    """Describe why samples do not suffice to watch an actuator by the channels `names`; "" if they suffice.
+
+    Without `names` the text is that of a wrong rate; the caller replaces it.
+    """
     for name in names:
         if name not in samples:
             return f"samples without {name}"

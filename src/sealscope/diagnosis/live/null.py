@@ -32,7 +32,8 @@ class StepNull(SavedAttributes):
 
     def __init__(self) -> None:
         self._count, self._surprisal = 0, 0.0  # number of windows, and sum of their surprisals
-        self._highest, self._blocks = 0.0, 0  # largest log M and number of blocks in the present window
+        # largest log M, at least 0 (`add_window` counts larger ones only), and number of blocks in the present window
+        self._highest, self._blocks = 0.0, 0
 
     def add(self, log_e: float) -> None:
         """Add log M (`log_e`), the evidence of a step after a block of a healthy machine."""
@@ -56,8 +57,9 @@ class StepNull(SavedAttributes):
 def _find_threshold(count: int, surprisal: float, probability: float) -> float:
     """Compute the threshold of log M for a false-alarm `probability` per block: at least -log(probability).
 
-    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals. With few windows
-    the threshold is the lower limit, else that of a window with the false-alarm probability `WINDOW` * `probability`.
+    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals. With fewer than
+    `_MIN_WINDOWS` the threshold is the lower limit, else that of a window with the false-alarm probability `WINDOW` *
+    `probability`.
     """
     if count < _MIN_WINDOWS:
         return -math.log(probability)

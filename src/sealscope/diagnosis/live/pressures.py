@@ -105,7 +105,7 @@ class PressureEstimator(SavedAttributes):
             beginning = _make_recording(samples[:, :n_first], run.rate)
             if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
                 samples = samples[:, n_first // 2 :]
-                counter = f"half minutes before the first block: {reason}"
+                counter = f"half minutes before the first block: {reason}"  # half of a minute, `response.begins`
                 yield NotJudged(float(run.t[-1]), status="", counter=counter)
             else:
                 self._follower = Follower.fit_start(beginning, self._rig)
@@ -120,7 +120,9 @@ class PressureEstimator(SavedAttributes):
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
         """Set stuck pressure readings in the first `n_block` columns of `samples` (time, p_A, p_B, command) to nan.
 
-        Returns False, and changes nothing, if only later samples can show whether a reading is stuck; otherwise True.
+        The first reading of a hold is kept. If it is the last sample of a block, the hold counts as beginning with the
+        next block, whose first sample is kept, too. Returns False, and changes nothing, if only later samples can show
+        whether a reading is stuck; otherwise True.
         """
         holds = [find_holds(samples[row], rate, held) for row, held in zip(_PRESSURES, self._held, strict=True)]
         # `pending`: index of the first sample whose flag later samples may change

@@ -118,7 +118,7 @@ class StepDetector(SavedAttributes):
         if not np.isfinite(elapsed_blocks):  # the first block after `forget`
             self._level[:], self._level_variance[:] = g, variance
             return
-        level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)
+        level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)  # 1: should blocks overlap
         e, S = g - self._level, level_variance + variance  # innovation and its variance
         gain = level_variance / S
         may_begin = self._count >= _N_WARM
@@ -182,7 +182,7 @@ class StepDetector(SavedAttributes):
         # fraction of T that a step of the best size explains, less than 1 so that its logarithm is finite
         explained = np.minimum(np.maximum(a, 0.0) ** 2 / (b * T), 1.0 - 1e-15)
         max_log_ratio = -0.5 * float(np.min(self._onsets[:, _N] * np.log1p(-explained)))
-        # M is at most the largest ratio times the number of blocks
+        # M is at most the largest ratio times the number of onsets, each of which has the prior 1/len(PARTS)
         if max_log_ratio + np.log(len(self._onsets) / len(PARTS)) <= min_log_e:
             return -np.inf
         return float(np.logaddexp.reduce(self._log_terms().ravel()))

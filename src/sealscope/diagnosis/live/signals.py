@@ -121,6 +121,9 @@ class SignalWindow(SavedAttributes):
 
 
 def append_row(rows: Array, row: Array) -> Array:
-    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`, or to none if their length differs."""
+    """Append the `row` of a block to the last `WINDOW` - 1 of the `rows`.
+
+    If the rows have another length, there are none yet, or they are of other channels: they are dropped.
+    """
     stored = rows[1 - WINDOW :] if rows.shape[1:] == row.shape else np.empty((0, len(row)))
     return np.vstack([stored, row])

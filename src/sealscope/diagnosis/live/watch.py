@@ -316,7 +316,10 @@ class Watch:
         self._compared, self._grouped = self._compared[:0], 0
 
     def judge(self, result: BlockResult) -> BlockEstimate:
-        """Test the conductance in a `result` of the estimator for a leak, and return the estimate of its last block."""
+        """Test the conductances in a `result` of the estimator for a leak, and return the estimate of its last block.
+
+        A `result` that is no `NotJudged` has at least one block.
+        """
         self.blocks += 1
         if isinstance(result, NotJudged):
             if result.restarts:
@@ -360,7 +363,7 @@ class Watch:
         return self._add_flows(estimate, self._blocks_of_leak(self.leak)[-_PRIORS.recent :])
 
     def _add_to_tests(self, block: BlockConductance, *, has_known_duty: bool) -> None:
-        """Add a block to the tests for a leak, which restart after a pause or a change of duty.
+        """Add a block to the tests for a leak, which restart after a pause, a clock set back or a change of duty.
 
         The duty changes if it leaves the baseline's range, or returns to it (`has_known_duty`).
         """
@@ -398,6 +401,7 @@ class Watch:
         log_threshold = self._null.log_threshold(self._false_alarm_probability(STEP, block.end - block.begin))
         min_log_e = log_threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
         is_learning = leak is None and self.baseline is None
+        # -inf: the exact value, which is stored while the baseline is learned
         log_e = self._detector.log_e(-math.inf if is_learning else min_log_e)
         if not log_e > min_log_e:
             if is_learning:
@@ -408,7 +412,8 @@ class Watch:
         if leak is None:
             explanation = self._explain(rise, block)
             if not explanation.is_leak:
-                if is_learning and explanation == UNKNOWN and len(self._compared):  # the tests did not restart
+                # no other event explains the step, and the tests did not restart
+                if is_learning and explanation == UNKNOWN and len(self._compared):
                     self._null.add(log_e)
                 return True
             cause = OUTSIDE if explanation.is_outside else None

@@ -45,7 +45,7 @@ class RmsBlockPriors(PriorTable):
     fewest: int  # smallest number of blocks in which a change is looked for
     settling: float  # [s] time in which pressures and speed settle after a start
     settling_cycles: float  # the same in cycles of the duty
-    standstill: float  # RMS of a command at standstill over that of the whole recording
+    standstill: float  # RMS of the command, its rate and the load at standstill, over that of the whole recording
 
 
 class RingingRates(PriorTable):

@@ -152,11 +152,11 @@ def _block_bounds(inside: slice, rate: float, cycle: float | None) -> tuple[IntA
     prior, n_samples = RMS_PRIORS.blocks, inside.stop - inside.start
     block_s = prior_s = max(prior.seconds, prior.samples / rate)
     phases = 1
-    if cycle is not None:  # a whole fraction of the cycle, or a multiple if it is shorter than `prior_s`
+    if cycle is not None:  # a whole fraction of the cycle, or a multiple if the cycle is shorter than `prior_s`
         phases = max(1, round(cycle / prior_s))
         phase_s = cycle / phases
         block_s = phase_s * max(1, round(prior_s / phase_s))
-    if n_samples > prior.most * block_s * rate:  # too many blocks: make them longer, in whole cycles
+    if n_samples > prior.most * block_s * rate:  # too many blocks: make them longer, of whole cycles without phases
         block_s *= phases * math.ceil(n_samples / (prior.most * phases * block_s * rate))
         phases = 1
     n_blocks = int(n_samples / (block_s * rate))

@@ -79,8 +79,8 @@ def estimate_reading(
 ) -> LeakReading:
     """Estimate the leakage of a recording; if that is impossible, `problem` of the result states the reason.
 
-    `rig` states the sizes of the machine, as for `diagnose`. If it is None, the thesis's rig is assumed, and L/min can
-    be stated only for a simulation with these sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
+    `rig` states the sizes of the machine, as for `diagnose`. If it is None, a rig is assumed (`assumed_rig`), and L/min
+    can be stated only for a simulation with its sizes, or with a flow meter (`LeakReading.states_flow`). `file` is the
     recording's name, by default that of its file.
     """
     used_rig, machine = assumed_rig(rig, recording)
@@ -231,6 +231,7 @@ def build_timeline(
             scales[point.group] = scale  # the first that is known
     differences = [""] * len(scales)
     for number, scale in enumerate(scales[1:], 1):
+        # neither is None: readings of unknown ratio are of group 0, and so is the first one of known ratio
         percent = 0.0 if scale is None or scales[0] is None else 100.0 * (scale / scales[0] - 1.0)
         cause = "a sensor exchanged, or another machine"
         differences[number] = f"position or angle is scaled by {percent:+.2g} %: {cause}"
@@ -248,11 +249,10 @@ def _group_scales(scales: Sequence[float | None]) -> list[int]:
     gaps = np.diff(np.log(known))
     prior = TREND.reading
     limit = math.log1p(prior.scale)
-    if (
-        len(gaps) >= prior.fewest
-    ):  # the recordings of some machines do not determine the ratio well, so that it scatters
+    # the recordings of some machines do not determine the ratio well, so that it scatters
+    if len(gaps) >= prior.fewest:
         limit += prior.scatter * float(np.median(gaps))
-    # by ratio, the number of its cluster, counted from the smallest ratio
+    # by ratio, the number of its cluster, counted from the smallest ratio; not strict, for the case of no known ratio
     clusters: dict[float | None, int] = dict(zip(known, np.cumsum([0, *(gaps > limit)]).tolist(), strict=False))
     numbers: dict[int, int] = {}  # number of the group of each cluster
     return [numbers.setdefault(clusters[scale], len(numbers)) if scale in clusters else 0 for scale in scales]

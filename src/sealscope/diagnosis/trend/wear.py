@@ -91,8 +91,9 @@ class Levels:
     def scatter(self) -> float:
         """Standard deviation of the levels between recordings of a machine that does not change.
 
-        Its square is the mean of two variances: that of the prior, weighted by its degrees of freedom, and that of the
-        changes between neighbours in a group, weighted by their number.
+        Its square is the mean of two variances: that of the prior plus the mean square of the stated errors, weighted
+        by the prior's degrees of freedom, and that of the changes between neighbours in a group, from the median of
+        their sizes, weighted by their number.
         """
         prior = self.prior
         # a change between neighbours has twice the variance of a level
@@ -121,10 +122,10 @@ def outlier_excess(levels: Levels) -> tuple[Array, Array]:
     """Compute the part of each leakage level beyond the limit of outliers, which the fit of the wear subtracts.
 
     The limit is `outlier` (`priors.toml`) times the scatter of all earlier levels (`Levels.scatter`), as a distance
-    from the median of up to three levels before it in its group. Two successive levels beyond the limit on the same
-    side are a change of the machine, whose excess is 0. Returns two variants, each (n,). The first treats each level as
-    the latest level. The second is for the whole series, in which the next level may show a change; it is 0 for the
-    last level of a group, whose next is not known.
+    from the median of up to three levels before it in its group; the first level of a group has no excess. Two
+    successive levels beyond the limit on the same side are a change of the machine, whose excess is 0. Returns two
+    variants, each (n,). The first treats each level as the latest level. The second is for the whole series, in which
+    the next level may show a change; it is 0 for the last level of a group, whose next is not known.
     """
     excess_as_last, excess = np.zeros((2, len(levels)))
     for group in np.unique(levels.group):
@@ -421,7 +422,7 @@ def estimate_wear(levels: Levels, n_healthy: int, allowed_rise: float | None, ch
     is_growth = changes.grows[draws.change]
     growth = np.where(is_growth, draws.amplitude, 0.0)
     mostly_grows = float(np.mean(is_growth)) >= 0.5
-    healthy, scatter = _estimate_healthy_range(levels.select(slice(0, change_begin)))
+    healthy, scatter = _estimate_healthy_range(levels.select(slice(0, change_begin)))  # None: of all recordings
     limit = reach = None
     if allowed_rise is not None:
         limit = healthy.value + allowed_rise

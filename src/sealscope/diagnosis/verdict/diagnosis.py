@@ -217,8 +217,9 @@ class Diagnosis(Evidence):
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
         At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings, in the test
-        for a step, and in the rarest of all tests (`rarest_chance`). No cause of a change may be stated. If the total
-        leakage is surely above 0, an undetected leak must not be the whole of it.
+        for a step, and in the rarest of all tests (`rarest_chance`). The result is False without that comparison, or if
+        a cause of a change is stated. If the total leakage is surely above 0, an undetected leak must not be the whole
+        of it.
         """
         comparison = self._find_test(AGAINST)
         if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):

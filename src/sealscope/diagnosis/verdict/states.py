@@ -91,7 +91,7 @@ def action_of(condition: str, cause: str | None = None, parts: Sequence[str] = (
     """Return the action of `states.toml` for the cause of a change; without a listed cause, that for the condition.
 
     For a leak past piston or pump, the text begins with the checks of `parts`, components whose leakage may be mistaken
-    for that of a worn seal, such as "bypass". Raises KeyError for an unknown condition or part.
+    for that of a worn seal, such as "bypass". Raises KeyError for an unknown condition or, with such a leak, part.
     """
     tables = _tables()
     row = tables["causes"].get(cause or "", tables["conditions"][condition])

@@ -88,7 +88,8 @@ int unit_started(Instance *unit) {
 int unit_get(Instance *unit, uint32_t reference, double *value) {
     Block *b = &unit->block;
     int64_t code = 0;
-    if (reference == 0) {
+    /* the differences are unsigned: large for references below the base */
+    if (reference == 0) { /* the time, in FMI 3 */
         *value = b->time;
     } else if (reference - INPUT_BASE < N_INPUTS) {
         *value = b->inputs[reference - INPUT_BASE];

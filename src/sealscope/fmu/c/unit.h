@@ -29,12 +29,14 @@ Instance *unit_new(const char *name, const char *token, void *environment, void 
 void unit_free(Instance *unit);
 void unit_reset(Instance *unit);
 int unit_initialize(Instance *unit, double start);
-int unit_started(Instance *unit);
+int unit_started(Instance *unit); /* ends the initialization at standstill */
 int unit_get(Instance *unit, uint32_t reference, double *value);
 int unit_set(Instance *unit, uint32_t reference, double value);
 int unit_set_slope(Instance *unit, uint32_t reference, double slope);
 int unit_advance(Instance *unit, double time, double span);
+/* copies a block of `size` bytes to *state, which is allocated if it is NULL */
 int unit_keep(Instance *unit, void **state, const void *block, size_t size);
+/* reports a message to the importer, and returns `code` */
 int unit_refuse(Instance *unit, int code, const char *format, ...);
 
 #endif

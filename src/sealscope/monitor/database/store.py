@@ -212,7 +212,7 @@ class MonitorStore:
                 connection.execute(table.insert(), new_rows)
         for table, rows_by_key in rows.current.items():
             self.upsert(connection, table, [*rows_by_key.values()])
-        for table, last_numbers in rows.old.items():
+        for table, last_numbers in rows.old.items():  # the running numbers begin at 1
             if parameters := [{"name": name, "last": last} for name, last in last_numbers.items() if last > 0]:
                 is_actuator = table.c.actuator == bindparam("name", type_=sa.String)
                 connection.execute(table.delete().where(is_actuator, table.c.number <= bindparam("last")), parameters)
@@ -253,7 +253,8 @@ class MonitorStore:
     def begin_decoding(self, reader: str, digest: str) -> int:
         """Store that a `reader` (MQTT client) begins to decode a message; return the number of earlier attempts.
 
-        An attempt that ends is not counted (`end_decoding`): the earlier ones crashed the process.
+        `digest`: hash of the message. An attempt that ends is not counted (`end_decoding`): the earlier ones crashed
+        the process.
         """
         table, columns = tables.decodings, tables.decodings.c
         query = select(columns.attempts).where(columns.reader == reader, columns.digest == digest)

@@ -29,7 +29,7 @@ def _deliver(store: MonitorStore, output: str, send: Callable[[dict[str, Any]], 
     def send_announced(event: dict[str, Any]) -> bool:
         if event["event"] not in _DETECTOR_EVENTS or not event["alarm"]["shelved"]:
             send(event)
-        return True
+        return True  # an event that is not announced counts as sent, too
 
     store.deliver(output, send_announced)
 

@@ -200,7 +200,7 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
         transform: Details = details(samples)
         windows = windowed_rms(transform, step=_RMS_STEP)  # refuses details that overflow, in either form
     except InputError:
-        return {**header, "t": [], "has": 0}
+        return {**header, "t": [], "has": 0}  # overflowing samples count as none
     if detail_form == "details":
         inside = transform.inside()  # without the samples that depend on padding
         series = {f"d{level}": row[inside] for level, row in enumerate(transform.values, 1)}
@@ -212,8 +212,8 @@ def _detail_curves(t: Array, signal: Array | None, pressure: str, detail_form: s
 def _motion_curves(t: Array, channels: dict[str, Array], rate: float) -> dict[str, Any]:
     """Compute the curves of motion: pressures [bar], position [mm], speeds of piston [mm/s] and pump [rpm].
 
-    The last `_MOTION_S` seconds of the channels (n,) in SI units are averaged over groups of successive samples,
-    1/`_MOTION_HZ` s long. Returns only an empty "t" if there are fewer than two groups.
+    The last `_MOTION_S` seconds of the channels (n,) in SI units are averaged over groups of successive samples, about
+    1/`_MOTION_HZ` s or one sample long. Returns only an empty "t" if there are fewer than two groups.
     """
     bin_size = max(1, round(rate / _MOTION_HZ))
     n_bins = min(t.size // bin_size, round(_MOTION_S * rate / bin_size))

@@ -373,7 +373,7 @@ async function requestRefresh() {
     byId("overall").classList.remove("lost");
   } catch (error) {
     byId("overall").textContent = error instanceof TypeError ? "the monitor does not answer" : error.message;
-    again = !(error instanceof TypeError);
+    again = !(error instanceof TypeError); // without a connection, the stream of events tells when to try again
     await new Promise((later) => setTimeout(later, 1500));
   }
   setTimeout(() => {

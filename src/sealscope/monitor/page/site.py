@@ -247,7 +247,7 @@ class _Pages:
         if request.method == "POST" and admission is not None:
             if wait := admission.pause_s(address):
                 return _refuse_for_now(wait)
-            token = ""
+            token = ""  # of a body that is too long or too slow: counts as wrong
             with suppress(InputError, TimeoutError):
                 form = parse_qs((await _read_body(request)).decode("utf-8", "replace"))
                 token, *_ = form.get("token", [""])
@@ -317,6 +317,7 @@ def _client_address(request: Request) -> str:
 
 
 async def _read_body(request: Request) -> bytes:
+    """Read the body of a request; raise InputError if it is too long, TimeoutError if it takes over `_BODY_S`."""
     data = b""
     async with asyncio.timeout(_BODY_S):
         async for part in request.stream():
@@ -344,7 +345,7 @@ class PageServer:
         self._application = site(actuators, settings, token, queue_load, live)
         self._proxies = [str(address) for address in settings.proxies]
         self._socket: socket.socket | None = self._open_socket()
-        self.port = int(self._socket.getsockname()[1])
+        self.port = int(self._socket.getsockname()[1])  # chosen by the system if the stated port is 0
         self.address = f"http://{self._format_place()}/"
         self._server: uvicorn.Server | None = None
         self._thread = actuators.supervisor.start("page", self._serve)
@@ -381,7 +382,7 @@ class PageServer:
             forwarded_allow_ips=self._proxies,
         )
         self._server = uvicorn.Server(config)
-        self._server.should_exit = self._actuators.closed
+        self._server.should_exit = self._actuators.closed  # `leave` may have been called before
         self._server.run(sockets=[page_socket])
         if not self._actuators.closed:
             raise RuntimeError("the page's server has ended")

@@ -38,6 +38,7 @@ function showTwin(live) {
     if (!motion.v && !motion.rpm) missing.push("Neither position nor pump speed is recorded: the flow is not known.");
     for (const name of ["p_A", "p_B"]) {
       const most = Math.max(0, ...(motion[name] || []).filter((value) => value !== null));
+      // the scale grows in steps of 1, 2, 5, 10, ... bar
       while (twin.most < most) twin.most *= twin.most.toString()[0] === "2" ? 2.5 : 2;
     }
     twin.reach = Math.max(twin.reach, ...(motion.x || []).filter((value) => value !== null).map(Math.abs));

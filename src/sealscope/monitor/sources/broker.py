@@ -210,7 +210,7 @@ class _Connection:
 
         topic, block = "", None
         try:
-            with suppress(UnicodeDecodeError):
+            with suppress(UnicodeDecodeError):  # the message is then decoded as one of topic ""
                 topic = message.topic
             with self._note_decoding(message):
                 if self._host is not None and topic.startswith(f"{NAMESPACE}/"):

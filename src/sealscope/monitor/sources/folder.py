@@ -87,9 +87,9 @@ class WatchedFolder:
     def blocks(self) -> Iterator[SourceBlock | RefusedMessage]:
         """Yield the blocks of all files that are complete and not stored yet, in the order of their recording.
 
-        A file is complete when it has not changed for `settle_s`. It is refused if it is older than the watched
-        samples, or if it cannot be read and has not changed for `_PATIENCE_FACTOR` times as long: the reason and a
-        block without samples are then yielded. Raises PartAway if the folder cannot be read.
+        A file is complete when it has not changed for `settle_s`. It is refused if it is older than the newest one
+        (`_find_refusal_reason`), or if it cannot be read and has not changed for `_PATIENCE_FACTOR` times as long: the
+        reason and a block without samples are then yielded. Raises PartAway if the folder cannot be read.
         """
         files = sorted(self._files())  # by the time of their last change
         self._first_found = {file.identity: self._first_found.get(file.identity, time.monotonic()) for file in files}
@@ -153,6 +153,7 @@ class WatchedFolder:
         return [(file, reading) for _, file, reading in rows]
 
     def _read(self, path: Path) -> _Reading:
+        """Read a file by the actuator's map of columns; after any error return None and the reason."""
         try:
             return read_by_map(path, self._channel_map, self._settings.rate), ""
         except (SealscopeError, OSError, MemoryError) as error:

@@ -74,7 +74,7 @@ class ValueGatherer:
         """Add successive samples of a channel, in SI units; return the blocks of all channels that are then complete.
 
         `t` [s]: time of the first sample, rounded to the sampling interval; the others follow at the sampling rate. NaN
-        is an unknown value. Values without a finite time, and too many at once, are dropped and counted. If the time
+        is an unknown value. No values, too many, or values without a finite time are dropped and counted. If the time
         jumps forward by more than `_AHEAD_S`, the blocks continue after the pause with each channel's last value. If it
         jumps back by as much, the clock was set, and all earlier values are discarded. Only the first value of a
         channel may be so old, dated by its last change; it counts as the present value.
@@ -133,7 +133,7 @@ class ValueGatherer:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest_indices = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]
-        if not newest_indices or None in newest_indices:  # all are silent, or one has no new value
+        if not newest_indices or None in newest_indices:  # all are silent, or one that is not has no value on this axis
             return []
         blocks: list[Recording] = []
         known_stop = min(index for index in newest_indices if index is not None) + 1

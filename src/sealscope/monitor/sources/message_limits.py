@@ -99,6 +99,7 @@ def _count_shallow_pairs(values: Any) -> int:
 
 
 def _count_pairs(values: Any) -> int:
+    """Count the pairs of all mappings in a decoded message, at any depth."""
     if isinstance(values, dict):
         return len(values) + sum(map(_count_pairs, values.values()))
     return sum(map(_count_pairs, values)) if isinstance(values, list) else 0

@@ -65,6 +65,7 @@ class _OpcUaSession:
         self._waiting: BoundedQueue[SourceBlock] = BoundedQueue(_MAX_QUEUE, _MAX_QUEUE_BYTES)
 
     def run(self) -> None:
+        """Connect, again after each loss of the connection, and submit blocks until the service stops."""
         stopping = self._service.stopping
         submitting = self._service.supervisor.start("OPC UA blocks", self._submit)
         while not stopping.wait(self._server.pause_s):

@@ -226,13 +226,13 @@ def _parse_mapping(payload: bytes) -> Mapping[str, Any]:
         if payload.lstrip()[:1] == b"{":
             import orjson
 
-            n_colons = check_json(payload)
+            n_colons = check_json(payload)  # a decoder drops repeated keys: the count reveals them
             values = orjson.loads(payload)
             check_json_keys(values, payload, n_colons)
         else:
             import cbor2
 
-            n_pairs = check_cbor(payload)
+            n_pairs = check_cbor(payload)  # as `n_colons`
             values = cbor2.loads(payload)
             check_keys(values, n_pairs)
     except ImportError as error:

@@ -99,7 +99,7 @@ class _Birth:
 
     def rate(self, actuator: ActuatorSettings) -> float:
         """Find the sampling rate [Hz] in the settings, else in the birth; raise RefusedMessage if it is not > 0."""
-        metric = self.metrics.get(self.names.get(_RATE))
+        metric = self.metrics.get(self.names.get(_RATE))  # None if the birth has no rate
         rate = actuator.rate or (math.nan if metric is None else metric.value)
         if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
             rule = f"{actuator.name} must have a rate > 0 Hz, in its settings or as the metric {_RATE!r}"
@@ -184,7 +184,7 @@ class SparkplugHost:
             payload = spb.decode_payload(data)
         except ValueError as error:
             raise RefusedMessage(blocks.UNREADABLE, error) from None
-        self._follow_session(group, node, kind, payload)
+        self._follow_session(group, node, kind, payload)  # devices that are no actuators count in the sequence, too
         state, actuator = self._nodes[group, node], self._actuators.get(path)
         if actuator is None or kind == "NDEATH":
             return None
@@ -209,7 +209,8 @@ class SparkplugHost:
         """Update the state of a node with the birth, death or sequence number of a message of `kind`.
 
         A birth of a node (NBIRTH) begins its session, and a death (NDEATH) ends it; both discard the births of its
-        devices. After a gap in the sequence, which is counted, a birth is requested.
+        devices. After a gap in the sequence, which is counted, a birth is requested. Raises RefusedMessage for a
+        message outside a session or without a number, and for the death of an earlier session.
         """
         state = self._nodes[group, node]
         if kind in ("NBIRTH", "NDEATH"):

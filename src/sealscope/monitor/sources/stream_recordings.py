@@ -42,7 +42,7 @@ class StreamRecorder(SavedAttributes):
     blocks: list[Recording] = field(default_factory=list)
 
     def take(self, number: int, samples: Recording) -> Recording | None:
-        """Collect the block of samples with the running `number`; return the recording that ends, None for a short one.
+        """Collect the block of samples with the running `number`; return the recording that ends, if it is long enough.
 
         A recording that reaches its full length or `_MAX_BYTES` contains `samples`; one that ends for another reason
         does not.

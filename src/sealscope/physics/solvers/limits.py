@@ -82,7 +82,7 @@ def longest_step(p: RigNumbers, G: float = 0.0, C: float = 0.0) -> float:
     column_stiffness = (p.K_oil * max(p.A_A**2 / V_A + p.A_B**2 / V_B for V_A, V_B in ends) + p.k_load) / p.M_eq
     F_C = p.F_pr + (0.0 if p.coulomb_of_difference else p.F_cfr * 2.0 * p.p_charge)  # p_A = p_B = p_charge
     friction_slope = F_C * p.K_brk / p.v_th + p.F_v
-    if p.literal_bracket:
+    if p.literal_bracket:  # eq. (4.22) as printed
         friction_slope = F_C * (p.K_brk + p.F_v * p.v_th) / p.v_th
     damper = p.d_load
     if len(p.pushed) > 1:  # the tables of a load over position and velocity

@@ -53,9 +53,9 @@ def quantize(value: Any, count: float) -> Any:
 def sample_controller(loop: Loop, k: int, y: np.ndarray) -> bool:
     """Measure the state `y` (14,) and call the controller for its sample number k; return False if it fails.
 
-    The controller fails if its voltage is not finite. The voltage and a reported flow are stored in the `loop`. A
-    sample that is already taken keeps its voltage, which the solver needs when it repeats a part of the run at half the
-    step.
+    The controller fails if its voltage is not finite. The voltage, limited to +-MAX_VOLTAGE, and a reported flow are
+    stored in the `loop`. A sample that is already taken keeps its voltage, which the solver needs when it repeats a
+    part of the run at half the step.
     """
     counters, numbers, measured = loop.counters, loop.numbers, loop.measured
     if k < counters[SAMPLED]:

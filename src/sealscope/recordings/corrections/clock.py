@@ -25,13 +25,14 @@ MAX_INTERVAL: float = _PRIORS.near
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    If the intervals are whole numbers of sampling steps, to within `clock.scatter` of `priors.toml` (rms), rows of NaN
-    are inserted for lost samples; else the samples are interpolated linearly. Rows without a time, or not later than
-    all rows before, are dropped. If long breaks divide the recording, only its longest stretch is used.
+    Rows without a time, or not later than all rows before (`_ordered_rows`), are dropped. If long breaks divide the
+    recording, only its longest stretch is used. If the intervals are then whole numbers of sampling steps, to within
+    `clock.scatter` of `priors.toml` (rms), rows of NaN are inserted for lost samples; else the samples are interpolated
+    linearly. A recording that needs none of this is returned as it is.
     """
     rows = _ordered_rows(recording.t)
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
-    if rows.size < 2:
+    if rows.size < 2:  # too few for a clock
         return recording.samples(slice(rows[0], rows[0] + 1) if rows.size else slice(0))
     t = recording.t[rows]
     steps = np.diff(t) * recording.rate
@@ -93,7 +94,7 @@ def _insert_lost_rows(recording: Recording, rows: NDArray[np.intp], steps: NDArr
 def _interpolate_rows(recording: Recording, rows: NDArray[np.intp]) -> Recording:
     """Interpolate the rows with the indices `rows` linearly to evenly spaced times at the sampling rate.
 
-    The result is NaN within intervals over `MAX_INTERVAL` median intervals, except in slow channels.
+    A channel, unless it is slow, is NaN between known samples over `MAX_INTERVAL` of its median intervals apart.
     """
     t = recording.t[rows]
     even_times = t[0] + np.arange(int((t[-1] - t[0]) * recording.rate) + 1) / recording.rate

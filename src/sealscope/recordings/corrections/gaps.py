@@ -66,7 +66,7 @@ def remove_unsupplied(recording: Recording) -> Recording:
     A sensor of 4 to 20 mA then reads a quarter of its range below zero; the fraction `gaps.live_zero` (`priors.toml`),
     a little less, is enough. These samples are
 
-    - all channels, where each chamber pressure is below vacuum by more than this fraction of its own maximum;
+    - all channels, where both chamber pressures are below vacuum by more than this fraction of their own maxima;
     - the position alone, where it is constant from the first sample or up to the last one, and outside of all its other
       values by more than this fraction of their range, if these are at least `_MIN_POSITIONS` different ones. It may be
       so at both ends.
@@ -83,7 +83,7 @@ def remove_unsupplied(recording: Recording) -> Recording:
 
 
 def _is_below_live_zero(pressure: Array) -> Flags:
-    """Flag the samples (n,) of a sensor without a supply: a `pressure` p [Pa] < -P_ATM - `gaps.live_zero` max(0, p)."""
+    """Flag the samples (n,) of a sensor without a supply: p [Pa] < -P_ATM - `gaps.live_zero` max(0, all p)."""
     return np.asarray(pressure < -P_ATM - _GAPS.live_zero * np.nanmax(pressure, initial=0.0))
 
 
@@ -132,12 +132,13 @@ def bridge(recording: Recording, needed: Sequence[str]) -> Recording:
     Values that other channels miss in the same rows are filled in the same way. The times must be evenly spaced.
     """
     is_complete = np.all([np.isfinite(recording[name]) for name in needed], axis=0)
-    if not len(recording) or is_complete.all() or not is_complete.any():
+    if not len(recording) or is_complete.all() or not is_complete.any():  # no gaps, or no readings beside them
         return recording
     # copies of the channels, in which infinite values are missing, too
     channels = {name: np.where(np.isfinite(values), values, np.nan) for name, values in recording.channels.items()}
     stretches = uniform_segments(recording, needed)
     longest_stretch = max(stretches, key=lambda stretch: stretch.stop - stretch.start, default=None)
+    # its period [s], by the longest stretch without gaps
     cycle = None if longest_stretch is None else find_cycle(recording.samples(longest_stretch).only(needed))
     bridged, spline_rows, line_rows = np.zeros((3, len(recording)), dtype=bool)
     for first, length in find_runs(~is_complete).tolist():
@@ -215,9 +216,9 @@ def _finite_mean(values: Array) -> float:
 def _copy_other_cycle(channels: dict[str, Array], needed: Sequence[str], first: int, stop: int, period: float) -> bool:
     """Fill a gap in all channels, in place, from a nearby cycle of motion; return False if no cycle is similar enough.
 
-    The two nearest cycles on either side are tried, the nearer ones first. `channels`: name -> values (n,); `first`,
-    `stop`: the gap's first sample, and the first one after it; `needed`: channels that must be complete in the copied
-    cycle; `period`: length of a cycle [samples].
+    The two nearest cycles on either side are tried, the nearer ones first, each with up to `_SLACK` samples more or
+    less. `channels`: name -> values (n,); `first`, `stop`: the gap's first sample, and the first one after it;
+    `needed`: channels that must be complete in the copied cycle; `period`: length of a cycle [samples].
     """
     half_cycle = round(0.5 * period)
     # the copied samples must not overlap the gap, nor the half cycle next to it
@@ -262,7 +263,11 @@ def _cycle_mismatch(
 
 
 def _copy_shifted(values: Array, first: int, stop: int, shift: int) -> None:
-    """Fill a gap in place with the values `shift` samples later, plus a linear offset by which they join its ends."""
+    """Fill a gap in place with the values `shift` samples later, plus a linear offset by which they join its ends.
+
+    `_cycle_mismatch` has found that the recording contains both, with `_N_END` samples beside each. A channel with no
+    value in one of these groups of samples gets the offset NaN: its gap stays.
+    """
     ends = (slice(first - _N_END, first), slice(stop, stop + _N_END))
     offset_before, offset_after = (
         _finite_mean(values[end]) - _finite_mean(values[end.start + shift : end.stop + shift]) for end in ends

@@ -52,9 +52,9 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     5. speeds and flows without a sign;
     6. gaps, which are interpolated or bridged, and incomplete rows at the ends, which are cut off.
 
-    Steps 3 and 5, bridged gaps, and rows that steps 4 and 6 leave out are reported as findings. Channels without any
-    value are left out, except chamber pressures. A chamber pressure that is stuck in more than `MAX_STUCK_FRACTION` of
-    the rows stays as it is, and is named as unusable.
+    Steps 3 and 5, bridged gaps, and rows outside of the time span that is left are reported as findings. Channels
+    without any value are left out, except chamber pressures. A chamber pressure that is stuck in more than
+    `MAX_STUCK_FRACTION` of the rows keeps these rows, and is named as unusable.
     """
     part = remove_unsupplied(remove_dropouts(remove_impossible(recording)))
     part = set_missing(part, dict.fromkeys(part.channels, flag_frozen_rows(part)))

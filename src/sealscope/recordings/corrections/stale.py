@@ -111,7 +111,7 @@ def _jumps_at(values: Array, row: int) -> bool:
     """Test whether a channel (n,) changes around `row` by more than the quantile `stale.leap` of its usual changes.
 
     Changes are those over 7 sampling steps, here from 4 rows before `row` to 3 rows after it, as the holds of p_A and
-    p_B may begin or end up to 3 rows apart.
+    p_B may begin or end up to 3 rows apart. False if either sample is missing.
     """
     change = np.abs(values[min(row + _MAX_REPEAT, len(values) - 1)] - values[max(row - _MAX_REPEAT - 1, 0)])
     usual_change = np.nanquantile(np.abs(values[2 * _MAX_REPEAT + 1 :] - values[: -2 * _MAX_REPEAT - 1]), _PRIORS.leap)
@@ -125,7 +125,7 @@ def _moves_in(values: Array, rows: NDArray[np.intp]) -> bool:
 
 
 def _find_equal_runs(values: Array) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Divide a channel (n,) into its k runs of equal values; return the first index (k,) and a flag (k,) of each.
+    """Divide finite values (n > 0,) into k runs of equal ones; return the first index (k,) and a flag (k,) of each.
 
     A run is flagged if it both begins and ends with a jump of more than `_MIN_JUMP` quantisation steps.
     """
@@ -139,9 +139,10 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     """Estimate the time [s] for which a channel (n,) that is slower than its logger repeats each reading.
 
     It is the mean duration of the regular runs among the runs of equal values that begin and end with a jump
-    (`_find_equal_runs`). A run is regular if its duration is within the fraction `stale.spread` (`priors.toml`) of the
-    median. Returns None for fewer than `stale.runs` runs, if less than the fraction `stale.share` of them is regular,
-    if their median length is below two samples, or if the mean is below `stale.shortest` [s]. `t` (n,): times [s].
+    (`_find_equal_runs`), in the first `_N_ESTIMATE` samples. A run is regular if its duration is within the fraction
+    `stale.spread` (`priors.toml`) of the median. Returns None for fewer than `stale.runs` runs, if less than the
+    fraction `stale.share` of them is regular, if their median length is below two samples, or if the mean is below
+    `stale.shortest` [s]. `t` (n,): times [s].
     """
     t, values = t[:_N_ESTIMATE], values[:_N_ESTIMATE]
     known = np.isfinite(values) & np.isfinite(t)
@@ -151,7 +152,7 @@ def estimate_holding_period(t: Array, values: Array) -> float | None:
     starts, is_bounded = _find_equal_runs(values)
     ends = np.r_[starts[1:], values.size]
     lengths = (ends - starts)[is_bounded]
-    durations = (t[np.minimum(ends, t.size - 1)] - t[starts])[is_bounded]
+    durations = (t[np.minimum(ends, t.size - 1)] - t[starts])[is_bounded]  # the last run, which has no end, is not
     if lengths.size < _PRIORS.runs or np.median(lengths) < 2:
         return None
     median_duration = float(np.median(durations))
@@ -196,6 +197,7 @@ def _flag_repeated_rows(channels: list[Array]) -> NDArray[np.bool_]:
     p_equal = float(np.prod([np.mean(flags) for flags in equal]))  # if channels repeat independently
     runs = find_runs(is_same)
     first, stop = runs[:, 0], runs.sum(axis=1)
+    # the jumps below need the rows first - 2 and stop
     is_short = (stop - first < _MAX_REPEAT) & (first > 1) & (stop < is_same.size)
     first, stop = first[is_short], stop[is_short]
     is_candidate = np.zeros(first.size, dtype=bool)

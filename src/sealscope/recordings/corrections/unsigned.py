@@ -36,9 +36,10 @@ _NAMES = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
-    The result is positive for flow into chamber A. Samples within the noise get random signs. A channel whose sign
-    cannot be found stays as it is. A flow q_pump without a sign that was measured in a valve's supply line
-    (`_is_in_supply_line`) becomes the channel q_supply. Also returns a finding for each channel that was changed.
+    The magnitude gets the sign of the flow into chamber A (`_find_sign`), and random signs within the noise
+    (`_draw_noise_signs`). A channel whose sign cannot be found stays as it is. A flow q_pump without a sign that was
+    measured in a valve's supply line (`_is_in_supply_line`) becomes the channel q_supply. Also returns a finding for
+    each channel that was changed.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     for name, quantity in _NAMES.items():
@@ -48,7 +49,7 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
         sign, source = _find_sign(recording, np.abs(values))
         if sign is None:
             continue
-        # sign of the side of zero on which the channel stays
+        # a channel that stays below zero is mirrored, so that all but its noise is positive
         main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
         channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
         text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
@@ -119,7 +120,7 @@ def _piston_speed(x: Array, rate: float) -> Array:
     """
     n_half = _half_span(rate)
     x = _interpolate_missing(x)
-    # the position is constant before the beginning and after the end
+    # the position is taken as constant before the beginning and after the end
     padded = np.concatenate([x[:1].repeat(n_half), x, x[-1:].repeat(n_half)])
     return np.asarray((padded[2 * n_half :] - padded[: -2 * n_half]) * (0.5 * rate / n_half))
 
@@ -216,7 +217,7 @@ def _interpolate_missing(values: Array) -> Array:
 
 
 def _draw_noise_signs(values: Array, rate: float) -> Array:
-    """Restore the zero mean of noise that is recorded without its sign, by random signs; return values (n,).
+    """Restore the zero mean of noise that is recorded without its sign, by random signs; missing values (n,) stay so.
 
     The magnitude of normal noise has a mean of sqrt(2 / (pi - 2)) = 1.32 times its standard deviation. Where the ratio
     of the local mean of `values` (n,) to their local standard deviation, from second differences, is at most 1.32 plus
@@ -253,7 +254,7 @@ def _most_likely_signs(log_odds: Array, cost_of_change: Array) -> Array:
         path_odds[k] = odds
     # if its odds exceed the cost of the next change, a sample keeps its sign whatever follows
     decided = np.abs(path_odds) > np.append(cost_of_change, 0.0)
-    decided[-1:] = True
+    decided[-1:] = True  # a slice, as there may be no samples
     # the first decided sample from each sample on
     following = np.flatnonzero(decided)[np.searchsorted(np.flatnonzero(decided), np.arange(log_odds.size))]
     return np.where(path_odds[following] < 0.0, -1.0, 1.0)

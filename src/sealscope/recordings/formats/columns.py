@@ -410,5 +410,6 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         # is then refused (`convert_columns`), unless the user has mapped it
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
+    # in the order of the first column of each in the file
     choice.channels = dict(sorted(choice.channels.items(), key=lambda item: next(iter(item[1].factors))))
     return choice

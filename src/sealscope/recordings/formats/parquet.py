@@ -104,6 +104,7 @@ def _read_values(read_column: Callable[[], Any], field: Any, n_rows: int) -> NDA
     if types.is_duration(field.type):
         return np.asarray(read_column().cast(pyarrow.duration("ns")).to_numpy())
     if types.is_integer(field.type) or types.is_floating(field.type) or types.is_decimal(field.type):
+        # safe=False: integers that no double can hold are rounded, not refused
         return np.asarray(read_column().cast(pyarrow.float64(), safe=False).to_numpy(), dtype=np.float64)
     raise InputError(f"{field.name} must hold numbers, got the type {field.type}")
 

@@ -275,7 +275,7 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:
     """Test whether `time` (n,) has a date stamp with a time of day other than midnight; False for numbers."""
-    known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]
+    known = time[~np.isnat(time)] if time.dtype.kind == "M" else time[:0]  # numbers: no stamps
     return not (known == known.astype("datetime64[D]").astype(known.dtype)).all()
 
 
@@ -329,8 +329,8 @@ def read_times(time: Series, start: np.datetime64 | None = None) -> tuple[Array,
 def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str]]:
     """Give each series of a file a unique name; return the series, and lines for the history.
 
-    The series in the group with most channels or, among equal groups, with most samples keeps its name. Others are
-    called by their paths, `group/name`. If no series has a group, all stay as they are.
+    Of series with one name, that in the group with most channels or, among equal groups, with most samples keeps it;
+    the others are called by their paths, `group/name`. If no series has a group, all stay as they are.
     """
     if all(member.group == "" for member in series):
         return list(series), []
@@ -425,7 +425,7 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
     Samples that are slower than `t` or equally fast are interpolated linearly, with NaN within long intervals and
     beyond the ends; faster ones are averaged around the times. Samples that have the times `t` already are returned
     unchanged. If the start of either clock is unknown, both are assumed to count from one moment. Also returns a note
-    for the history, or "". Raises InputError unless the series' times increase.
+    for the history, or "". Raises InputError unless the series has two values or more, at increasing times.
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
@@ -495,7 +495,7 @@ def _read_long_channel(
     elif "start" in fields.provenance:
         start = np.datetime64(fields.provenance["start"]).astype("datetime64[ns]")
     elif times.dtype.kind == "M" and times.size > 0:  # times of day without a date
-        start = np.nanmin(times)
+        start = np.nanmin(times)  # the first, or the last of rows that are reversed
     return fields.channels["u"], fields.t, start
 
 
@@ -521,7 +521,7 @@ def _pivot_long_table(
         labels = [days if label.name.casefold() == "time_ms" else label for label in labels]
     choice = choose_columns(labels, _count_request(value_column))
     assert choice.time is not None  # `choose_columns` raises InputError without a time
-    choice.notes.clear()
+    choice.notes.clear()  # they are about `u`, which stands for each channel in turn
     kinds = dict.fromkeys(text_columns, "texts") | ({} if validity_column is None else {validity_column: "any"})
     kinds |= choice.columns | {value_column: "any"}  # "any": numbers, with inf in place of words
     kinds[choice.time] = kinds.pop(choice.time)  # the time comes last

@@ -153,7 +153,10 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         time_of_column = {column: max(time for time in time_columns if time < column) for column in columns}
 
     def prepare(kinds: Mapping[int, str], date: int | None) -> Sequence[str]:
-        """Read the columns with the indices `kinds` in `columns`, and their times; return lines for the history."""
+        """Read the columns with the indices `kinds` in `columns`, and their times; return lines for the history.
+
+        `date`: column of the date in a long table, whose indices in `columns` are the columns' numbers.
+        """
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
         log = _Log(path, layout, kinds_by_column | time_kinds, None if time_columns else date)
@@ -233,7 +236,7 @@ class _Block:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return the block of the rows in a slice."""
+        """Return the block of the rows in a slice; `first_words` stay those of the whole block."""
         first, stop, _ = rows.indices(len(self))
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
@@ -272,7 +275,7 @@ class _Log:
         for first_line, content, end, is_cut in self._iter_line_blocks():
             block = self._read_by_arrow(first_line, content, end) if self.uses_arrow and not is_cut else None
             if block is None:
-                if first_line == 1:  # later blocks fail also for a comment or a word
+                if first_line == 1:  # pyarrow cannot read this layout; a later block may just contain a word or comment
                     self.uses_arrow = False
                 rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
                 self._count_rows(len(rows))
@@ -382,7 +385,7 @@ class _Log:
         result = _Block({column: _arrow_values(cells) for column, cells in zip(self.kinds, table.columns, strict=True)})
         if any(np.isinf(cells).any() for cells in result.columns.values()):
             return None
-        self.has_stamps, self.last_width = False, width
+        self.has_stamps, self.last_width = False, width  # the times are numbers, too
         self._count_rows(len(result))
         return result
 
@@ -552,7 +555,8 @@ class _Log:
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
 
-        Rows with a word as the time are left out, and `blocks` are emptied. Raises InputError for too many words.
+        Rows with a word as the time are left out, and `blocks` are emptied. Raises InputError if the log has had too
+        many words until now.
         """
         labels = self.layout.labels
         notes: list[str] = []
@@ -653,4 +657,4 @@ def _arrow_values(cells: Any) -> Array:
             bits = np.unpackbits(np.frombuffer(validity, np.uint8), count=stop, bitorder="little")[first:]
             part = np.where(bits, part, np.nan)
         parts.append(part)
-    return parts[0] if len(parts) == 1 else np.concatenate([*parts, np.empty(0)])
+    return parts[0] if len(parts) == 1 else np.concatenate([*parts, np.empty(0)])  # empty: there may be no chunk

@@ -153,8 +153,8 @@ def _detect_dialect(body: Sequence[str]) -> tuple[str, str, int]:
 def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
     """Split the heading line of a log into the names of columns.
 
-    If the `delimiter` is a blank, a unit in brackets stays with its name. If this does not give `width` names, but a
-    split at tabs and at two or more blanks does, this split is used.
+    If the `delimiter` is a blank, a unit in brackets stays with its name. If this does not give `width` names (0: not
+    known), but a split at tabs and at two or more blanks does, this split is used.
     """
     if delimiter == " ":
         names = _SPACED_LABEL.findall(line)
@@ -164,7 +164,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
-    """Parse a row of units, with None for an empty cell; return None if under 60 % of the units are known."""
+    """Parse a row of units, with None for an empty cell; return None if none, or under 60 %, of them are known."""
     texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
     n_known = sum(unit is not None and is_unit(unit) for unit in units)
@@ -250,7 +250,7 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
         and (units := _parse_unit_row(rows_above[0])) is not None
         and None not in units
         and len(units) == len(row) > 1
-    ):  # units above the names
+    ):  # units above the names, one for each; others may be names of groups
         rows_above, n_rows = rows_above[1:], n_rows + 1
     else:
         units = []

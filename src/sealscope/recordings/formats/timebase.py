@@ -276,6 +276,7 @@ def interpolate_samples(t: Array, times: Array, values: Array, max_interval: flo
     result, intervals = np.interp(t, times, values, left=np.nan, right=np.nan), np.diff(times)
     next_sample = np.clip(np.searchsorted(times, t), 1, times.size - 1)
     is_long = intervals > max_interval * float(np.median(intervals))
+    # within a long interval, but not at the samples that bound it
     result[is_long[next_sample - 1] & (t > times[next_sample - 1]) & (t < times[next_sample])] = np.nan
     return result
 
@@ -295,8 +296,8 @@ def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState)
     """Convert date stamps (n,) of the time column `name` to seconds from the first stamp.
 
     Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
-    hour are removed. In dated stamps a single jump by an hour in the night, due to daylight saving time, is removed.
-    Raises InputError if all stamps are missing.
+    hour are removed. In dated stamps a single jump by an hour is removed, as that of daylight saving time, if a stamp
+    is before 4 o'clock. Raises InputError if all stamps are missing.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
@@ -363,7 +364,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
         try:
             elapsed = np.timedelta64(round(to_si(first, unit_of_time, "s") * 1e9), "ns")
             return seconds, {"start": iso_moment(parse_stamps([since["start"]])[0] + elapsed)}, []
-        except (ValueError, OverflowError):
+        except (ValueError, OverflowError):  # no date in a known form, or one too far: stated as written
             return seconds, {"start": f"{first:g} {unit}"}, []
     seconds = to_si(values, unit, "s", name="time")
     epoch = float(seconds[np.isfinite(values)][0])
@@ -392,7 +393,7 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
         start = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
         return (values - first) * _DAY, start, [note]
     is_row_count = is_first_part and finite.size == values.size and np.all(np.diff(finite) == 1)
-    if is_row_count and abs(first) < _MIN_EPOCH:
+    if is_row_count and abs(first) < _MIN_EPOCH:  # larger ones may be seconds since 1970, at 1 Hz
         raise InputError(
             f"time must be in seconds, got a count of rows {first:g}, {first + 1:g}, ... in column {name}: "
             f"give the rate, or the unit of its column (t={name} ms)"
@@ -483,6 +484,7 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
         samples_per_step = float(n_samples.sum() / n_steps.sum())
         if samples_per_step < 2.0 or np.abs(n_samples / n_steps - samples_per_step).max() > 1.0:
             return None
+        # uncertain by one sample of all
         rate = _shortest_decimal(samples_per_step / resolution, slack=1.0 / float(n_samples.sum()))
     elif state.resolution is not None and state.rate is not None and steps.max(initial=0.0) < 1.5 * state.resolution:
         resolution, rate = state.resolution, state.rate

@@ -97,7 +97,7 @@ def result_text(result: CampaignResult) -> str:
     """Summarise in a few sentences the leaks that the best detectors of a campaign find, and their false alarms.
 
     At most `_MAX_NAMED` detectors are described, in the order of a90; those without an a90 within the tested sizes
-    come last, ordered by the fraction of the largest leaks that they find.
+    come last, by falling fraction of the largest leaks that they find.
     """
     judgement, unit = result.judgement, result.plan.unit
     ranked_findings: list[tuple[float, float, str]] = []
@@ -171,7 +171,7 @@ def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
 
 
 def _is_batched(result: CampaignResult) -> bool:
-    """Return True if a campaign's records were simulated in batches, and not one by one, or recorded."""
+    """Return True if a campaign's records were simulated in batches, False if one by one or if they are recordings."""
     return result.mode not in ("", RUN_BY_RUN)
 
 
@@ -282,7 +282,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
+    """Describe the score from which the ROC curve of a detector is computed; "" for `watch` and if it is not installed.
 
     The word after the "@" in a `name` such as "diagnose @ pressures" is the view, i.e. the set of channels it is given.
     """
@@ -302,8 +302,8 @@ _Curve = tuple[str, Array, Array, tuple[Array, Array] | None]
 def _pod_plot(pod: DetectorPod, unit: str) -> dict[str, Any] | None:
     """Draw the fraction of leaks that a detector finds over the leak size, with the fitted curve, a90 and a90/95.
 
-    More than `_MAX_FRACTIONS` fractions are left out. Returns title and picture by name for the page's template, or
-    None for fewer than two sizes.
+    The fractions are left out if there are more than `_MAX_FRACTIONS`. Returns title and picture by name for the page's
+    template, or None for fewer than two sizes.
     """
     if len(pod.sizes) < 2:
         return None

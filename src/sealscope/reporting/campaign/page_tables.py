@@ -81,7 +81,7 @@ def cause_tables(judgement: Judgement) -> list[dict[str, Any]]:
 
 
 def _format_quantile(quantile: IntervalEstimate) -> str:
-    """Format a quantile with its interval, such as "1.2 (0.9–1.8)"; a number that is not finite is a dash."""
+    """Format a quantile, with its interval if an end is finite, such as "1.2 (0.9–1.8)"; a dash if it is not finite."""
     if not math.isfinite(quantile.value):
         return "–"
     if not (math.isfinite(quantile.low) or math.isfinite(quantile.high)):

@@ -81,6 +81,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     if not known_levels:
         return None
     has_dates = all(entry.start_s is not None for entry in ordered)
+    # `or`: for type checkers
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
     # values above 8 times the median would flatten the others; they are drawn as a symbol at the top

@@ -115,7 +115,7 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
 def _y_limits(trend: Trend) -> tuple[float, float]:
     """Compute the limits (low, high) of the leakage axis, which include intervals, healthy ranges and, in L/min, zero.
 
-    The repair limit is included if it is below 2.5 times these values, because a higher one would flatten the curve.
+    The repair limit is included if it is below 2.5 times the highest of these, as a higher one would flatten the curve.
     """
     ends = [value for point in trend.points for value in (point.low, point.high) if value is not None]
     ends += [end for episode in trend.episodes for end in (episode.wear.healthy.low, episode.wear.healthy.high)]

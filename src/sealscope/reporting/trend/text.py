@@ -130,7 +130,7 @@ def _format_reach(trend: Trend, limit: float, reach: Interval) -> str:
     """Format the repair limit, and the predicted date at which the leakage reaches it, or why none is stated.
 
     `limit`: in the unit of the trend; `reach` [days]: time from the last compared recording until then (`Wear.reach`).
-    Without an alarm only the earliest date is stated.
+    Without an alarm, or if that time is over `TREND.history.furthest`, at most the earliest date is stated.
     """
     limit_text = f"{number(limit, 2)} {trend.unit} in all"
     first, last = (trend.points[row].day for row in (trend.rows[0], trend.rows[-1]))
@@ -211,5 +211,6 @@ def trend_csv(trend: Trend) -> str:
     with io.StringIO(newline="") as text:
         table = csv.writer(text, lineterminator="\n")
         table.writerow(("file", time, "day [d]", *levels, "group", "temperature [degC]", "note"))
+        # the entries of a point have the order of the columns
         table.writerows(map(guard_cell, row.values()) for row in trend.as_dict()["points"])
         return text.getvalue()

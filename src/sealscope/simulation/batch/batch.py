@@ -149,7 +149,8 @@ def simulate_batch(
     InputError
         The runs cannot be in one batch.
     SimulationFailed
-        A run diverged or fell below vacuum; the message names it.
+        A run diverged or fell below vacuum, which the message names; the step is too long for a run; or the search for
+        leakage coefficients fails.
 
     Examples
     --------
@@ -210,8 +211,8 @@ def _run_set(
 def choose_step(experiment_set: ExperimentSet, coefficients: Array, error: float) -> float:
     """Choose the solver's step [s] for a set of experiments with leakage `coefficients` (runs,).
 
-    It is the shortest of `longest_allowed_step` and of the steps that `integrate` finds for a pressure error of `error`
-    [Pa rms] in the first 4 s of up to four runs, evenly spread over the set.
+    It is the shortest of `longest_allowed_step` and of the steps that `integrate_run` finds for a pressure error of
+    `error` [Pa rms] in the first 4 s of up to four runs, evenly spread over the set.
     """
     members, steps = experiment_set.members, [longest_allowed_step(experiment_set, coefficients)]
     for k in np.unique(np.linspace(0, len(members) - 1, _N_SAMPLE_RUNS).round().astype(int)):
@@ -246,6 +247,7 @@ def _size_leaks(experiment_set: ExperimentSet, step: float, coefficients: Array,
 
     def measure_unit_flows(trial_coefficients: Array) -> tuple[Array, None]:
         """Simulate the set; return the flows per unit of coefficient (runs,) that `size_leaks` needs, and no run."""
+        # the first trial may be 0: then the flow of a leak of coefficient 1 is computed (`build_leak_rows`)
         flow_coefficients = np.where(trial_coefficients > 0, trial_coefficients, 1.0)
         run_step = stated_step or min(step, longest_allowed_step(experiment_set, trial_coefficients))
         run = SetRun(experiment_set, run_step, trial_coefficients, flow_coefficients=flow_coefficients, bounds=None)

@@ -46,9 +46,8 @@ def noise_keys(seeds: list[int]) -> Array:
 
 
 def uniform(key: Any, position: int) -> Any:
-    """Draw a uniform random number in (0, 1] for each run of a vector of runs.
+    """Draw a uniform random number in (0, 1] for each run of a vector of runs, in code that `_lower_uniform` builds.
 
-    This is only a declaration: `_lower_uniform` generates the compiled code.
     `key`: keys of the runs' noise (`noise_keys`); `position` >= 0: position in the sequences of random numbers.
     """
 

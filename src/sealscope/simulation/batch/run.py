@@ -60,7 +60,7 @@ class Member:
 
     @cached_property
     def step_limiting_parameters(self) -> tuple[RigNumbers, ...]:
-        """The model's parameters without changes and at each fault, which limit the solver's step."""
+        """The model's parameters without changes and beside each breakpoint of a change, for the check of the step."""
         return step_limiting_parameters(self.effects, self.numbers, self.experiment.duration)
 
 
@@ -402,7 +402,7 @@ class SetRun:
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
         table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
         chunks = self._chunks()
-        history = self.taps_before + self.taps_after + self.oversampling  # earlier outputs that later samples need
+        history = self.taps_before + self.taps_after + self.oversampling  # outputs for later samples, with a margin
         longest = max(stop - start for _, _, start, stop in chunks)
         # (groups, outputs of history and chunk, channels, width)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))

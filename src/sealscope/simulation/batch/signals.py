@@ -71,7 +71,7 @@ def _read_pressure(
     """Compute the readings [Pa] of a pressure channel in a group of runs from the filtered `pressure` [Pa].
 
     `sensor`, `row`: as in `convert_lanes`; `channel_noise`, `common_noise`: standard normal numbers; `drift` [Pa]: that
-    of the offset so far; `sample`: number of the sample; `samples_since`: since the one for which `sensor` was built.
+    of the offset so far; `sample`: number of the sample; `samples_since`: samples since that of the values in `sensor`.
     """
     gain = load(sensor, row + GAIN) + samples_since * load(sensor, row + GAIN_RISE)
     offset = load(sensor, row + OFFSET) + samples_since * load(sensor, row + OFFSET_RISE)

@@ -144,6 +144,7 @@ def _draw_nuisance(nuisance: Nuisance, seed: int, oil: Wander) -> tuple[dict[str
         groups = [(f"{nuisance.name}/{parameter}", (parameter,)) for parameter in nuisance.parameters]
     for stream_name, group in groups:
         random = _random_stream(seed, stream_name)
+        # without a range no number is drawn: the drift takes the stream's first numbers
         value = float(random.uniform(nuisance.low, nuisance.high)) if nuisance.high > nuisance.low else nuisance.low
         values |= dict.fromkeys(group, value)
         if nuisance.drift is not None:

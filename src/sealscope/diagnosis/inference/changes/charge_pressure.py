@@ -68,9 +68,9 @@ def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     `charge.near` (`priors.toml`) of the chamber's lowest pressure, its quantile `LOWEST`, and change more slowly than
     `charge.steady` [Pa/s]: a load that swings through zero lowers the pressure only for a moment. While the pump rests
     no sample counts, as shut valves may enclose any pressure. A chamber is left out if its lowest pressure exceeds that
-    of the other chamber by `charge.near` or more, or if at most the fraction `charge.share` of the samples of a turning
-    pump counts. The result is empty for a recording shorter than `MIN_SAMPLES`, and if a pressure, or both angle and
-    speed of the pump, are not recorded.
+    of the other chamber by `charge.near` or more, if at most the fraction `charge.share` of the samples of a turning
+    pump counts, or if these do not determine the drift (`_fit_drift`). The result is empty for a recording shorter than
+    `MIN_SAMPLES`, and if a pressure, or both angle and speed of the pump, are not recorded.
     """
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
@@ -86,7 +86,7 @@ def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     window = max(1, round(prior.seconds * rate))
     drifts = dict[str, Estimate]()
     for side, p, low in zip("AB", pressures, lowest, strict=True):
-        slope = np.full(len(p), np.nan)  # over twice `charge.seconds`
+        slope = np.full(len(p), np.nan)  # over twice `charge.seconds`; samples at the ends, with NaN, do not count
         slope[window:-window] = (p[2 * window :] - p[: -2 * window]) * rate / (2 * window)
         is_low = is_known & np.isfinite(p) & (p < low + prior.near) & (np.abs(slope) < prior.steady)
         if low < min(lowest) + prior.near and is_low.sum() > prior.share * is_known.sum():
@@ -172,9 +172,9 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
 
     The envelope is a robust fit in which samples above it count less than those below. `regressors` (n, k): pump flow
     and position, which are fitted together with the drift; `rows`: indices of the samples to fit, which are thinned out
-    if they are many. Return None for fewer than `MIN_SAMPLES` samples, without a finite standard error, and for a drift
-    larger than samples can have that lie within `charge.near` of their lowest pressure: few visits to the charge
-    pressure do not determine it.
+    if they are many. Return None for fewer than `MIN_SAMPLES` samples, without a finite standard error, and if the
+    drift over the recording reaches `charge.range` times `charge.near`: as all samples lie within `charge.near`, such a
+    drift comes from too few visits to the charge pressure.
     """
     rows = rows[:: max(1, len(rows) // MAX_SAMPLES)]
     if len(rows) < MIN_SAMPLES:

@@ -68,7 +68,7 @@ def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
 def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
     """Flag the blocks (K,) in motion for at least the fraction `features.busy` (`priors.toml`) of the busiest's time.
 
-    `fractions` (K,): fraction of each block's samples in which it moves (`time_in_motion`).
+    All are flagged if none moves. `fractions` (K,): fraction of each block's samples in motion (`time_in_motion`).
     """
     return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
@@ -92,16 +92,17 @@ def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:
 def duty_observables(time: Array, amplitudes: Mapping[str, Array]) -> Iterator[Observable]:
     """Yield an observable if the machine's duty (commanded motion) changes suddenly, else nothing.
 
-    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) of command and motion
-    (`log_amplitudes`). Both must rise, or both fall, by similar amounts (`_MIN_STEP_RATIO`), since a leak changes only
-    one amplitude. Score, onset and size are those of the test with the lower score. The p-value is twice the higher
-    one, since a step may be up or down. Nothing is yielded if an amplitude cannot be tested.
+    `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) of command and motion (`log_amplitudes`).
+    Both must rise, or both fall, by similar amounts (`_MIN_STEP_RATIO`), since a leak changes only one amplitude; a
+    motion without a recorded command is tested alone. Score, onset and size are those of the test with the lower score.
+    The p-value is twice the higher one, since a step may be up or down. Nothing is yielded if an amplitude cannot be
+    tested.
     """
     tests = [test for values in amplitudes.values() if (test := feature_step_test(time, values)) is not None]
     if len(tests) < len(amplitudes):
         return
     steps = np.abs([test.fitted.value for test in tests])
-    has_one_sign = len({test.sign for test in tests}) == 1
+    has_one_sign = len({test.sign for test in tests}) == 1  # also false without any amplitude
     if has_one_sign and steps.min() > _MIN_STEP_RATIO * steps.max():
         weakest = min(tests, key=lambda test: test.score)
         least_certain = max(tests, key=lambda test: test.chance)
@@ -212,7 +213,8 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
     """Compute the log power (K,) of a spectral line in blocks (K, n), relative to the power of the neighbouring bins.
 
     Ringing is wider than a line, so it raises the neighbouring bins as well and cancels. `frequency`: frequency of the
-    line, divided by the sampling rate. The power is the mean over both halves of each block (Welch's estimate).
+    line, divided by the sampling rate. The power is the mean over both halves of each block (Welch's estimate), NaN if
+    a sample is missing.
     """
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)

@@ -116,7 +116,7 @@ def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
     min_count = _PRIORS.blocks[-1]  # long cycles may leave fewer blocks
     for length in lengths:
         count = len(recording) // max(length, 1)
-        if length < 2 or count < min_count:
+        if length < 2 or count < min_count:  # a block needs both directions of motion
             continue
         blocks = rows[: count * length].reshape(count, length, rows.shape[1])
         gram = blocks.transpose(0, 2, 1) @ blocks
@@ -150,8 +150,9 @@ def pressure_level_rows(
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
     """Fit level_A, level_B, half_A and half_B in K blocks, (K, 4) [Pa]; None if a block has too few of one direction.
 
-    `gram` (K, m, m): Gram matrices of `pressure_level_rows`; `length`: samples in a block; `means` (2,): means of the
-    pressures that were subtracted in these rows [Pa].
+    Too few are less than `levels.least` (`priors.toml`) times `length`. `gram` (K, m, m): Gram matrices of
+    `pressure_level_rows`; `length`: samples in a block; `means` (2,): means of the pressures that were subtracted in
+    these rows [Pa].
     """
     # free in each block: the constant and, if a motion is recorded, sign(v); the last two columns are p_A and p_B
     n_free = min(2, gram.shape[1] - 2)
@@ -163,10 +164,11 @@ def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | Non
     free = np.linalg.solve(gram[:, :n_free, :n_free], gram[:, :n_free, n_free:])
     # eliminate the free coefficients of each block, then fit the motion's slopes to all blocks together
     reduced = (gram[:, n_free:, n_free:] - gram[:, n_free:, :n_free] @ free).sum(axis=0)
-    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], TINY))[:, None]
+    scale = np.sqrt(np.maximum(np.diag(reduced)[:-2], TINY))[:, None]  # to a unit diagonal, against rounding
     normalised, right_sides = reduced[:-2, :-2] / scale / scale.T, reduced[:-2, -2:] / scale
     slopes = np.linalg.lstsq(normalised, right_sides, rcond=None)[0] / scale
-    values = np.zeros((len(gram), 4))  # half changes stay 0 without a recorded motion
+    # level and half change of p_A and p_B, the free coefficients; half changes stay 0 without a recorded motion
+    values = np.zeros((len(gram), 4))
     values[:, : 2 * n_free] = (free[:, :, -2:] - free[:, :, :-2] @ slopes).reshape(len(gram), -1)
     values[:, :2] += means
     return values
@@ -234,7 +236,7 @@ def _test_patterns(time: Array, values: Array) -> list[Observable | None]:
         # each of its bases, so that the lowest rank counts
         change = min((test for test in tests if test is not None), key=lambda test: test.score, default=None)
         if change is not None and change.onset is not None:
-            # a loss of oil (CHARGE) lowers the sum of both levels; if they rise, the supply feeds both chambers
+            # a loss of oil (CHARGE) lowers the sum of both levels; if it does not fall, the supply feeds both chambers
             after = time > change.onset.value
             is_falling = after.any() and not after.all() and sum_of_levels[after].mean() <= sum_of_levels[~after].mean()
             if name == CHARGE and not is_falling:
@@ -321,6 +323,6 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Obser
     score = n_blocks * float(gains.max())
     # up or down in each direction, by the law under which the score is the most probable
     chance = 2.0 * n_directions * max(test.law.chance(score) for test in tests[:n_directions])
-    onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])
+    onset, block = float(tests[0].onsets[best]), float(time[1] - time[0])  # onsets are the same in all directions
     interval = Interval(onset, onset - block, onset + block)
     return Observable(name=name, data="levels", score=rank, chance=min(1.0, chance), onset=interval)

@@ -133,6 +133,7 @@ def _octave_powers(
             continue
         spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * hann)
         products = np.stack([np.abs(spectrum_A) ** 2, np.abs(spectrum_B) ** 2, spectrum_A * spectrum_B.conj()])
+        # lines are 1 / `octaves.seconds` apart, the width of the lowest octave: every octave has a line
         powers.append(np.add.reduceat(products[:, : first_lines[-1]], first_lines[:-1], axis=1))
     if not powers:
         return None

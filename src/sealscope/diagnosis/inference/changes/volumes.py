@@ -100,7 +100,7 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
-        prior = law_prior_of[_LEAK_EXPONENTS.get(name, 1.0)]
+        prior = law_prior_of[_LEAK_EXPONENTS.get(name, 1.0)]  # 1.0, without effect, for all but leaks past the piston
         advantage += 2.0 * float(np.log(prior / law_prior_of[1.0]))
         term = name.removesuffix(MADE_UP)  # the end of a name that marks a leak whose lost oil a check valve replaces
         if (accumulator_test := oil_loss.get(term)) is not None:

@@ -32,8 +32,9 @@ _PUMP_FLOWS = ("theta", "omega", "q_pump")
 def shows_open_circuit(rig: Rig, recording: Recording) -> bool | None:
     """Return True if a recording shows that the pump feeds one chamber at a time (`open_circuit_log_odds`).
 
-    The result is None if the recording cannot tell: the areas of the piston in `rig` are not stated, or equal; or the
-    flow of the pump, the position or a chamber pressure is not recorded, or has no unit.
+    The result is None if the recording cannot tell: the areas of the piston in `rig` are not stated, or hardly differ;
+    the flow of the pump or the position is not recorded, or a valve meters the flow; a chamber pressure is not recorded
+    in Pa; or there are fewer than two samples.
     """
     channels = frozenset(recording.channels)
     if not (rig.states("cylinder.A_A", "cylinder.A_B") and rig.cylinder.single_rod):
@@ -76,6 +77,7 @@ def open_circuit_log_odds(equation: Equation, signals: Signals) -> float:
     growing_A = motions_of_side(equation, "A")
     for loaded_side in "AB":
         same_load = [name for name in MOTIONS if name.endswith(f"{loaded_side} carries")]
+        # the motion in which the pump feeds A, so that A grows, and the one in which B grows
         (of_A,), (of_B,) = ([name for name in same_load if (name in growing_A) == is_A] for is_A in (True, False))
         if not (volumes[of_A] * volumes[of_B] < 0.0 and distances[of_A] * distances[of_B] < 0.0):
             continue  # the piston does not move both ways under this load

@@ -1,8 +1,8 @@
 """External leakage, from the volume of an accumulator that replaces the lost oil, in blocks of whole cycles.
 
-The gas of the accumulator (volume V and polytropic exponent n at the charge pressure) expands by V dp/(n p) when oil is
-lost, when the rod extends, and when it warms. With the pressure p of the unloaded side, the position x and the piston's
-areas A_A and A_B, the volume delivered by the middle of block k is
+The gas of the accumulator (volume V and polytropic exponent n at the absolute charge pressure) expands by V dp/(n p)
+when oil is lost, when the rod extends, and when it warms. With the pressure p of the unloaded side, the position x and
+the piston's areas A_A and A_B, the volume delivered by the middle of block k is
 
     y_k = -V p_k/(n p_charge) - (A_A - A_B) x_k = y_0 + sum_j g_j P_j tau (1 or 1/2) + w t + v t^2 + noise,
 
@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 def cycle_length(speed: Array, rate: float) -> float | None:
     """Estimate the period of a machine's cycle [s], from its strokes or else the strongest line of a speed's spectrum.
 
-    Return None if the recording has fewer than `MIN_BLOCKS` periods of that line. `speed` (n,): speed or flow; `rate`
-    [Hz].
+    Return None for fewer than `MIN_BLOCKS` periods of that line, too few for a step test. `speed` (n,): speed or flow,
+    without NaN; `rate` [Hz].
     """
     cycle = estimate_period(speed, rate)
     if cycle is None:
@@ -53,7 +53,7 @@ def recorded_oil_loss_tests(recording: Recording, rig: Rig, offset: float) -> di
     if not rig.cylinder.single_rod:
         return {}
     signals = Signals(samples_without_holes(recording, ("x", "p_A", "p_B")), recording.rate, offset=offset)
-    x_step = signals.step("x")
+    x_step = signals.step("x")  # missing steps count as 0 in the search for the cycle
     cycle = cycle_length(np.where(np.isfinite(x_step), x_step, 0.0) * recording.rate, recording.rate)
     return oil_loss_tests(signals, rig, cycle, float(recording.t[0]))
 
@@ -94,7 +94,7 @@ def oil_loss_tests(signals: Signals, rig: Rig, cycle: float | None, begin: float
 
 
 def _block_means(values: Array, edges: Array) -> Array:
-    """Average `values` (n,) over K blocks with the bounds `edges` (K + 1,), ignoring NaN; NaN if all values are NaN."""
+    """Average the known `values` (n,) over K blocks with the bounds `edges` (K + 1,); NaN for a block without any."""
     is_known = np.isfinite(values)
     sums, counts = (
         np.concatenate([[0.0], np.cumsum(series)])[edges] for series in (np.where(is_known, values, 0.0), is_known)

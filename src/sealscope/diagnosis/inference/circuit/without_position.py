@@ -73,16 +73,18 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     is_locked = equation.name == LOCKED  # shut valves hold the piston
     samples = samples_without_holes(recording, _READ)
     if not is_locked:
+        # `loaded`: a droop of the speed under load is no leakage
         samples = derive_drive_signals(samples, rig, recording.rate, loaded=True)
     signals = Signals(samples, recording.rate)
     # left side of the balance as a flow [m^3/s]: delivered by the pump, or displaced by a piston behind shut valves
     flow, dp = equation.left(signals) * recording.rate, signals.pressure_difference
-    # friction dissipates power, so a negative power means reversed signs of the flow
+    # friction dissipates power, so a negative power means reversed signs of the flow; the mean of p_A - p_B does not
+    # count, as a constant load takes no power over whole cycles
     if not is_locked and float(np.nansum((dp - np.nanmean(dp)) * flow)) < 0.0:
         recorded_left = equation.left
         equation, flow = equation._replace(left=lambda s: -recorded_left(s)), -flow
     is_known = np.isfinite(flow + dp)
-    if not is_known.any() or not np.ptp(flow[is_known]) > 0.0:
+    if not is_known.any() or not np.ptp(flow[is_known]) > 0.0:  # missing or stuck
         return []
     single_rod = rig.cylinder.single_rod
     # behind shut valves the piston is held while the command is constant; a control loop may hold it at any command
@@ -109,9 +111,9 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
 def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    The averaged flow is near zero below a fraction of its largest value, or below `min_limit` [m^3/s] if this is
-    larger. `flow` (n,): flow [m^3/s], infinite where the piston is surely not held. The two times and the fraction are
-    those of `held` in `priors.toml`.
+    The flow is averaged over `held.averaged` (`priors.toml`). It is near zero up to the fraction `held.slow` of its
+    largest value, or up to `min_limit` [m^3/s] if this is larger. The settling time is `held.settles`; before the first
+    sample the piston counts as held. `flow` (n,): flow [m^3/s], infinite where the piston is surely not held.
     """
     window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
@@ -129,7 +131,7 @@ def _build_blocks(
 
     `is_used` (n,): flags of the sampling intervals that may be part of a row; `begin`: time of the first sample [s];
     `one_sided`: use only rows in which one side has the higher pressure throughout, but for noise. Return None for
-    fewer than `MIN_BLOCKS` blocks.
+    fewer than `MIN_BLOCKS` blocks with rows.
     """
     left, dp, rate = equation.left(signals), signals.pressure_difference, signals.rate
     rows = _integrate_rows([*(term.increments(signals) for term in equation.terms), left], is_used, half_width, rate)
@@ -138,7 +140,8 @@ def _build_blocks(
         # weighted fraction of each row's window in which A has the higher pressure; the rows are rates, hence `/ rate`
         share_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
         rows = rows._replace(whole=rows.whole & (np.minimum(share_A, 1.0 - share_A) < _PRIORS.elsewhere))
-    # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`), or of `MAX_BLOCK_TIME`
+    # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`) or, for holds and shorter
+    # cycles, of `MAX_BLOCK_TIME`
     rows_per_block = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)
     n_blocks = len(rows.time) // rows_per_block
     n_used = n_blocks * rows_per_block
@@ -191,7 +194,8 @@ def _shrink_offset(values: Array, names: list[str]) -> None:
     """Reduce, in place, the leak's columns of rows `values` (r, c) by the part that sensor offsets may cause.
 
     The mean pressure difference d of a row, in the column of a laminar leak, becomes d - z^2/d, or 0 if |d| is smaller
-    than the largest usual offset z (Breiman's garrote). The column of an orifice is multiplied by the same factor.
+    than the offset z that 95 % of usual sensors do not exceed (Breiman's garrote). The column of an orifice is
+    multiplied by the same factor.
     """
     max_offset = WITHIN_95 * INFERENCE.zero.pressure
     mean_pressure = values[:, names.index(LEAK)]

@@ -27,7 +27,7 @@ def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None
     The result is the Schur complement G - C' (D + P)^-1 C, where C are the rows of G in `eliminated`, and D those of
     their entries that lie in these columns. The coefficient of a remaining column k alone is then entry (k, left) /
     entry (k, k), with the precision of entry (k, k). `prior` (c,): precisions P of normal priors on the coefficients,
-    about 0; None without priors.
+    about 0, which `_limit_precisions` limits; None without priors.
     """
     cross, matrix = gram[eliminated], gram[np.ix_(eliminated, eliminated)]
     if prior is not None:
@@ -39,14 +39,15 @@ def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None
 
 def _limit_precisions(prior: Array, gram: Array) -> Array:
     """Limit prior precisions (c,), which may be infinite, to 1e9 times those of the data, the diagonal of `gram`."""
-    return np.minimum(prior, 1e9 * np.diag(gram))  # enough to fix a coefficient
+    # enough to fix a coefficient; 0 for a column of zeros, whose coefficient `solve` makes 0
+    return np.minimum(prior, 1e9 * np.diag(gram))
 
 
 def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
-    `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`. Both results are 0 without information on
-    the leak.
+    `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`. All other coefficients are free; the
+    precisions and moments of the equations are added up. Both results are 0 without information on the leak.
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
@@ -62,11 +63,12 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     Returns the log ratio and its standard error, which excludes the error of the healthy fit. The ratio differs from 1
     if piston area over pump displacement changed, as on another machine or by another scale of a sensor.
 
-    `judged`, `healthy`: Gram matrices (m, m) of the volume balance in the recording and of the sum of the healthy ones.
-    Each of the two fits gives a coefficient for each direction of the motion and each loaded side. Their mean, weighted
-    by the sums of squares of these columns in the recording, is the motion coefficient [m^2]. In the recording's fit
-    the coefficients of the motion, of its delay (`terms.LAG`) and of the leak are free: otherwise the motion would
-    absorb leakage. All other coefficients have normal priors about the healthy ones (`between` in `priors.toml`).
+    `judged`, `healthy`: Gram matrices (m, m) of the volume balance, after `eliminate_unshared`, in the recording and of
+    the sum of the healthy ones. Each of the two fits gives a coefficient for each direction of the motion and each
+    loaded side. Their mean, weighted by the sums of squares of these columns in the recording, is the motion
+    coefficient [m^2]. In the recording's fit the coefficients of the motion, of its delay (`terms.LAG`) and of the leak
+    are free: otherwise the motion would absorb leakage. All other coefficients have normal priors about the healthy
+    ones (`between` in `priors.toml`).
     """
     motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
@@ -80,7 +82,8 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     # second right side: gives the variance of the weighted sum of the coefficients
     right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
     coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
-    # means of the motion coefficients, times the sum of the weights, which cancels in both results
+    # means of the motion coefficients, times the sum of the weights, which cancels in both results; magnitudes above 0,
+    # for their logarithm
     motion_sum, healthy_sum = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
     return math.log(motion_sum / healthy_sum), math.sqrt(max(float(weights @ error_weights), 0.0)) / motion_sum
 
@@ -88,9 +91,9 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Eliminate the coefficients that recordings do not share, such as a constant loss of oil, from each equation.
 
-    Their `between_deviation` is infinite. The leakage of a pump that holds the load, which counts only within a
-    recording, is set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices of E equations. In the
-    result the rows and columns of these coefficients are zero.
+    Their `between_deviation` is infinite; the leak is kept in any case. The leakage of a pump that holds the load
+    counts only within a recording and is set to zero first (`ColumnRoles.hold_leak`). `gram` (E, m, m): Gram matrices
+    of E equations. In the result the rows and columns of these coefficients are zero.
     """
     reduced = _remove_hold_leaks(gram, columns)
     for e, roles in enumerate(columns):
@@ -122,8 +125,8 @@ def subtract_reference(
 ) -> tuple[Array, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
-    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings. Returns the
-    arguments of `eliminate`:
+    `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings, both after
+    `eliminate_unshared`. Returns the arguments of `eliminate`:
 
     - Gram matrix (m, m) of the recording with the residual in place of the left side;
     - indices of the c columns whose coefficients may differ between recordings, with the leak only if `has_leak`;
@@ -151,10 +154,10 @@ def estimate_leak_excess(
     """Estimate the excess of a recording's leak coefficient over that of reference recordings, and the standard errors.
 
     `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the reference recordings, for E
-    equations; `widths` (s,): factors on the prior standard deviations of the differences between recordings in the
-    coefficients of all terms but the leak. Both results (s,) are 0 where there is no information. The excess is fitted
-    to the residual under the coefficients of the reference recordings (`subtract_reference`); the precisions and
-    moments of the equations are added up.
+    equations after `eliminate_unshared`; `widths` (s,): factors on the prior standard deviations of the differences
+    between recordings in the coefficients of all terms but the leak. Both results (s,) are 0 where there is no
+    information. The excess is fitted to the residual under the coefficients of the reference recordings
+    (`subtract_reference`); the precisions and moments of the equations are added up.
     """
     precision, moment = np.zeros((2, len(widths)))
     for e, roles in enumerate(columns):
@@ -171,27 +174,28 @@ def estimate_leak_excess(
 def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]) -> Array:
     """Compute the weights (K,) of K blocks in a recording's excess over reference recordings; their sum is 1.
 
-    A leak with the coefficient g_k in block k causes the excess sum_k w_k g_k (`estimate_leak_excess`). With N_k, the
-    sum of squares of the leak's column in the block, and C_k, its products with the columns of the other terms,
+    A leak with the coefficient g_k in block k causes the excess sum_k w_k g_k (`estimate_leak_excess` for the width 1).
+    With N_k, the sum of squares of the leak's column in the block, and C_k, its products with the columns of the other
+    terms,
 
-        w_k = (N_k - C (G + P)^-1 C_k') / (N - C (G + P)^-1 C').
+        w_k = sum_e (N_k - C (G + P)^-1 C_k') / sum_e (N - C (G + P)^-1 C'),
 
-    N and C are the sums over the blocks, G is the Gram matrix of the other columns, and P the prior precision of their
-    coefficients. The weight of a block in which the other terms explain the leak is small, and may be negative. Without
-    information all weights are equal.
+    where sum_e is over E equations. N and C are the sums over the blocks, G is the Gram matrix of the other columns,
+    and P the prior precision of their coefficients. The weight of a block in which the other terms explain the leak is
+    small, and may be negative. Without information all weights are equal.
 
-    `grams` (K, E, m, m): Gram matrices of the blocks for E equations; `reference` (E, m, m): that of the sum of the
-    reference recordings.
+    `grams` (K, E, m, m): Gram matrices of the blocks (`blocks.scale_grams`); `reference` (E, m, m): sum of those of the
+    reference recordings, after `eliminate_unshared`.
     """
     grams = _remove_hold_leaks(grams, columns)
     totals = grams.sum(axis=0)
     shared = eliminate_unshared(totals, columns)
     weights = np.zeros(len(grams))
     for e, roles in enumerate(columns):
-        _, nuisance, prior = subtract_reference(shared[e], reference[e], roles)
+        _, nuisance, prior = subtract_reference(shared[e], reference[e], roles)  # the residual has no effect on weights
         eliminated = [*nuisance, *roles.unshared]
         matrix = totals[e][np.ix_(eliminated, eliminated)]
-        n = len(nuisance)
+        n = len(nuisance)  # only these have a prior, limited as in `estimate_leak_excess`
         matrix[:n, :n] += np.diag(_limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]))
         factors = solve(matrix, totals[e][eliminated, roles.leak])
         weights += grams[:, e, roles.leak, roles.leak] - grams[:, e, roles.leak][:, eliminated] @ factors

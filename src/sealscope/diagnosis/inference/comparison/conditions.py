@@ -15,8 +15,8 @@ class UnusualCondition(NamedTuple):
     """Operating condition of a recording that lies outside of the range `low` to `high` of the healthy recordings.
 
     `name`: "load" [Pa], "speed" (of the pump, as mean flow [m^3/s]) or "oil" (temperature [degC]), with its `value` in
-    the recording; `log_excess`: log ratio of load or speed to the nearer end of the range. It is 0 for oil, since the
-    uncertain slope in temperature already covers it.
+    the recording; `log_excess`: magnitude of the log ratio of load or speed to the nearer end of the range. It is 0 for
+    oil, whose effect has an uncertain slope in temperature (`oil`), which already covers it.
     """
 
     name: str

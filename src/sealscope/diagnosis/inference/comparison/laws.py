@@ -32,8 +32,9 @@ def compare_laws(
 ) -> LawFit | None:
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
-    All balances are fitted together. Return None if a balance has no column of an orifice, if the recording has no
-    information on one of the two leaks, or if their columns are not positively correlated.
+    All balances are fitted together; a negative leak is fitted, too. Return None if a balance has no column of an
+    orifice, if the recording has no information on one of the two leaks, or if their columns, both with the sign of
+    p_A - p_B, are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None
@@ -70,6 +71,7 @@ def compare_with_leak(
             return None
         if name != AIR:
             moment = max(moment, 0.0)
+        # above rounding errors
         squares.append(max(left_square - moment**2 / energy, 1e-9 * abs(left_square) + TINY))
     return float(-0.5 * np.log(squares[1] / squares[0]))
 
@@ -85,7 +87,7 @@ def _fit_excess(
     """Compute the sums of a fit of c tested terms, by `names`, to the residual of `judged` under the `baseline`.
 
     All other terms are eliminated, the leak only if `has_leak` (`subtract_reference`). Returns sums over the equations:
-    Gram matrix (c, c) of the tested columns, their products (c,) with the residual, and the residual's square.
+    Gram matrix (c, c) of the tested columns, their products (c,) with the residual, and the residual's sum of squares.
     """
     reference = np.sum([recording.sums for recording in baseline], axis=0)
     gram, moments, left_square = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0

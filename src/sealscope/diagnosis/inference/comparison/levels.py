@@ -57,7 +57,7 @@ SCALES, MAX_SCALE = 11, 2.5
 MIN_WITH_HOLDS = 2
 #: A normal distribution of z is replaced by this number of narrower ones, with this fraction of its deviation.
 PARTS, PART_WIDTH = 7, 0.5
-#: Limit of abs(z).
+#: Limit of abs(z), which keeps sinh(z) finite.
 MAX_Z = 30.0
 
 
@@ -74,7 +74,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
     log_widths = np.linspace(-MAX_SCALE, MAX_SCALE, SCALES)
     widths = prior.between**log_widths
     rises, rise_errors = np.zeros((SCALES, count)), np.zeros((SCALES, 0))
-    if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all
+    if count > 1:  # rises of each healthy recording over the others, scaled to its rise over the mean of all (else 0)
         excesses = [
             estimate_leak_excess(recording.sums, healthy_sums - recording.sums, columns, widths)
             for recording in baseline
@@ -82,7 +82,7 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         rises, rise_errors = np.array(excesses).transpose(1, 2, 0) * ((count - 1) / count)
     values, error = estimate_leak_excess(judged.sums, healthy_sums, columns, widths)
     level, level_error = coefficient_level(healthy_sums, columns)
-    # smallest scatter of the rises for each width: a fraction of their typical standard error, at least the fraction
+    # smallest scatter of the rises for each width: a fraction of their median standard error, at least the fraction
     # `prior.finest` of the pump's mean flow, as a conductance, and never 0 (1 / MAX_READING)
     errors = prior.estimate * np.median(np.column_stack([error, rise_errors]), axis=1)
     errors = np.maximum(errors, max(prior.finest * judged.conductance_of_flow, 1.0 / MAX_READING))
@@ -128,8 +128,8 @@ def _compare_held(
 
     `name`: field of `RecordingSums` whose first two values are the leak's conductance and standard deviation
     [m^3/(s Pa)]; `min_crossover`: as in `_compare_levels`; `session_share`: standard deviation between sessions, over
-    the healthy mean, or None for its usual prior. Return None if the field is None in the judged recording, or known in
-    fewer than `MIN_WITH_HOLDS` healthy recordings.
+    the healthy mean, or None for `scatter.session` of `priors.toml`. Return None if the field is None in the judged
+    recording, or known in fewer than `MIN_WITH_HOLDS` healthy recordings.
     """
     baseline = [recording for recording in baseline if getattr(recording, name) is not None]
     if getattr(judged, name) is None or len(baseline) < MIN_WITH_HOLDS:
@@ -137,20 +137,21 @@ def _compare_held(
     leaks = np.array([getattr(recording, name)[:2] for recording in (*baseline, judged)])
     *healthy_leaks, leak = leaks[:, 0]
     level = float(np.mean(healthy_leaks))
-    min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)  # above 0
-    error = np.maximum(np.median(leaks[:, 1]), min_error)
+    # smallest scatter of a healthy leak: the fraction `finest` of the pump's mean flow, as a conductance, and never 0
+    min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)
+    error = np.maximum(np.median(leaks[:, 1]), min_error)  # median over all leaks, the judged one included
     rise = _compare_levels(
         judged,
         baseline,
         values=np.array([leak - level]),
         rises=(np.array(healthy_leaks) - level)[None],
         errors=error[None],
-        level=max(level, 0.0),
+        level=max(level, 0.0),  # a mean below 0 is an error of the estimates
         level_error=error / np.sqrt(len(baseline)),
         min_crossover=min_crossover,
         session_deviation=None if session_share is None else session_share * abs(level),
     )
-    # `error` is included already; a less precise judged recording adds the difference
+    # the median `error` is included already; a less precise judged recording adds the difference
     return rise.widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
 
 
@@ -188,11 +189,11 @@ def _compare_levels(
         session_deviation = prior.session * judged.conductance_of_flow
     recordings = [*baseline, judged]
     oils = oil_hypotheses(recordings)
-    # scatter that the oil does not explain: warmer oil is thinner and leaks more
+    # scatter that the most probable oil does not explain: warmer oil is thinner and leaks more
     oil_factor = np.exp(oils[0].thinning[:-1])
     unexplained = rises - level * (oil_factor - oil_factor.mean())
     scatter = float(np.median(unexplained.std(axis=1)))
-    # c, below which z is linear in a: the largest of the errors, the scatter and a tenth of the level
+    # c, below which z is linear in a: the largest of errors, scatter, a tenth of the level, and `min_crossover`
     scale = _LevelScale(level, max(level_error, float(np.median(errors)), scatter, 0.1 * level, min_crossover))
     steepness = scale.slope(level)  # dz/da at the healthy mean
     relative_slope = steepness * level  # change of z for a relative change of a
@@ -253,7 +254,7 @@ def _candidate_covariances(
     # half-normal density times the distance of the grid points, which grows with the root of the ratio
     ratios = MAX_SESSION_RATIO * ((np.arange(NODES) + 0.5) / NODES) ** 2
     log_priors = 0.5 * np.log(ratios) - 0.5 * ratios**2
-    if len(set(sessions)) == 1:
+    if len(set(sessions)) == 1:  # the deviation of a single session is part of the unknown mean
         ratios, log_priors = np.zeros(1), np.zeros(1)
     session_variances = (np.hypot(oil_deviation, session_deviation) * ratios) ** 2
     # recordings of one session share the deviation of the session

@@ -85,7 +85,7 @@ def _oils_by_drop(recordings: Sequence[RecordingSums], unknown_deviation: float)
     prior, no_fit = INFERENCE.oil, np.full(len(Resistance._fields), np.nan)
     friction, friction_error, drop, drop_error, speed = np.array(
         [no_fit if recording.resistance is None else recording.resistance for recording in recordings]
-    ).T
+    ).T  # (n + 1,) each, NaN where unknown
     is_known = np.isfinite(drop)
     if not (is_known[-1] and is_known[:-1].any()):
         return []

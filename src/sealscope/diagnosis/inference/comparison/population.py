@@ -53,7 +53,7 @@ class Population:
         sums_of_squares = freedom * prior_sigma**2 + count * healthy.var(axis=1)
         if not 1e4 * sums_of_squares.max() < MAX_READING:
             return Rise(float(values.mean()), deviation=np.inf, degrees_of_freedom=freedom)
-        # limits of the grid of sigma, far below and far above the probable values
+        # limits of the grid of sigma, far below and far above the probable values, and above 0 (1 / MAX_READING)
         min_sigma = np.sqrt(np.maximum(0.1 * freedom * prior_sigma**2, 1e-9 * sums_of_squares) / (freedom + count))
         max_sigma = np.maximum(100.0 * np.sqrt(sums_of_squares), 10.0 / MAX_READING)
         sigma = np.geomspace(np.maximum(min_sigma, 1.0 / MAX_READING), max_sigma, NODES, axis=1)

@@ -40,7 +40,7 @@ class Mixture(NamedTuple):
         """Compute the value below which the mixture lies with the given probability."""
         from scipy.special import ndtr, ndtri
 
-        # scale by a typical deviation (each counts up to 1000 times the smallest): the quantile is then of order one
+        # scale by the mean deviation (each counts up to 1000 times the smallest): the quantile is then of order one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
         scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
 
@@ -70,7 +70,8 @@ class Rise(NamedTuple):
     - `value`, `deviation`: estimate and standard deviation, in the unit of the coefficient;
     - `mixture`: distribution of `value` in a healthy recording. If None, `value` / `deviation` is Student's t with
       `degrees_of_freedom`;
-    - `share`: fraction of the allowed false alarms that is left to this rise, by which its p-value is divided.
+    - `share`: fraction of the allowed false alarms that is left to this rise, by which its p-value is divided. It must
+      be 1 for `bound`, `interval` and `log_ratio_within`.
     """
 
     value: float
@@ -119,8 +120,8 @@ class Rise(NamedTuple):
     def log_ratio(self, rise: float, log_deviation: float = 0.0) -> float:
         """Compute the log likelihood ratio of two hypotheses: the leak's coefficient rose by `rise`, and it did not.
 
-        `log_deviation`: standard deviation of the logarithm of the true rise about log(`rise`); 0 if the true rise is
-        exactly `rise`, in the unit of `value`.
+        `log_deviation`: standard deviation of the logarithm of the true rise about log(`rise`); the true rise is
+        exactly `rise`, in the unit of `value`, if it is 0 or if `rise` has no logarithm.
         """
         if log_deviation > 0.0 and rise > 0.0:
             return self._log_ratio_lognormal(rise, log_deviation)
@@ -167,7 +168,7 @@ class Rise(NamedTuple):
 
     def bound(self) -> float:
         """Compute the 95 % upper bound of the true rise, in the unit of `value`; a negative `value` counts as zero."""
-        # a healthy recording exceeds this score with a probability of 95 %; it is usually negative
+        # the score that a healthy recording exceeds with a probability of 95 % is negative
         return max(self.value, 0.0) - self.threshold(BOUND_PROBABILITY) * self.deviation
 
     def interval(self, probability: float = BOUND_PROBABILITY) -> tuple[float, float]:
@@ -187,7 +188,7 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
 
     `values` (s,): the judged value by s alternative estimates; `predicted`: mixture of predicted values of shape (s,
     ...), with log weights. The rise is the median of judged minus predicted value over all estimates, and its standard
-    deviation is half the width of the central 68 % interval, infinite if no weight is a number.
+    deviation is half the width of the central 68 % interval, infinite if no part has finite numbers.
     """
     judged = np.reshape(values, (-1, *[1] * (predicted.centres.ndim - 1)))  # (s, 1, ..., 1)
     log_weights, deviations = predicted.weights.ravel(), predicted.deviations.ravel()

@@ -81,7 +81,8 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
     While the piston rests, the spool of a servo valve is at its null: both chambers are connected with supply and
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
     hardly changes the flow. The balance gets two terms at rest with unknown coefficients: a flow with the sign that
-    `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B.
+    `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B. `Signals.holding` flags all rests of the piston
+    here, since the flow of such a balance never counts as resting (`balance.find_rest_limits`).
     """
     left = equation.left
     at_rest = (
@@ -112,8 +113,8 @@ def _supply_equation(rig: Rig) -> Equation:
     """Make the volume balance of a cylinder behind a valve whose supply line has a flow meter.
 
     The meter sees only the chamber that the supply feeds, A if the flow is positive, so that compression and external
-    leaks of the other chamber do not count. An accumulator between meter and valve takes up oil with the pressure of
-    the supply, if that is recorded.
+    leaks of the other chamber do not count, and at rest those of neither (`_separate_at_rest`). An accumulator between
+    meter and valve takes up oil with the pressure of the supply, if that is recorded.
     """
 
     def while_fed(side: str, *terms: Term) -> list[Term]:
@@ -124,7 +125,7 @@ def _supply_equation(rig: Rig) -> Equation:
         ]
 
     def direction(s: Signals) -> Array:
-        """Compute the sign of the flow in each interval; the meter's offset, part of a magnitude, has the same sign."""
+        """Compute the sign of the flow in each interval, which the inspection gave to the meter's offset as well."""
         return np.sign(s.mean("q_supply"))
 
     air = free_air_term(rig, weight_A=lambda s: (s.mean("q_supply") > 0.0).astype(float))
@@ -206,7 +207,8 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
         terms.insert(0, START_TERM)
     if source == "q_pump":  # a meter is downstream of the filling loss
         terms.remove(SPEED_LOSS_TERM)
-    # the air is half in either chamber; on a single rod it is in the one that carries the load
+    # half of the air is in either chamber; on a single rod all is on the loaded side, as check valves keep the other at
+    # the charge pressure
     single_rod = rig.cylinder.single_rod
     air = free_air_term(rig, weight_A=lambda s: interval_means(s.carried_by_A) if single_rod else 0.5)
     area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
@@ -265,8 +267,8 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
     """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
-    command, from which the speed is derived. Return None if none of them is recorded, or only the command of a pump
-    that does not feed the chambers.
+    command, from which the speed has been derived (`balance.derive_drive_signals`). Return None if none of them is
+    recorded, or only the command of a pump that does not feed the chambers.
     """
     displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
     if source == "theta":
@@ -295,7 +297,8 @@ def with_rests(equation: Equation) -> Equation:
 def shut_at_rest(equation: Equation) -> Equation:
     """Adapt a pump's volume balance to valves that cut the pump off from the cylinder while the pump rests.
 
-    The pump's leakage gets its two terms, and the constant flow (`BIAS`) counts only while pump and piston move.
+    The pump's leakage gets two terms (`_pump_leakage_terms`), and the constant flow (`BIAS`) counts only while pump and
+    piston move.
     """
     left = equation.left
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))

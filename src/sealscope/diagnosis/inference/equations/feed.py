@@ -51,10 +51,10 @@ def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n - 1,) in which the pump's flow probably circulates to the tank, past the cylinder.
 
     Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
-    load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as
-    a fraction f of that in motion: a flow that circulates has any fraction up to 1, that of a pump that holds the load
-    a log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`). `feed.circulates`: log
-    odds, before any recording, of a flow that circulates.
+    load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as a
+    fraction f of that in motion: a flow that circulates has any fraction up to 1, that of a pump that holds the load a
+    log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`). `feed.circulates`: log
+    odds, before any recording, of a flow that circulates. Nothing is flagged if f is unknown.
     """
     prior = INFERENCE.feed
     flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
@@ -68,6 +68,7 @@ def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
         fraction = float(np.nanmean(flow[hold])) / flow_in_motion
         deviation = np.log(fraction / prior.held) / prior.spread
         log_density_if_held = -0.5 * deviation**2 - np.log(fraction * prior.spread * np.sqrt(2.0 * np.pi))
+        # the density of f is 1 if the flow circulates, also for a few f above 1
         circulates[hold] = prior.circulates - log_density_if_held > 0.0
     return circulates
 

@@ -104,14 +104,18 @@ class Signals:
 
     @cached_property
     def carried_by_A(self) -> Array:
-        """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0."""
+        """1 for each sample (n,) in which side A carries the load, i.e. p_A - p_B exceeds the sensor offset, else 0.
+
+        It is 0 also where a pressure is missing.
+        """
         return (self._channels["p_A"] > self._channels["p_B"] + self._offset).astype(float)
 
     def direction_weights(self, outward: bool, by_A: bool) -> Array:
         """Return 1 for each interval (n - 1,) of motion in a given direction while a given side carries the load.
 
         `outward`: motion towards B, or standstill, as opposed to motion towards A; `by_A`: side A, as opposed to B, has
-        the load (`carried_by_A`). Other intervals have the weight 0, and 1/2 if direction or side change within.
+        the load (`carried_by_A`). Other intervals have the weight 0, and 1/2 if direction or side change within. A
+        missing speed counts as towards A.
         """
         is_counted = ((self.speed >= 0.0) == outward) & (self.carried_by_A == by_A)
         return interval_means(is_counted.astype(float))
@@ -127,7 +131,7 @@ class Signals:
     def holding(self, pump_volume: Callable[[Signals], Array]) -> Array:
         """Return 1 for each sampling interval (n - 1,) in which the pump turns and the piston rests, else 0.
 
-        `pump_volume`: as in `moving`. Without `rest_limits` it never rests.
+        `pump_volume`: as in `moving`. Without `rest_limits` the piston never rests.
         """
         return self._find_states(pump_volume)[1]
 
@@ -149,7 +153,7 @@ def find_rests(increments: Array, rate: float, limit: float, shortest: float = M
 
     `increments` (n,): increments of the pump's volume [m^3] or of the position [m], NaN (not at rest) where missing;
     `rate`: sampling rate [Hz]; `limit` in m^3/s or m/s. The speed is averaged over `AVERAGING_TIME`. A recording
-    shorter than this time and `shortest` together has no rest.
+    shorter than this time and `shortest` together has no rest. A rest has at least two intervals.
     """
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(shortest * rate))  # [samples]
     if len(increments) < window + min_length:

@@ -178,9 +178,10 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
 def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Term:
     """Make the term of free air in both chambers: w V_A d(1/p_A) - (1 - w) V_B d(1/p_B).
 
-    p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at the current position, counted from
+    p_A and p_B are absolute. V_A and V_B are the volumes of the chambers at the position x, which counts from
     mid-stroke, or at mid-stroke if the rig's file states fixed volumes. `weight_A` computes w, the weight (0 to 1) of
-    chamber A in the balance.
+    chamber A in the balance. The coefficient [Pa] is minus the fraction of free air at atmospheric pressure, times that
+    pressure.
     """
     from sealscope.physics.cylinder import mid_stroke_volumes
 
@@ -206,7 +207,8 @@ def free_air_term(rig: Rig, weight_A: Callable[[Signals], Array | float]) -> Ter
 def external_leak_term(side: str, weight: float = 1.0) -> Term:
     """Make the term of an external leak from `side` "A" or "B" at its gauge pressure p: `weight` max(p, 0) dt [Pa s].
 
-    `weight`: 1 for a leak from A, -1 for a leak from B, and 0 in a balance of the other chamber alone.
+    No oil flows in at a negative pressure. `weight`: 1 for a leak from A, -1 for a leak from B, and 0 in a balance of
+    the other chamber alone.
     """
     p = f"p_{side}"
     return conductance_term(
@@ -263,7 +265,7 @@ def metering_edge_terms(
     recorded = tuple(name for name in (upstream, downstream) if name in channels)
 
     def pressure(s: Signals, name: str) -> Array | float:
-        """Return the pressure [Pa] on one side of the edge in the middle of each interval."""
+        """Return the pressure [Pa] on one side of the edge in each interval, or `return_pressure` if not recorded."""
         return s.mean(name) if name in recorded else return_pressure
 
     def pressure_root(s: Signals) -> Array:

@@ -47,8 +47,8 @@ class ResponseLeak(LeakMeasure):
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
     - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
 
-    The leakage has no `rise_flow`, since the level of the conductance depends on the assumed friction, and is not
-    related to the pump's flow, which is only assumed from the command.
+    There is no `rise_flow`, since the level of the conductance depends on the assumed friction, and no leak's share of
+    the pump's flow (`relative`), which is only assumed from the command.
     """
 
     provider = PRESSURE_RESPONSE
@@ -123,7 +123,8 @@ class ResponseLeak(LeakMeasure):
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above theirs, otherwise on a leak that begins within the
-        recording. An orifice is assumed, which has the largest flow for a fitted conductance.
+        recording. An orifice is assumed, which has the largest flow for a fitted conductance, and the largest usual
+        scale.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:

@@ -198,7 +198,7 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
 
     They are the table `[response]` of `priors.toml`, multiplied by the rig's value of the parameter, or absolute if the
     rig has none; the prior of the contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. The
-    Coulomb friction is that at the charge pressure. The bias, a speed, is in volts of the command.
+    Coulomb friction is that at the charge pressure. The table states the bias, a speed, in volts of the command.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
@@ -206,6 +206,7 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     relative = {str(name): row for name, row in PRESSURE.response.items()} | {"give": _FRICTION[law].give}
+    # one row of centre, width and wander for each parameter
     return Priors(*np.array([rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]).T)
 
 
@@ -235,9 +236,8 @@ class Machine(NamedTuple):
     def simulate(self, command: Array, sets: Array, states: Array) -> tuple[Array, Array]:
         """Simulate p_A - p_B [Pa] at n samples for each of up to 16 parameter sets (m, p).
 
-        `command` (n + 1,): command [V] at the sample before the first and at each of the n samples; `states` (8, m):
-        states at the sample before the first (`simulate_response`). Returns p_A - p_B (m, n), and the states (8, m) at
-        the last sample.
+        `command` (n + 1,), `states` (8, m): as in `simulate_response`. Returns p_A - p_B (m, n), and the states (8, m)
+        at the last sample.
         """
         lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)  # without scale and offset

@@ -131,7 +131,8 @@ class Segment:
         """
         theta, n_sets = sets[0], len(sets)
         n_slopes = SPRING + 1  # the derivatives by the first parameters, up to SPRING, are simulated
-        # simulated together: theta, theta with each parameter up to SPRING increased by a unit, and the other sets
+        # simulated together, in up to 16 lanes: theta, theta with each parameter up to SPRING increased by a unit, and
+        # the other sets
         simulated = np.concatenate([sets[:1], np.tile(theta, (n_slopes, 1)), sets[1:]])
         simulated[range(1, n_slopes + 1), range(n_slopes)] += self.priors.unit[:n_slopes]
         states = self.states[:, [*range(n_slopes + 1), *[0] * (n_sets - 1)]]  # column 0 for the other sets
@@ -295,16 +296,15 @@ class Follower:
     def fit_start(recording: Recording, rig: Rig) -> Follower:
         """Start a filter with parameters that are fitted to the beginning of a recording.
 
-        `rig`: assumed machine, which gives sizes and priors. The law of friction is Stribeck's, or LuGre's if
-        Stribeck's does not explain the beginning and LuGre's fits better.
+        `rig`: assumed machine, which gives sizes and priors. The law of friction is chosen as the module states.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
-        # 1 if a positive command raises p_A - p_B, -1 if it lowers it
+        # 1 if a positive command raises p_A - p_B or has no effect, -1 if it lowers it
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
         # p_A + p_B has the noise of p_A - p_B but does not ring; the squares of the coefficients (1, -3, 3, -1) of a
-        # third difference have the sum 20
+        # third difference have the sum 20; at least 1 Pa^2, as a divisor
         noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
         follower = Follower(rig, recording.rate, sense)
         segment = follower.next_segment(beginning)
@@ -325,7 +325,7 @@ class Follower:
     def _converge_on_beginning(self, recording: Recording) -> None:
         """Refine the parameters by filtering the beginning of a recording, then return to its first sample.
 
-        Only `theta` is kept, since the same samples are filtered again.
+        Covariance and simulated states are reset, since the same samples are filtered again.
         """
         covariance, states = self.covariance, self.states
         length = round(_FOLLOW.block * recording.rate)
@@ -428,8 +428,7 @@ class Follower:
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
     """Fit the response of p_A and p_B to the command in a recording, once; None if no parameters describe it.
 
-    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine, which gives sizes and
-    priors.
+    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine.
     """
 
     def compute_fit(recording: Recording) -> Joint | None:

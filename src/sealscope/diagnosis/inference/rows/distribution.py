@@ -28,15 +28,16 @@ def sorted_part_means(pressure: Array, rate: float) -> Array:
     """Summarise the distribution of a pressure by the means of `PARTS` equal parts of its sorted samples [Pa].
 
     The spread due to white noise is removed first (see the module). `pressure` (n,): samples [Pa] at the sampling
-    `rate` [Hz], NaN where missing. Only whole pieces within whole strides of the weak form count, without a missing
-    sample; a shorter `pressure` is one stride. The means (PARTS,) are zeros if no piece counts.
+    `rate` [Hz], NaN where missing, for at least `SMOOTHED` seconds. Only whole pieces within whole strides of the weak
+    form count, without a missing sample; less than a stride counts as one. The means (PARTS,) are zeros if no piece
+    counts.
     """
     piece = max(1, round(SMOOTHED * rate))  # averaging time [samples]
     stride = min(stride_samples(rate), max(len(pressure), 1))  # [samples]
     n_pieces = stride // piece
     strides = pressure[: len(pressure) // stride * stride].reshape(-1, stride)[:, : n_pieces * piece]
     pieces = strides.reshape(-1, n_pieces, piece)
-    mean = pieces.mean(axis=2, keepdims=True)
+    mean = pieces.mean(axis=2, keepdims=True)  # NaN, as the deviation, in pieces that do not count
     deviation = pieces - mean
     if piece > 1:  # else each sample is its own mean
         differences = np.diff(pressure, _ORDER)

@@ -81,7 +81,7 @@ def eliminate(matrix: Any, count: int) -> None:
 
 @law
 def median(values: Any, n: int) -> float:
-    """Compute the median of the first n values, by quickselect, which reorders them."""
+    """Compute the median of the first n > 0 values, by quickselect, which reorders them."""
     k, low, high = (n - 1) // 2, 0, n - 1  # k: index of the middle value, the lower one of two
     while low < high:
         pivot, i, j = values[k], low, high
@@ -135,8 +135,8 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
-    The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0. The
-    arguments are those of `weigh_rows`.
+    The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0, which
+    makes all weights 1. The arguments are those of `weigh_rows`.
     """
     count, left, block = len(values), len(column_order) - 1, 0  # left: position of the left side in `column_order`
     for r in range(count):
@@ -179,7 +179,7 @@ def weigh_rows(
     n_slow, normal, reduced = left - n_fast, workspace.normal, workspace.reduced
     for r in range(n_rows):
         workspace.weights[r] = 1.0
-    converged = n_rows == 0
+    converged = n_rows == 0  # then one pass writes Gram matrices of zeros
     for iteration in range(MAX_ITERATIONS + 1):
         for block in range(n_blocks):
             begin = int(ends[block - 1]) if block else 0

@@ -58,7 +58,7 @@ def half_width(rate: float) -> float:
 
 
 def strides_in(seconds: float, rate: float) -> int:
-    """Convert a time [s] to a number of strides (distances of test functions), at least `SPAN`.
+    """Convert a time [s] to a number of strides (distances of test functions), at least `SPAN`, one test function.
 
     A stride is `STRIDE`, or its length in samples if that is longer, as for slow loggers.
     """

@@ -163,7 +163,10 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def _rise_fits(self) -> RiseFits:
-        """Fits of a leak to the rise over healthy recordings and to the course of the leakage (`fit_rise`)."""
+        """Fits of a leak to the rise over healthy recordings and to the course of the leakage (`fit_rise`).
+
+        There must be healthy recordings.
+        """
         balance, motion_rise = self.balance, self._motion_rise
         assert motion_rise is not None
         return fit_rise(
@@ -213,7 +216,7 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def _hold_laws(self) -> Array:
-        """Leak past the piston, fitted to the times in which shut valves hold the load, under k laws of flow, (4, k).
+        """Leak past the piston, fitted to holds, under k laws of flow, (4, k).
 
         The rows are the probability of each law, with the sum 1; the mean flow [m^3/s] after the onset for a
         coefficient of 1; and the fitted mean flow and its standard deviation [m^3/s]. Each of
@@ -312,7 +315,8 @@ class BalanceLeak(LeakMeasure):
         """Compute the 95 % upper bound of a leak's mean flow [m^3/s] from holds and from the whole recording.
 
         It is a quantile of a mixture of three hypotheses: the holds say nothing about the leak, so that the whole
-        recording counts; they show a leak past the piston; they show a leak to the outside.
+        recording counts; they show a leak past the piston; they show a leak to the outside. There must be a rise in
+        holds (`_hold_rise`).
         """
         motion_rise, hold_rise, chambers = self._motion_rise, self._hold_rise, self.balance.chambers
         assert motion_rise is not None and hold_rise is not None and chambers is not None
@@ -370,6 +374,7 @@ class BalanceLeak(LeakMeasure):
             # after the onset the holds show the whole step; `agrees`: standard deviation of log(rise / step)
             return LeakRise(total_rise, rise_after.log_ratio(step.fitted.value, INFERENCE.held_oil.agrees))
         is_after = balance.running_blocks.time >= step.onset().value
+        # the weight of a block may be negative
         mean_rise = step.fitted.value * float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))
         return LeakRise(total_rise, motion_rise.log_ratio_within(mean_rise, tail=INFERENCE.scatter.tail))
 
@@ -433,7 +438,7 @@ class BalanceLeak(LeakMeasure):
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the total leakage over time [L/min], or its growth since `onset_s` [s]; None if not in L/min."""
+        """Return the leakage over time [L/min], or its rise over the mean before `onset_s` [s]; None if no L/min."""
         balance = self.balance
         if not balance.size.stated:
             return None
@@ -476,8 +481,9 @@ def _flow_mixture(rise: Rise, value: float, *, unit: float, weight: float, oil_d
     """Compute the distribution of a leak's mean flow [m^3/s] from the rise of its coefficient over healthy recordings.
 
     It is a part of a larger mixture, in which it has the `weight`. `value`: estimated rise, a negative one counting as
-    0; `rise`: source of the distribution of this estimate's error; `unit`: mean flow [m^3/s] for a coefficient of 1;
-    `oil_deviation`: standard deviation of the coefficient that uncertain properties of the oil cause.
+    0; `rise`: source of the distribution of this estimate's error, normal if it has no mixture; `unit`: mean flow
+    [m^3/s] for a coefficient of 1; `oil_deviation`: standard deviation of the coefficient that uncertain properties of
+    the oil cause.
     """
     # the true rise is `value` minus an error that is distributed as a healthy recording's rise
     weights, deviations, centres = rise.mixture or Mixture(np.ones(1), np.array([rise.deviation]), np.zeros(1))

@@ -73,8 +73,8 @@ class VolumeBalance:
 
     - the position, and the pump's angle, its speed, a flow meter or the command;
     - one of these channels without the position, if a loop brings the piston back or holds it (`without_position`);
-    - behind a servo valve: position, command, and the pressures of supply and return; without supply and return, leaks
-      are measured only while shut valves hold the load;
+    - behind a servo valve: position, command and the pressure of the supply; without the latter, leaks are measured
+      only while shut valves hold the load;
     - only the position, if the held load creeps in the healthy recordings.
     """
 
@@ -214,7 +214,8 @@ class VolumeBalance:
         flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
         typical = healthy[0]._replace(flow=flow, pressure=pressure, start_s=None, held=None)
         first_dated = next((sums for sums in healthy if sums.start_s is not None), typical)
-        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))  # after all repetitions
+        # after all repetitions; undated if no healthy recording has a date
+        later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))
         return rise(later_recording, repetitions, self._columns(channels, shut))
 
     def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
@@ -300,8 +301,8 @@ class VolumeBalance:
         if leak.step is None and leak.rise is None:
             reason = "finds p_A and p_B too similar, or too few samples without gaps, to show a leak"
             return Observed(self.name, lack=reason)
-        # a block with missing samples has fewer rows; but if the position is not recorded, the number of rows also
-        # depends on the motion, and the whole recording counts as judged
+        # a block with missing samples has fewer rows; but in a balance over cycles or holds (`without_position`) the
+        # number of rows also depends on the motion, and the whole recording counts as judged
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks

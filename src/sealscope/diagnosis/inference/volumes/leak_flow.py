@@ -92,7 +92,7 @@ def _fit_steps(
     """Fit a step of the leak with each growth of `_step_growths` and each law of `EXPONENTS`, at each of o onsets.
 
     `positions` (o,): the onsets, counted in blocks; `onsets` (o,): their indices in the step test. Returns the fits,
-    and the fraction of the recording after each onset, (o,).
+    and for each onset the fraction of the blocks with a known pressure after it, (o,).
     """
     weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
     part_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
@@ -109,8 +109,8 @@ def _fit_steps(
 def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, test: StepTest) -> Estimate:
     """Estimate the mean flow [m^3/s] of a leak that begins within a recording, from its onset to the end.
 
-    It is the mean over all combinations of law, growth and onset, weighted by their likelihood and the prior
-    probability of the growth. `leak`: likelihood of the leak's coefficient in the blocks; `test`: step test of this
+    It is the mean over all combinations of law, growth and onset, weighted by their likelihood and, of the priors, only
+    that of the growth. `leak`: likelihood of the leak's coefficient in the blocks; `test`: step test of this
     coefficient, whose onsets are used except improbable ones.
     """
     onsets = np.flatnonzero(test.weights > NEGLIGIBLE * test.weights.max())
@@ -171,6 +171,7 @@ class RiseFits(NamedTuple):
             return 0.0
         # weights of whole normal densities, of which only the parts with a flow > 0 have the weights above
         truncated = weights / np.maximum(ndtr(flows / deviations), _TINY)
+        # given a leak, `tail` / `chance` of it remains above the bound
         return bound_steps(truncated, flows, deviations, 1.0 - tail / chance)
 
 
@@ -192,7 +193,8 @@ def fit_rise(
     - `rise`: mean rise of the coefficient over the recording [m^3/(s Pa)];
     - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
-    - `max_flow`: mean flow of the pump [m^3/s]; larger leaks are excluded, except an older one under the first law.
+    - `max_flow`: mean flow of the pump in motion [m^3/s]; larger leaks are excluded, except an older one under the
+      first law.
 
     With a given onset, growth and law, a leak with the coefficient s changes the conductance of block k by s c_k. The
     changes within the recording give the estimate s' with the standard error e, and the log likelihood ratio L of the
@@ -222,7 +224,8 @@ def fit_rise(
     log_weights = law_log_weights + normal_log_density(rise.value, rise.deviation**2 + usual_rises**2)
     present: float = INFERENCE.size.present
     within: float = INFERENCE.size.within
-    # the hypothesis of no leak gets the sum of the laws' weights, which are not normalised
+    # no leak gets the sum of the laws' weights, which are not normalised; 0.5: a half-normal density is twice a normal
+    # one
     log_none = math.log(0.5 * (1.0 - present) / present) + float(np.logaddexp.reduce(law_log_weights))
     log_none += float(normal_log_density(rise.value, rise.deviation**2))
     if test is not None:

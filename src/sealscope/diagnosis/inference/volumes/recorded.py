@@ -154,7 +154,8 @@ class RecordedBalance:
     def block_weights(self, healthy: Sequence[RecordingSums]) -> Array:
         """Compute the weights (K,) of `running_blocks` in the rise of the leakage over `healthy` recordings.
 
-        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`coefficients.block_weights`).
+        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`coefficients.block_weights`). The
+        weights of all blocks have the sum 1.
         """
         grams = scale_grams(self.blocks, self.columns)
         reference = np.sum([recording.sums for recording in healthy], axis=0)
@@ -169,7 +170,8 @@ class RecordedBalance:
     def _leak_and_test(self) -> tuple[Information, StepTest | None]:
         """Likelihood of the leak's conductance in each of `running_blocks`, and the test for a step of it.
 
-        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`); the larger p-value counts.
+        The healthy leakage may be laminar, or turbulent in part (`with_turbulence`); the larger p-value counts, 1
+        without a test.
         """
         laminar = information(self.running_blocks, self.columns, self.columns[0].leak, with_expansion=True)
         candidates = [
@@ -261,7 +263,7 @@ class RecordedBalance:
 
         It is positive while the pump holds a load or compresses oil. The flow that moves the piston is its speed times
         the area of the side with the higher pressure or, in an open circuit, of the side that the pump feeds. Both are
-        magnitudes, averaged over `LOST_FLOW_TIME`.
+        magnitudes of means over `LOST_FLOW_TIME`.
         """
         recording, fed_outward = self.recording, self.equations[0].fed_outward
         step = np.diff(recording["x"])
@@ -338,7 +340,7 @@ class RecordedBalance:
         return rest_log_odds(hold_leak.value, total, rest_variance=variance, difference_variance=difference_variance)
 
     def _cylinder_sides(self) -> CylinderSides | None:
-        """Estimate piston areas and ends of the stroke; None without motion, or for an implausible ratio of the areas.
+        """Estimate piston areas and ends of the stroke; None without motion or `x`, or for an implausible area ratio.
 
         The stroke covers the motion of this recording and of the others that are known (`known_stroke`).
         """
@@ -369,16 +371,16 @@ class RecordedBalance:
         Returns for either side the area and the standard deviation of the logarithm of its magnitude. The areas are
         negative if the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are
         stated and can be scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of
-        the motion under its load, weighted by the sums of squares of the columns. The main side is the one with more
-        motion in which it surely carries the load. The other area is corrected for motion that may belong to the main
-        side (`log_area_ratio`).
+        its motions (`motions_of_side`), weighted by the sums of squares of the columns. The main side is the one with
+        more motion in which it surely carries the load. The other area is corrected for motion that may belong to the
+        main side (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
         fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
         coefficients = dict(zip(nuisance, fitted, strict=True))
         areas, energies = [], []  # for A and B
-        for side in "AB":  # columns of the motion under a load that this side carries
+        for side in "AB":  # columns of the motion with the area of this side
             motion = [k for k in roles.motion if roles.names[k] in motions_of_side(self.equations[0], side)]
             squares = np.diag(total)[motion]
             energy = float(squares.sum())
@@ -452,7 +454,7 @@ class RecordedBalance:
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of the flow that the piston displaces."""
+        """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of that which the larger piston side displaces."""
         if not self.is_creep:  # weights: positive, so that a mean exists
             return float(np.average(self.blocks.flow, weights=np.maximum(self.blocks.rows, 1e-9)))
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
@@ -504,8 +506,8 @@ class RecordedBalance:
     def _loaded_area(self) -> _Area | None:
         """Piston area, a mean over the directions of motion and the loaded sides; None if unknown or 0.
 
-        The balance has one column for each direction and loaded side, with the area as its coefficient. The mean is
-        weighted by the sums of squares of the columns.
+        Each of these has a column in the balance, with the area as its coefficient; the mean is weighted by the sums of
+        squares of the columns.
         """
         roles, cylinder = self.columns[0], self.rig.cylinder
         motion = [k for k in roles.motion if roles.names[k].startswith("motion")]
@@ -541,6 +543,7 @@ class RecordedBalance:
         variance = float(conductance_variance[0, 0]) * self.mean_pressure() ** 2
         if not variance > 0.0:
             return 0.0
+        # positive log odds of "rest" mean a flow of about zero, as under a loop
         return -rest_log_odds(flow, holding_flow, rest_variance=variance, difference_variance=variance)
 
     @cached_property

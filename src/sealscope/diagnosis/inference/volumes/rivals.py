@@ -108,7 +108,8 @@ def _turning_rise(
 ) -> Observable | None:
     """Test the leakage of the turning pump, the coefficient of the column `tested`, for a rise over healthy recordings.
 
-    It describes data of its own, and so does not compete with the leak for the rise of the leakage.
+    It describes data of its own, and so does not compete with the leak for the rise of the leakage. Return None if too
+    few healthy recordings show it.
     """
     pump_rise = held_pump_rise(judged, healthy)
     if pump_rise is not None:  # measured just before valves shut to hold a load
@@ -155,7 +156,8 @@ def held_rivals(
     if judged.held is None or len(healthy_leaks) < MIN_HEALTHY:
         return None
     judged_leaks = HeldLeaks(*judged.held)
-    min_error = INFERENCE.scatter.finest * judged.conductance_of_flow  # no machine repeats its leakage any better
+    # no machine repeats its leakage to less than the fraction `scatter.finest` of the pump's mean flow
+    min_error = INFERENCE.scatter.finest * judged.conductance_of_flow
     observables = list[Observable]()
     for side in "AB":
         value, *healthy_values = (float(getattr(leaks, f"outside_{side}")) for leaks in (judged_leaks, *healthy_leaks))
@@ -181,10 +183,10 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
     """Estimate the change of a coefficient of a recording from healthy recordings, with its standard error.
 
-    `gram`, `reference` (E, m, m): Gram matrices of the recording, and of the sum of the healthy recordings, for E
-    equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The differences of the
-    other coefficients have normal priors and are eliminated. Except for the leak, columns without a finite prior
-    deviation are left out: `RecordingSums.sums` no longer contain them. Without information the result is (0, inf).
+    `gram`, `reference` (E, m, m): Gram matrices (`RecordingSums.sums`) of the recording, and of the sum of the healthy
+    recordings, for E equations; `tested`: column of the coefficient, which counts as 0 in the healthy recordings. The
+    differences of the other coefficients have normal priors and are eliminated. Except for the leak, columns without a
+    finite prior deviation are left out: `sums` no longer contain them. Without information the result is (0, inf).
     """
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):

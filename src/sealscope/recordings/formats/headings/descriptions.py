@@ -94,7 +94,7 @@ def split_pairs(labels: Sequence[Label]) -> list[Label]:
     are_times = all(label.unit is None or same_dimension(label.unit, "s") for label in times)
     if len(labels) < 4 or len(labels) % 2 or not are_times:
         return list(labels)
-    # blanks in place of `_`, which would be part of a word, so that X or Y were none
+    # with blanks in place of `_`, as the X of `p_A_X` would be no word of its own
     x_matches = [_PAIR_NAMES["x"].fullmatch(label.name.replace("_", " ")) for label in times]
     y_matches = [_PAIR_NAMES["y"].fullmatch(label.name.replace("_", " ")) for label in values]
     is_unnamed = all(x_match is not None and not x_match["name"] for x_match in x_matches)

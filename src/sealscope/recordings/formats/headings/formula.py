@@ -66,7 +66,7 @@ def parse_formula(text: str) -> Formula[str]:
         names: list[str] = []
 
         def replace_name(match: re.Match[str], names: list[str] = names) -> str:
-            """Append a column's name to `names`; return `columnN`, which Python can parse, instead."""
+            """Append a column's name to `names` of this step of the loop; return `columnN`, which Python can parse."""
             names.append(match[1] or match[2])
             return _COLUMN.format(len(names) - 1)
 

@@ -91,6 +91,7 @@ def parse_remarks(lines: Sequence[str], delimiter: str) -> dict[str, str]:
         text = line.strip().lstrip("#%/!\" '").strip()[:500]
         if delimiter.strip() or delimiter == "\t":  # not a blank, which a name of two words contains, too
             name, separator, value = text.partition(delimiter)
+            # a name with a colon ends there: `Operator: A, B`
             if separator and name.strip() and value.strip(f" {delimiter}") and ":" not in name:
                 pairs.append((name, value.strip(f" {delimiter}")))
                 continue

@@ -97,6 +97,7 @@ def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
 def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
     """Build stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,), else of 1970-01-01."""
     if all(part in parts for part in _DATE):
+        # 1 for a missing part: its row is assumed to lack the hour, too, which makes the stamp NaT
         year, month, day = (np.nan_to_num(parts[part], nan=1.0) for part in _DATE)
         # months since 1970, as numpy counts them
         months = ((np.clip(year, 1.0, 9999.0) - 1970) * 12 + month - 1).astype(np.int64).astype("datetime64[M]")

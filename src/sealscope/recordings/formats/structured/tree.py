@@ -82,6 +82,7 @@ def _iter_struct(place: _Place, fields: Mapping[str, Any]) -> Iterator[Series]:
 
     A signal has samples and a unit or, in a Simulink log, a name and `values`.
     """
+    # MATLAB's objects call some of their fields `Data_`
     by_name = {key.rstrip("_").casefold(): value for key, value in fields.items()}
     unit = _first_text(by_name, _UNIT_FIELDS)
     samples = next((vector for key in _SAMPLE_FIELDS if _is_vector(vector := by_name.get(key))), None)

@@ -132,7 +132,8 @@ class HeldChambers:
         """Supplies of A and B if a check valve refills only the side of the larger area, while the piston leaks.
 
         The leak moves equal volumes from one side to the other, and the piston follows the side that loses oil. If the
-        other side has the larger area, its volume grows by more than the leak supplies, and the check valve opens.
+        other side has the larger area, its volume grows by more than the leak supplies, and the check valve opens. With
+        equal areas none opens.
         """
         area_A, area_B = abs(self.sides.area_A), abs(self.sides.area_B)
         if area_A == area_B:
@@ -141,18 +142,18 @@ class HeldChambers:
 
     @cached_property
     def _unloaded_open(self) -> SideSupplies:
-        """Supplies of A and B if no valve shuts the side with the lower mean pressure, which is then open."""
+        """Supplies of A and B if the side with the lower mean pressure is open; a check valve refills the other."""
         means = [np.mean(np.concatenate([getattr(hold, side) for hold in self.holds])) for side in ("p_A", "p_B")]
         return (SideSupply.CHECK, SideSupply.OPEN) if means[0] > means[1] else (SideSupply.OPEN, SideSupply.CHECK)
 
     def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
-        An open side has the probability `held_oil.open` (`priors.toml`). It is above the charge pressure, by more than
-        the back pressure `held_oil.tank` of its line, only while it empties: for the fraction a = `held_oil.above` of a
-        hold. Each hold with a larger fraction f multiplies the probability by exp(-(f - a) / a). If check valves keep
-        both sides at their pressure, a side that gains oil drains to the tank: the charge pressure is then that of a
-        tank line, which is normal about 0 gauge with the standard deviation `held_oil.tank`.
+        An open side has the probability `held_oil.open` (`priors.toml`), any other choice 1 minus this. This side is
+        above the charge pressure, by more than the back pressure `held_oil.tank` of its line, only while it empties:
+        for the fraction a = `held_oil.above` of a hold. Each hold with a larger fraction f multiplies the probability
+        by exp(-(f - a) / a). If both have check valves, a side that gains oil drains to the tank: the charge pressure
+        is then that of a tank line, which is normal about 0 gauge with the standard deviation `held_oil.tank`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
@@ -184,9 +185,11 @@ class HeldChambers:
     def _possible_supplies(self) -> list[SideSupplies]:
         """Supplies of A and B that are tried for a leak.
 
-        Check valves are tried if a side is at the charge pressure in some samples, an open side if it nearly always is.
+        Shut sides are always tried, check valves if a side that they refill is at the charge pressure in some samples.
+        An open unloaded side is tried unless it is above that pressure for too long (`_supply_log_prior`).
         """
         possible = [sides for sides in (self._refillable_sides, BOTH) if self._closed_share(sides) < 1.0]
+        # `drains` has no effect on an open side
         if self._supply_log_prior(self._unloaded_open, drains=True) > MIN_LOG_PRIOR:
             possible.append(self._unloaded_open)
         return [NEITHER, *possible]
@@ -205,7 +208,8 @@ class HeldChambers:
     def _closed_share(self, supplies: SideSupplies) -> float:
         """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
 
-        While a side is not closed, its readings fit any leak: the variance of all readings is too small by this factor.
+        While a side is not closed, its readings are constant and fit any leak: the variance of all readings is too
+        small by this factor.
         """
         share = float(np.concatenate(self._closed_flags(supplies), axis=1).mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
@@ -243,7 +247,7 @@ class HeldChambers:
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
-        """Compute the flow [Pa] of a leak with a conductance of 1 from A (or B, if not `is_A`): the gauge pressure."""
+        """Compute the flow [Pa], at least 0, out of A (or B, if not `is_A`) to the outside, for a conductance of 1."""
         pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
         flows = [flow_of_side(np.maximum(p - P_ATM, 0.0), is_A) for p in pressures]
         return self._while_closed(flows, supplies)
@@ -277,8 +281,8 @@ class HeldChambers:
     def _conditions_log_prior(self, leak: PistonLeak) -> float:
         """Compute the log prior of a leak's supplies and sensor offset, up to a constant.
 
-        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the recording's
-        (`LockedHold.offset_in_hold`).
+        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the
+        recording's, in standard deviations (`LockedHold.offset_in_hold`).
         """
         offset_costs = [float(offset_cost(leak.offset)), *(hold.offset_in_hold(leak.offset)[1] for hold in self.holds)]
         return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * sum(offset_costs)
@@ -287,9 +291,9 @@ class HeldChambers:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
 
         The coefficient is the volume that has left a chamber, over the time integral of the flow u of a leak with a
-        coefficient of 1. The time at which the valves shut is known to within s = `held_oil.settles` (`priors.toml`),
-        and a large leak equalises the pressures about as fast. With the flow u_0 at the start of each hold, the error
-        is
+        coefficient of 1 without growth. The time at which the valves shut is known to within s = `held_oil.settles`
+        (`priors.toml`), and a large leak equalises the pressures about as fast. With the largest flow u_0 in the first
+        interval of each hold, the error is
 
                     s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
         """
@@ -332,7 +336,7 @@ class HeldChambers:
             deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
             if not fit.coefficients[0] < 0.0:  # no leak flows from the lower to the higher pressure
                 value, variance = float(fit.coefficients[0]), fit.variance
-        closed_variance = variance / self._closed_share(leak.supplies)
+        closed_variance = variance / self._closed_share(leak.supplies)  # without readings that fit any leak
         return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * math.log(closed_variance))
 
     @cached_property
@@ -504,6 +508,7 @@ class HeldChambers:
             fit = self._fit_leak(leak._replace(flows=flows), onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
+            # such a leak moves no oil to the other side, which therefore does not drain
             log_prior = math.log(probability) + self._supply_log_prior(leak.supplies, drains=False)
             log_weights.append(fit.log_likelihood + log_prior)
         fit, index = fits[int(np.argmax(log_weights))]
@@ -516,13 +521,15 @@ class HeldChambers:
             np.abs(sides[0])[hold.t >= leak.onset] for hold, sides in zip(self.holds, unit_leak.flows, strict=True)
         ]
         after_onset = np.concatenate(flows)
+        # at least a tiny number, as a divisor
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
 
     @cached_property
     def _leak_hypotheses(self) -> list[LeakHypothesis]:
         """Hypotheses of a leak past the piston, from A to the outside, and from B to the outside, in this order.
 
-        Leaks to the outside are fitted with check valves on both sides and, if possible, with an open unloaded side.
+        Leaks to the outside are fitted with check valves on both sides and with an open unloaded side, if these are
+        possible.
         """
         tried = [supplies for supplies in (BOTH, self._unloaded_open) if supplies in self._possible_supplies]
         # if BOTH is not tried, no sample is at the charge pressure, and it flags the same samples as NEITHER
@@ -535,9 +542,9 @@ class HeldChambers:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
 
         Each of `leaks` is one leak with the flows that it has under each possible choice of the sides' supplies. It may
-        grow from its onset on. The coefficient past the piston is that of the most probable law,
-        converted to the conductance of a laminar leak with the same mean flow in the holds; the others are means from
-        the onset to the end. The likelihood of a leak is a mean over its laws and growths, by their priors.
+        grow from its onset on. The coefficient past the piston is that of the most probable law, converted to the
+        conductance of a laminar leak with the same mean flow in the holds; the others are means from the onset to the
+        end. The likelihood of a leak is a mean over its laws and growths, by their priors, each at its best onset.
         """
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
         laminar = best.leak._replace(exponent=1.0, growth=0.0)
@@ -603,7 +610,7 @@ class HeldChambers:
 
     @cached_property
     def piston_onset(self) -> Interval | None:
-        """Onset of the leak past the piston [s] with its 95 % interval; None if it may have begun before the holds.
+        """Median onset of the leak past the piston [s], and 95 % interval; None if it may have begun before the holds.
 
         The interval is widened on either side to the next of the evenly spaced onsets within holds, or to the whole
         time between two holds.

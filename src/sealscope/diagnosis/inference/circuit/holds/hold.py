@@ -60,7 +60,8 @@ class LockedHold:
     def centre(self, readings: Array, is_A: bool) -> Array:
         """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
 
-        The first reading of the side with the higher pressure becomes 0, since the valves may still be shutting.
+        The first reading of the side with the higher pressure becomes 0 and does not count in the mean, since the
+        valves may still be shutting.
         """
         first = int(self.is_A_loaded == is_A)  # first reading that counts: 1 on the side with the higher pressure
         centred = np.asarray(readings - readings[first:].mean(axis=0))
@@ -102,6 +103,7 @@ class LockedHold:
         """Find the start [s] of the window in which p_A - p_B changes most.
 
         Its length is `held_oil.equalises` (`priors.toml`), the time in which a large leak equalises the pressures.
+        Every hold is longer.
         """
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
@@ -111,10 +113,11 @@ class LockedHold:
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:
     """Find the pressure [Pa] that check valves maintain in a chamber without load.
 
-    It is the lowest pressure while the pump rests, but at most the median while the pump turns, since a leak may
-    equalise the pressures in every rest. If the pump never rests, it is the lowest of all, which may be too low by the
-    drop of check valves through which a moving piston draws oil. `lower_pressure` (n,): lower chamber pressure [Pa];
-    `rests` (n - 1,): flags of the intervals in which the pump rests; `rate`: sampling rate [Hz].
+    It is the lowest pressure (the quantile `LOWEST` of averaged samples) while the pump rests, but at most the median
+    while the pump turns, since a leak may equalise the pressures in every rest. If the pump never rests, it is the
+    lowest of all, which may be too low by the drop of check valves through which a moving piston draws oil.
+    `lower_pressure` (n,): lower chamber pressure [Pa]; `rests` (n - 1,): flags of the intervals in which the pump
+    rests; `rate`: sampling rate [Hz].
     """
     steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
     if not rests.any():
@@ -130,8 +133,8 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
 
     Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
     most this time. `rests` (n,): flags of the sampling intervals in which the pump rests; `flow` (n,): flow of the pump
-    without the part that moves the piston [m^3/s], since valves do not hold a moving piston; `rate`: sampling rate
-    [Hz].
+    without the part that moves the piston [m^3/s], since valves do not hold a moving piston, NaN counting as 0; `rate`:
+    sampling rate [Hz].
     """
     window = max(1, round(INFERENCE.rest.averaged * rate))
     magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
@@ -139,6 +142,7 @@ def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[
         earliest = max(first - window, 0)
         level = float(np.median(magnitude[max(earliest - window, 0) : earliest + 1]))  # before the flow falls
         is_above_half = magnitude[earliest:first] > 0.5 * level
+        # samples up to the last one above half; the others are added to the rest
         n_above = int(np.flatnonzero(is_above_half)[-1]) + 1 if is_above_half.any() else 0
         extended[earliest + n_above : first] = True
     return extended
@@ -177,7 +181,8 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
 def _reading_edges(n_samples: int, width: float) -> NDArray[np.intp]:
     """Divide `n_samples` of a hold into k intervals that lengthen geometrically; return their bounds, shape (k + 1,).
 
-    The first interval has `width` samples, each later one `GROWTH` times as many; the last one takes the rest.
+    The first interval has `width` samples (rounded, at least 1), each later one `GROWTH` times as many; the last one
+    takes the rest.
     """
     edges = [0]
     while edges[-1] + max(round(width), 1) < n_samples:

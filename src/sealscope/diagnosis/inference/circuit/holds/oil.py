@@ -177,7 +177,7 @@ def fit_leaks(regression: OilRegression, columns: Array, n_readings: float) -> L
     lowest = _lowest_changes()
     is_lowest = np.zeros(4, dtype=bool)  # properties that stay at their lower limit
     for _ in range(MAX_ITERATIONS):  # each is a linear fit of the leaks and of corrections of `changes`
-        slopes = np.where(is_lowest, 0.0, regression.slopes(changes))
+        slopes = np.where(is_lowest, 0.0, regression.slopes(changes))  # 0: no correction
         leaked, design = regression.leaked(changes), np.column_stack([columns, slopes])
         scale = np.sqrt((design**2).sum(axis=0))
         scale[~(scale > 0.0)] = 1.0
@@ -248,6 +248,7 @@ def residual_squares(regression: OilRegression, columns: Array, variance: float)
     energy = np.einsum("ro,ro->o", columns, columns) - np.einsum("ko,cko->co", with_columns, per_leak)
     moment = columns.T @ leaked - limits @ with_columns - np.einsum("ck,cko->co", remainder, per_leak)
     moment = np.maximum(moment, 0.0)  # (c, o); the coefficient of a leak is not negative
+    # a leak that no reading shows, such as one after the last hold, has the coefficient 0
     is_informative = energy > RIDGE * np.maximum(energy.max(axis=1, keepdims=True), np.finfo(float).tiny)
     leak = np.where(is_informative, moment / np.where(is_informative, energy, 1.0), 0.0)
     changes = without_leak[:, :, None] - leak[:, None] * per_leak
