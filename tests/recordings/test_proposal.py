@@ -188,6 +188,9 @@ def test_an_ending_that_may_be_no_unit_is_one_behind_a_word_of_its_kind(heading,
         ("v / m/s", ("v", "m/s")),
         ("gain (m/(s V))", ("gain", "m/(s V)")),
         ("pressure (port A)", ("pressure", None)),
+        ("Drehzahl_Pumpe_U/min", ("Drehzahl_Pumpe", "U/min")),
+        ("Flow l/min", ("Flow", "l/min")),
+        ("p_A/bar", ("p_A", "bar")),
     ],
 )
 def test_of_two_endings_the_known_unit_is_the_unit(heading, parts):

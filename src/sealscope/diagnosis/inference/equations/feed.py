@@ -1,40 +1,77 @@
 """Volume balance of a pump in an open circuit, which feeds one chamber at a time while the other drains to the tank.
 
 The coefficient of a term of motion is the area of the side that the pump feeds in this direction, whichever side
-carries the load. While valves shut the chambers, however, a load creeps by the oil of the side that carries it.
+carries the load; oil that the other chamber compresses or loses to the outside does not count. While the piston rests,
+the side that carries the load counts instead, by whose oil the load creeps.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.equations.terms import MOTIONS, Equation, Term
+from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
+from sealscope.diagnosis.inference.equations.terms import (
+    MOTIONS,
+    Equation,
+    Term,
+    chamber_terms,
+    compensated_leak_term,
+    external_leak_term,
+)
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
+
+#: Side of the terms of one chamber, by their names: its compliance, its air, and leaks from it to the outside.
+_SIDES = {
+    term.name: side
+    for side in "AB"
+    for term in (*chamber_terms(side), external_leak_term(side), compensated_leak_term(side))
+}
 
 
 def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
     """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
 
-    `fed_outward` of the result names the chamber that the pump feeds while x grows: A if its flow is positive then,
-    which the recording tells (`signals`, with limits of rest). The terms of motion count the creep of a piston at rest
-    with the area of the side that carries the load.
+    `fed_outward` of the result names the chamber that the pump feeds while x grows (`_find_fed_outward`). The terms of
+    motion count the creep of a piston at rest with the area of the side that carries the load. The terms of one chamber
+    count while it is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of rest.
+    """
+    adapted = equation._replace(fed_outward=_find_fed_outward(equation, signals))
+    volumes = equation.left(signals) * signals.step("x")  # > 0 if flow and position have one sense
+    sign_A = float(np.sign(np.nansum(volumes))) * (1.0 if adapted.fed_outward == "A" else -1.0)  # of the flow into A
+
+    def adapt(term: Term) -> Term:
+        """Adapt one term."""
+        if term.name in MOTIONS:
+            return term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
+        if term.name in _SIDES:
+            return term._replace(increments=partial(_counted_increments, term=term, left=equation.left, sign_A=sign_A))
+        return term
+
+    return adapted._replace(terms=tuple(map(adapt, equation.terms)))
+
+
+def _find_fed_outward(equation: Equation, signals: Signals) -> Literal["A", "B"]:
+    """Find the chamber that the pump feeds while x grows: that of the larger area if more flow moves the piston then.
+
+    Flows are compared per distance, whatever the signs of flow and position. With equal areas it is A if the flow is
+    positive while x grows.
     """
     volume, step = equation.left(signals), signals.step("x")
-    is_known = np.isfinite(volume * step)
-    adapted = equation._replace(fed_outward="A" if float(volume[is_known] @ step[is_known]) >= 0.0 else "B")
-    terms = [
-        term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
-        if term.name in MOTIONS
-        else term
-        for term in equation.terms
-    ]
-    return adapted._replace(terms=tuple(terms))
+    is_moving = np.isfinite(volume * step) & (signals.moving(equation.left) > 0.0)
+    outward, inward = is_moving & (step > 0.0), is_moving & (step < 0.0)
+    if equation.area_ratio == 1.0 or not (outward.any() and inward.any()):
+        feeds_A = float(volume[is_moving] @ step[is_moving]) >= 0.0
+    else:
+        flow_out, flow_in = (abs(float(volume[flags].sum() / step[flags].sum())) for flags in (outward, inward))
+        feeds_A = (flow_out > flow_in) == (equation.area_ratio < 1.0)
+    return "A" if feeds_A else "B"
 
 
 def motions_of_side(equation: Equation, side: str) -> list[str]:
@@ -71,6 +108,16 @@ def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
         # the density of f is 1 if the flow circulates, also for a few f above 1
         circulates[hold] = prior.circulates - log_density_if_held > 0.0
     return circulates
+
+
+def _counted_increments(signals: Signals, *, term: Term, left: Callable[[Signals], Array], sign_A: float) -> Array:
+    """Compute the increments (n - 1,) of a term of one chamber, 0 while neither the pump's flow nor a load shows it.
+
+    `left`: left side of the volume balance, the pump's flow; `sign_A`: its sign while the pump feeds A.
+    """
+    turns = signals.moving(left) + signals.holding(left) > 0.0  # the pump
+    counts_A = np.where(turns, sign_A * left(signals) > 0.0, interval_means(signals.carried_by_A))
+    return np.asarray(term.increments(signals) * (counts_A if _SIDES[term.name] == "A" else 1.0 - counts_A))
 
 
 def _carried_increments(signals: Signals, *, term: Term, equation: Equation) -> Array:

@@ -14,6 +14,9 @@ _WIDE_BRACKETS = str.maketrans("\uff08\uff09\uff3b\uff3d\u3010\u3011", "()[][]")
 #: `Druck in bar`, `p_A/bar`, `p_A, bar`: the last word is the unit if a channel can have it.
 _TRAILING_UNIT = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<unit>\S{1,20})")
 
+#: `Drehzahl_U/min`, `Flow l/min`: a unit that contains a slash itself.
+_JOINED_UNIT = re.compile(r"(?P<name>.{1,80}?)[_\s]+(?P<unit>[^\s_/]{1,10}/[^\s_/]{1,10})")
+
 
 @dataclass(frozen=True)
 class Label:
@@ -32,11 +35,12 @@ class Label:
         if bracket_text is not None:
             return cls(whole, name, bracket_text if unit is None else unit)
         name, remark = _split_brackets_or_slash(whole)
-        trailing = _TRAILING_UNIT.fullmatch(whole) if unit is None and remark is None else None
-        if trailing and any(
-            same_dimension(trailing["unit"], usual_unit) for usual_unit in (*CHANNEL_UNITS.values(), "s")
-        ):
-            return cls(whole, trailing["name"].rstrip(), trailing["unit"])
+        if unit is None and remark is None:
+            usual_units = (*CHANNEL_UNITS.values(), "s", "m/s", "1/s")
+            for pattern in (_JOINED_UNIT, _TRAILING_UNIT):
+                match = pattern.fullmatch(whole)
+                if match and any(same_dimension(match["unit"], usual) for usual in usual_units):
+                    return cls(whole, match["name"].rstrip(), match["unit"])
         if unit is None and remark and is_unit(remark):  # round brackets may hold a remark: `pressure (port A)`
             unit = remark
         return cls(whole, name, unit)
