@@ -7,9 +7,10 @@ import pytest
 from sealscope.campaigns.cases.case import list_cases
 from sealscope.campaigns.cases.machines import case_leaks
 from sealscope.campaigns.cases.row import CaseRow, Statement
-from sealscope.campaigns.judging.alarms import ALL, ANY_LAW
+from sealscope.campaigns.judging.alarms import ANY_LAW
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.judging.tables import build_tables
+from sealscope.campaigns.plans.duty import ALL_FAMILIES
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.reporting.campaign.page_tables import page_tables
 
@@ -46,7 +47,7 @@ def test_each_family_is_counted_by_hand():
     result = findings()
     hoses = result["hoses", 0.0, ANY_LAW]
     assert (hoses.alarms.count, hoses.alarms.n, hoses.cannot_tell.count, hoses.failed) == (1, 3, 1, 1)
-    assert result[ALL, 0.0, ANY_LAW].alarms.n == 4
+    assert result[ALL_FAMILIES, 0.0, ANY_LAW].alarms.n == 4
     both = result["hoses", 0.004, ANY_LAW]
     assert (both.alarms.count, both.alarms.n) == (1, 2)
     assert (both.coverage.count, both.coverage.n) == (1, 2)
@@ -58,12 +59,12 @@ def test_each_family_is_counted_by_hand():
 def test_the_table_says_which_half_it_is():
     families = build_tables(judge(ROWS, [NAME]), "L/min", {}, part="held out")["families"]
     assert {line["part"] for line in families} == {"held out"}
-    assert {line["family"] for line in families} == {ALL, "hoses", "mass"}
+    assert {line["family"] for line in families} == {ALL_FAMILIES, "hoses", "mass"}
 
 
 def test_the_page_shows_each_family():
     lines = page_tables(judge(ROWS, [NAME]), "L/min")["families"]["rows"]
-    assert lines[0][:3] == (NAME, ALL, "no leak")
+    assert lines[0][:3] == (NAME, ALL_FAMILIES, "no leak")
     both = next(line for line in lines if line[1:3] == ("hoses", "0.004 any"))
     assert both[3].startswith("50 %")
 
@@ -79,6 +80,17 @@ def test_a_mixture_is_half_of_each_law():
     leaks = case_leaks(plan, case)
     assert [leak.law for leak in leaks] == ["laminar", "orifice"]
     assert sum(leak.mean for leak in leaks) * 60_000 == pytest.approx(case.leak_lpm)
+
+
+def test_no_family_of_a_plan_is_called_as_all_of_them(tmp_path, text):
+    (tmp_path / "mine.toml").write_text(
+        '[profile]\nname = "mine"\ntitle = "families"\nextends = "bench"\n[[family]]\nname = "all"\nwhy = "ours"\n',
+        encoding="utf-8",
+    )
+    text = text.replace("[factors]", '[factors]\nfamily = ["all"]')
+    (tmp_path / "plan.toml").write_text(text.replace("seed = 3", 'seed = 3\nprofile = "mine.toml"'), encoding="utf-8")
+    with refusal("factors.family", "'all'", "plan.toml"):
+        load_plan(tmp_path / "plan.toml")
 
 
 def test_a_factor_of_families_needs_a_profile_with_them(tmp_path, text):

@@ -87,6 +87,7 @@ def test_kinds_of_records_take_turns(tiny):
         ('leak = "30 cm^3/min"', 'leak = "0.015 L/min"', "records"),
         ('use = "calibrate"', 'use = "calibrate"\nleak = "1 L/min"', "leak-free"),
         ("seed = 3", "seed = 3\ncolour = 2", "campaign.colour"),
+        ("seed = 3", 'seed = 3\nunit = "mL/min"', "campaign.unit"),
         ("[factors]", "[factor]", "[factor]"),
         ("seed = 3", "seed = 3\nrate = true", "campaign.rate"),
         ("seed = 3", "seed = 3\nfactors = {}", "campaign.factors"),

@@ -136,6 +136,14 @@ def test_hours_minutes_and_seconds_must_be_those_of_a_clock(tmp_path: Path) -> N
     assert recording.rate == 500.0
 
 
+def test_a_row_with_an_hour_and_no_date_has_no_time(tmp_path: Path) -> None:
+    rows = [f"2024,5,31,12,0,{k}" for k in range(40)]
+    rows[7] = ",,,12,0,7"
+    recording = read(saved(tmp_path, "year,month,day,hour,minute,second", rows))
+    assert np.flatnonzero(np.isnan(recording.t)).tolist() == [7]
+    assert np.nanmin(recording.t) == 0.0 and np.nanmax(recording.t) == 39.0
+
+
 def test_a_column_called_date_is_the_time_where_it_holds_times_of_the_day(tmp_path: Path) -> None:
     for cells in (["1", "2", "3"], ["2024-05-31", "2024-06-01", "2024-06-02"]):
         assert "got dates alone in column data (FILE)" in refused(saved(tmp_path, "data", cells))
@@ -186,6 +194,34 @@ def test_channels_of_one_length_whose_clocks_differ_are_not_put_beside_each_othe
     assert recording["p_B"][1:] == pytest.approx(1e5 * (np.arange(1, 100) - 0.5))
     # a map that names the time takes the rows as they are
     assert read(tmp_path / "log.csv", map={"t": "#1[s]"})["p_B"] == pytest.approx(1e5 * np.arange(100))
+
+
+@pytest.mark.parametrize("name", ["ms", "us", "ns"])
+def test_a_column_called_ms_is_no_part_of_a_clock_of_the_file(name: str, tmp_path: Path) -> None:
+    rows = "".join(f"{k / 100},{k},{k / 50},{20 * k % 1000}\n" for k in range(100))
+    (tmp_path / "log.csv").write_text(f"t,p_A [bar],t,{name}\n" + rows)
+    recording = read(tmp_path / "log.csv")
+    assert recording.t == pytest.approx(np.arange(100) / 100)
+    assert f"columns not used: {name}" in recording.history
+
+
+@pytest.mark.parametrize("begin", [0.2, 0.7])  # midnight is at 0.5 s
+@pytest.mark.parametrize(("clock", "order"), [("23:59:59.5", "name"), ("23:59:59.5", "time"), ("12:00:00", "reversed")])
+def test_times_of_day_in_a_long_table_may_pass_midnight(begin: float, clock: str, order: str, tmp_path: Path) -> None:
+    """A slower channel begins before or after midnight; the values are the true times."""
+    rows = []
+    for name, moments in (("p_A", np.arange(400) / 100), ("x", begin + np.arange(30) / 10)):
+        stamps = np.datetime64(f"2024-05-31T{clock}", "ms") + np.round(1e3 * moments).astype("m8[ms]")
+        rows += [(moment, f"{str(stamp)[11:]},{name},{moment!r}\n")
+                 for stamp, moment in zip(stamps, moments.tolist(), strict=True)]  # fmt: skip
+    lines = [line for _, line in (rows if order == "name" else sorted(rows, reverse=order == "reversed"))]
+    (tmp_path / "log.csv").write_text("Time,Name,Value\n" + "".join(lines))
+    recording = read(tmp_path / "log.csv", map={"p_A": "p_A[Pa]", "x": "x[m]"})
+    known = np.isfinite(recording["x"])
+    assert np.count_nonzero(known) >= 289  # times at its ends may be rounded
+    assert recording["x"][known] == pytest.approx(recording["p_A"][known])
+    assert recording.t == pytest.approx(np.arange(400) / 100)
+    assert "start" not in recording.provenance
 
 
 def test_what_a_long_table_says_of_its_samples(tmp_path: Path) -> None:

@@ -92,6 +92,15 @@ def test_what_is_decided_of_the_time_holds_for_all_parts(form: str, every: float
     assert np.array_equal(joined["p_A"], whole["p_A"], equal_nan=True)
 
 
+def test_a_part_names_no_word_of_an_earlier_part(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    words = {40: "FIRST", 60: "SECOND", 140: "THIRD"}
+    path.write_text("t [s];p_A [bar]\n" + "".join(f"{k / 100};{words.get(k, 1)}\n" for k in range(1000)))
+    notes = ["; ".join(line for line in part.history if "read as missing" in line) for part in ss.read_parts(path, 0.5)]
+    assert "1 cell" in notes[0] and "'FIRST' (line 42" in notes[0]
+    assert [note for note in notes[1:] if note] == ["column p_A [bar]: 1 cell without a number read as missing"] * 2
+
+
 @pytest.mark.parametrize("suffix", [".nc", ".parquet", ".csv.gz"])
 def test_other_formats_are_cut_the_same(suffix: str, tmp_path: Path) -> None:
     plain = log(tmp_path, 1000)

@@ -138,6 +138,16 @@ def test_a_cut_last_line_is_missing(tmp_path: Path) -> None:
     assert np.array_equal(recording["p_A"], [1e5, 2e5, 3e5, np.nan], equal_nan=True)
 
 
+@pytest.mark.parametrize("end", ["\n", "\r"])
+@pytest.mark.parametrize(("last", "value"), [("3,4", np.nan), ("3,4\r# the e", 4e5)])
+def test_only_the_line_that_the_end_of_the_file_cuts_may_be_incomplete(
+    tmp_path: Path, end: str, last: str, value: float
+) -> None:
+    path = tmp_path / "log.csv"
+    path.write_bytes(f"t [s],p_A [bar],row\n0,1,1\n1,2,2\n2,3,3\n{last}".replace("\n", end).encode())
+    assert np.array_equal(read(path)["p_A"], [1e5, 2e5, 3e5, value], equal_nan=True)
+
+
 @settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     delimiter=st.sampled_from([",", ";", "\t", "  ", "|"]),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 
 from sealscope.reporting.campaign.page import render_campaign_page, result_text
 
@@ -34,6 +35,14 @@ def test_a_single_size_has_a_curve_no_wider_than_two_in_a_row(campaign_result):
     page = render_campaign_page(campaign_result)
     assert page.count('<svg class="curve"') == 1
     assert "repeat(auto-fill,minmax(min(100%,400px),1fr))" in page
+
+
+def test_the_score_of_each_curve_is_described(campaign_result):
+    judgement = campaign_result.judgement
+    pods = [replace(pod, detector="watch") for pod in judgement.pods]
+    rocs = [replace(roc, detector="watch") for roc in judgement.rocs]
+    page = render_campaign_page(replace(campaign_result, judgement=replace(judgement, pods=pods, rocs=rocs)))
+    assert "Score: the score of the detector &#39;watch&#39;." in page
 
 
 def test_the_links_to_the_tables_can_break(campaign_result):

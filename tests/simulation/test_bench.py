@@ -235,6 +235,9 @@ def test_a_profile_of_one_s_own(tmp_path):
         ('parameters = ["K_oil"]', 'parameters = ["K_ol"]', "'K_ol', K_oil"),
         ('parameters = ["K_oil"]', 'parameters = ["volumes"]', "volumes"),
         ('parameters = ["K_oil"]', 'parameters = ["K_oil", "F_v"]', "unit"),
+        ('parameters = ["K_oil"]\nrange = [6000, 7000]\nunit = "bar"\ndrift = { size = [1, 2], unit = "%" }',
+         'parameters = ["sensors.p_A.offset", "sensors.p_A.gain_error"]\nscale = [1, 2]\n'
+         'drift = { size = [1, 2], unit = "bar" }', "oil, 1, Pa"),
         ('parameters = ["K_oil"]', 'parameters = ["p_charge"]', "p_charge"),
         ('parameters = ["K_oil"]', "parameters = []", "nuisance[1].parameters"),
         ('why = "measured"', "", "nuisance[1].why"),
@@ -251,7 +254,7 @@ def test_a_profile_of_one_s_own(tmp_path):
         ('title = "two nuisances"', "", "profile.title"),
         ("[profile]", "[profile", "TOML"),
     ],
-)
+)  # fmt: skip
 def test_a_profile_with_a_slip_is_refused_in_one_line_with_its_place(tmp_path, old, new, words):
     assert SMALL.count(old) == 1
     path = write(tmp_path, SMALL.replace(old, new))

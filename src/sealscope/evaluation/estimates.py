@@ -90,8 +90,8 @@ def estimate_errors(
     """Compute the errors of estimates, such as leaks [L/min] or onsets [s], with confidence intervals.
 
     `estimates`, `truth` and the ends `low` and `high` of the stated intervals, all (n,), have the same unit. A missing
-    estimate or interval is nan; at least one record has an estimate. Raises InputError for an error that is too large
-    to be squared.
+    estimate or interval is nan, and no end is infinite; at least one record has an estimate. Raises InputError for an
+    error that is too large to be squared.
     """
     stated, true_values = np.asarray(estimates, dtype=np.float64), np.asarray(truth, dtype=np.float64)
     lower, upper = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)

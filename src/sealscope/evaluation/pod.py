@@ -82,7 +82,7 @@ def _log_likelihood(design: Array, n: Array, k: Array, eta: Array, *, firth: boo
     """Compute the log-likelihood of `k` hits in `n` trials at m sizes with the log odds `eta` of a hit, all (m,).
 
     It is ``sum of k eta - n ln(1 + exp eta)``. With `firth`, half the log determinant of the Fisher information is
-    added as a penalty; `design` (m, 2) has the columns 1 and logarithm of size.
+    added as a penalty, minus infinity if it is singular; `design` (m, 2): columns 1 and logarithm of size.
     """
     value = float(np.sum(k * eta - n * np.logaddexp(0.0, eta)))
     if not firth:
@@ -107,7 +107,7 @@ def _fit_coefficients(design: Array, n: Array, k: Array, *, firth: bool) -> Arra
         # adds h (1/2 - p), with the leverage h = n p (1 - p) x' I^-1 x of a size, x its row of the design and I the
         # information: Firth (1993), Heinze and Schemper (2002)
         if firth:
-            inverse = np.linalg.pinv(_information(design, n, eta))
+            inverse = np.linalg.pinv(_information(design, n, eta))  # may be singular far from the maximum
             residual += n * p * (1.0 - p) * np.einsum("ij,jk,ik->i", design, inverse, design) * (0.5 - p)
         return -_log_likelihood(design, n, k, eta, firth=firth), -design.T @ residual
 
@@ -191,7 +191,8 @@ class HitMiss:
 
         log_odds = _log_odds(detection)
         allowed_drop = 0.5 * float(ndtri(confidence)) ** 2  # largest drop of the log-likelihood
-        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:  # even slope 0 is within the drop
+        # a curve with slope 0, the limit for large sizes, may be within the drop
+        if not self.slope > 0.0 or self.log_likelihood - self.null <= allowed_drop:
             return math.inf
 
         def excess_drop(log_size: float) -> float:
@@ -234,11 +235,12 @@ class HitMiss:
         design = np.column_stack([np.ones(x.size), x])
 
         def loss(slope: float) -> float:
-            """Compute the negative log-likelihood of the curve with this slope, 1e300 if it is infinite."""
+            """Compute the negative log-likelihood of the curve with this slope; 1e300 for inf, to go on searching."""
             eta = log_odds + slope * (x - log_size)
             value = _log_likelihood(design, self.tested, self.hits, eta, firth=self.estimator == "firth")
             return -value if math.isfinite(value) else 1e300
 
+        # first slopes of the search: the log odds change by 0, and by 1 from the point to the farthest size
         width = float(np.abs(x - log_size).max())
         return -float(minimize_scalar(loss, bracket=(0.0, 1.0 / width), options={"xtol": 1e-9}).fun)
 

@@ -60,7 +60,7 @@ def roc_curve(leak_free: npt.ArrayLike, leaky: npt.ArrayLike, confidence: float 
     """
     a, b = np.asarray(leak_free, dtype=np.float64), np.asarray(leaky, dtype=np.float64)
     falling_scores = np.unique(np.concatenate([a, b]))[::-1]
-    thresholds = np.concatenate([[np.inf], falling_scores])
+    thresholds = np.concatenate([[np.inf], falling_scores])  # inf: no alarms, the point (0, 0)
     false_alarm, detection = _alarm_fractions(a, thresholds), _alarm_fractions(b, thresholds)
     d, e = (kolmogorov_margin(scores.size, math.sqrt(confidence)) for scores in (a, b))
     # first and last point of the curve whose false-alarm fraction is within d of the point's own
@@ -100,7 +100,7 @@ def _newcombe_interval(value: float, n: int, m: int, z: float) -> tuple[float, f
         q = (1.0 - t) / (2.0 - t) + t / (1.0 + t)
         return (t - value) ** 2 - z * z * t * (1.0 - t) * (1.0 + (mean_number - 1.0) * q) / (n * m)
 
-    # at A itself the excess is negative, so each search ends just short of A, by 1e-9
+    # each search ends 1e-9 short of A, where the excess is negative; at A itself it is 0 if A is 0 or 1
     low = brentq(excess, 0.0, value * (1.0 - 1e-9)) if value > 0.0 else 0.0
     high = brentq(excess, value + (1.0 - value) * 1e-9, 1.0) if value < 1.0 else 1.0
     return float(low), float(high)

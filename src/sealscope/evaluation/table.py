@@ -57,8 +57,8 @@ def confusion_matrix(
 ) -> Confusion:
     """Count the verdicts for each true fault, with Clopper-Pearson intervals of their fractions.
 
-    `truth`, `verdicts`: true fault and verdict of each record, at least one; `faults`: names of all faults, including
-    that for no fault, in the order of rows and columns.
+    `truth`, `verdicts`: true fault and verdict (a fault or "cannot tell") of each record, at least one; `faults`: names
+    of all faults, including that for no fault, in the order of rows and columns; repeated names count once.
     """
     rows = tuple(dict.fromkeys(faults))
     columns = (*rows, CANNOT_TELL)
@@ -66,4 +66,5 @@ def confusion_matrix(
     for fault, verdict in zip(truth, verdicts, strict=True):
         counts[rows.index(fault), columns.index(verdict)] += 1
     shares = tuple(tuple(proportion(int(k), int(row.sum()), confidence) for k in row) for row in counts)
-    return Confusion(rows, columns, counts, shares, proportion(int(np.trace(counts)), len(truth), confidence))
+    n_correct = int(np.trace(counts))  # row i and column i are the same fault
+    return Confusion(rows, columns, counts, shares, proportion(n_correct, len(truth), confidence))

@@ -51,8 +51,8 @@ def _threshold_rank(n: int, false_alarm: float, promise: Promise, confidence: fl
     """Find which of `n` leak-free scores is the lowest possible threshold; return its rank, 1 for the highest score.
 
     With the score of rank r as the threshold, the true false-alarm probability is distributed as Beta(r, n + 1 - r).
-    The result is the largest r whose mean r/(n + 1) is at most `false_alarm` ("average"), or with which the true
-    probability is at most `false_alarm` with at least the probability `confidence` ("bound").
+    The result is the largest r <= n whose mean r/(n + 1) is at most `false_alarm` ("average"), or with which the true
+    probability is at most `false_alarm` with at least the probability `confidence` ("bound"); 0 if `n` is too small.
     """
     from scipy.special import betainc
 

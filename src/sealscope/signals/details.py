@@ -41,7 +41,7 @@ class Details:
     values : array, (levels, n)
         The details; row 0 is d_1.
     edges : array, (levels, 2)
-        Number of samples at the beginning and at the end of each level that depend on padding.
+        Number of samples at the beginning and at the end of each level that can depend on padding.
     """
 
     values: Array
@@ -81,7 +81,7 @@ class Details:
 
 
 def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
-    """Count the samples at the beginning and at the end of each level that depend on padding, (levels, 2).
+    """Count the samples at the beginning and at the end of each level that can depend on padding, (levels, 2).
 
     The detail d_j of a sample depends on before_j earlier and after_j later samples (`reach`). The two counts are:
 
@@ -91,6 +91,8 @@ def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "
       padding;
     - reconstructed: before_j + after_j at both ends, since analysis and synthesis both reach beyond a sample. This is
       ``(L - 1)(2^j - 1)`` for filters of L taps.
+
+    At the end of a decimated level, and at both ends of a reconstructed one, the counts are upper limits.
     """
     if transform not in get_args(Transform):
         raise InputError(f"transform must be one of {', '.join(get_args(Transform))}, got {transform!r}")
@@ -211,5 +213,6 @@ def _inverse_details(x: Array, wavelet: Any, levels: int) -> Array:
     values = []
     for index in range(levels, 0, -1):
         level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
+        # `waverec` returns one sample more for a signal of odd length
         values.append(pywt.waverec(level_coefficients, wavelet, mode=_PADDING)[: x.size])
     return np.array(values)

@@ -66,9 +66,10 @@ def split_levels(
 
     `low`, `high` (taps, WIDTH): low-pass and high-pass filter, repeated for each actuator (or simulated run). A row of
     `buffers` has a number for each. Every level of the channel has a buffer of `capacity` rows, the first one from row
-    `start` on; the new samples begin at row `first` of the first buffer. High-pass filtering of a level's buffer gives
-    its detail, and low-pass filtering fills the buffer of the next level. The finer levels, whose filters are shorter,
-    get the delay of the deepest level: row i of all levels in `details` (levels, CHUNK, WIDTH) belongs to one sample.
+    `start` on; the new samples begin at row `first` of the first buffer, after the history. High-pass filtering of a
+    level's buffer gives its detail, and low-pass filtering fills the same rows of the next level's buffer. The finer
+    levels, whose filters are shorter, get the delay of the deepest level: row i of all levels in `details` (levels,
+    CHUNK, WIDTH) belongs to one sample.
     """
     n_taps = low.shape[0]
     for level in range(levels):
@@ -88,7 +89,7 @@ def move_history(buffers: Array, start: int, levels: int, capacity: int, fill: i
     """
     for level in range(levels):
         row = start + level * capacity
-        for i in range(history):
+        for i in range(history):  # rising, as the old and the new rows may overlap
             store(buffers, row + i, load(buffers, row + fill - history + i))
 
 

@@ -189,6 +189,7 @@ class DetailStream:
 
         `threads`: number of threads, which may differ from that of the saved stream.
         """
+        # `object`: of any type, as the constructor checks them
         channels, levels, wavelet = (require_part(state, name, object) for name in ("channels", "levels", "wavelet"))
         channels = tuple(channels) if isinstance(channels, list) else channels  # JSON has no tuples
         stream = cls(channels, levels, wavelet=wavelet, threads=threads)
@@ -198,6 +199,7 @@ class DetailStream:
         groups, width = stream.buffers.shape[0], stream.buffers.shape[-1]
         # divide the signals of a row (last axis) into groups of `width`, after filling up the last group with zeros
         lanes = np.pad(history, [(0, 0)] * 3 + [(0, groups * width - shape[-1])]).reshape(*shape[:3], groups, width)
+        # in a new stream the history is at the front
         stream.buffers[:, :, :, : stream._history] = np.moveaxis(lanes, -2, 0)
         return stream
 

@@ -191,7 +191,7 @@ def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     pieces_per_window, pieces_per_step = size // piece, step // piece
     n_windows = max(0, (sums.shape[-1] - pieces_per_window) // pieces_per_step + 1)
     squares = np.zeros((*sums.shape[:-1], n_windows))
-    if n_windows:
+    if n_windows:  # the slices below need a window
         for i in range(pieces_per_window):  # add piece i of all windows
             last = i + (n_windows - 1) * pieces_per_step  # index of piece i of the last window
             squares += sums[..., i : last + 1 : pieces_per_step]

@@ -62,7 +62,7 @@ def noise_free_mean_squares(
 
 
 def log_rms(squares: Array, sigma: float) -> Array:
-    """Compute log RMS (..., 5) of d1..d4 and d3d4 of pressures with white noise, by the formulas above.
+    """Compute log RMS (..., 5) of d1..d4 and d3d4 of pressures with white noise, by the formulas of this module's text.
 
     `squares` (..., 5): mean squares without noise, m_1 to m_4 [psi^2] and m_34 [psi^4]; `sigma`: standard deviation
     [psi] of the noise in the pressure.
@@ -77,6 +77,7 @@ def log_rms(squares: Array, sigma: float) -> Array:
 def pressure_noise(rig: Rig, chamber: str) -> float:
     """Compute the noise [psi] of a sample of a chamber's pressure: sensor, common noise, quantisation (step^2/12)."""
     sensor, daq = getattr(rig.sensors, chamber), rig.daq
+    # step of the conversion in Pa: its volts, times the sensor's range over the sensor's voltage span
     step = daq.step * (sensor.range_hi - sensor.range_lo) / (daq.sensor_volts_hi - daq.sensor_volts_lo)
     return math.sqrt(sensor.noise**2 + rig.sensors.common_noise**2 + step**2 / 12.0) / PSI
 
@@ -133,7 +134,7 @@ def predicted_sheet(
     healthy_rig = _scale_parameters(rig.with_overrides(h.overrides), h.factors)
     leaking_rig = _scale_parameters(healthy_rig, h.leaking_factors)
     leak_free: dict[tuple[str, float], Array] = {}  # mean squares by operating condition, which several tests share
-    # d1..d4 squared scale with the gain of sensor B squared, d3d4 squared with its fourth power
+    # d1..d4 squared scale with the gain of sensor B squared, d3d4 squared with its fourth power; noise does not
     scales = np.array([[1.0] * 5, [h.gain_B**2] * 4 + [h.gain_B**4]])
     rms = np.empty((len(conditions), 2, len(CHAMBERS), len(QUANTITIES)))  # 2: without and with the leak
     for row, condition in enumerate(conditions):
@@ -170,7 +171,8 @@ def parameters_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def fit_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate the ratio of simulated to measured leak-free RMS of each wavelet detail, for the fitted rig.
 
-    Geometric mean and standard deviation over all tests, then the mean over the tests of each operating condition.
+    The first table has geometric mean and standard deviation over all tests, the second one the geometric mean over the
+    tests of each operating condition.
     """
     assert context.sheet is not None  # the item needs the measured data sheet
     residuals = log_residuals(load_rig(BENCH_RIG), context.sheet)

@@ -102,7 +102,7 @@ class DataSheet:
         return np.asarray(np.log(self.rms[chamber][quantity][:, 0] / other.rms[chamber][quantity][:, 0]))
 
     def count_same_signs(self, other: DataSheet, chamber: str, quantity: str) -> int:
-        """Count the tests in which the RMS of a wavelet detail changes in the same direction in another sheet."""
+        """Count the tests in which the RMS of a detail changes with the leak in the same direction in another sheet."""
         changes = (np.sign(sheet.log_change(chamber, quantity)) for sheet in (self, other))
         return int(np.sum(np.equal(*changes)))
 

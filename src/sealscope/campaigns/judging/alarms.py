@@ -9,14 +9,14 @@ from typing import Any
 
 from sealscope.campaigns.cases.row import expected_cause, matches_cause
 from sealscope.campaigns.judging.verdicts import JudgedRow, Verdicts, group_by
-from sealscope.campaigns.plans.duty import FAMILY
+from sealscope.campaigns.plans.duty import ALL_FAMILIES, FAMILY
 from sealscope.evaluation.binomial import IntervalEstimate, Proportion, proportion
 from sealscope.evaluation.table import CANNOT_TELL, events_per_hour
 
 #: Reference detectors that ignore the record; they are listed for comparison.
 ALWAYS, NEVER = "always fire", "never fire"
-#: Labels of all families together, and of all laws of a leak together.
-ALL, ANY_LAW = "all", "any"
+#: Label of all laws of a leak together.
+ANY_LAW = "any"
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class AlarmFractions:
     leak_lpm: float = 0.0
     law: str = ANY_LAW
     fault: str = ""
-    family: str = ALL
+    family: str = ALL_FAMILIES
     levels: Mapping[str, str | float] = field(default_factory=dict)
     named: Proportion | None = None
     failed: int = 0
@@ -119,7 +119,7 @@ def alarms_by_family(verdicts: Verdicts, confidence: float) -> Iterator[AlarmFra
         families = group_by(members, lambda record: str(record.row.levels[FAMILY]))
         if not families:
             continue
-        for family, family_records in {ALL: records, **families}.items():
+        for family, family_records in {ALL_FAMILIES: records, **families}.items():
             for size, group in group_by(family_records, lambda record: record.size).items():
                 laws = group_by(group, lambda record: record.row.law) if size else {}  # size 0: leak-free
                 by_law = laws if len(laws) == 1 else {ANY_LAW: group, **laws}

@@ -17,6 +17,8 @@ from sealscope.units import parse_quantity
 
 #: Names of the factors that are no parameters of the rig.
 CLOSED, COMMAND, CONTROLLER, FAMILY, LOAD = "closed", "command", "controller", "family", "load"
+#: Label of all families together in the tables of a campaign.
+ALL_FAMILIES = "all"
 #: Rate [Hz] at which a target is sampled to check that the piston can reach it.
 _TARGET_CHECK_RATE = 50.0
 
@@ -34,6 +36,8 @@ def check_level(plan: SimulatedPlan, name: str, level: str | float) -> None:
         if plan.machine_profile is None:
             raise InputError(f"a family needs a profile that defines it, got {level!r} in a plan without profile")
         plan.machine_profile.family(text)
+        if text == ALL_FAMILIES:
+            raise InputError(f"a family must not be called {text!r}, which stands for all families in the tables")
     elif name == CONTROLLER and text in CONTROLLERS:
         CONTROLLERS[text](plan.rig)  # raises if the controller does not fit the rig
     elif name == CONTROLLER:

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, TypeAlias
 
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field
 
@@ -127,7 +127,6 @@ class _Plan(_TomlTable):
     - `confidence`: confidence level of all intervals, such as 0.95
     - `false_alarm`, `promise`: wanted false-alarm probability of each detector, and how thresholds keep it (`Promise`)
     - `detectors`: names in the forms that the module `plans.detectors` lists
-    - `unit`: unit of the leaks' sizes
     - `views`: sets of channels, by the name that follows the "@" in a detector's name
     - `channels`: channels of the detectors without "@", None for all but the flow meter of the leak
     - `assume`: name or file of the rig that detectors may assume, None for the default of the plan's type
@@ -142,7 +141,6 @@ class _Plan(_TomlTable):
     false_alarm: Annotated[Fraction, Field(ge=1e-15)] = 0.01  # no number of records shows a smaller one
     promise: Promise = "average"
     detectors: Names
-    unit: Text = "L/min"
     views: Mapping[Annotated[str, AfterValidator(_validate_view_name)], Channels] = field(default_factory=dict)
     channels: Channels | None = None
     assume: Text | None = None
@@ -171,6 +169,7 @@ class SimulatedPlan(_Plan):
     - `keep_recordings`: True to store the recordings
     - `factors`: by name, the levels (values) of each factor; a group's records take their combinations in turn
     - `part`: purpose of the plan, such as development or judging
+    - `unit`: unit of the leaks' sizes, which a plan's file cannot change
 
     The factors `command`, `controller` and `load` set how the machine is moved and loaded, `closed` how far the
     throttles of its lines are closed, and `family` which groups of the profile's machines are drawn. Others are
@@ -188,6 +187,7 @@ class SimulatedPlan(_Plan):
     records: Annotated[tuple[RecordGroup, ...], Field(min_length=1)]
     factors: Mapping[str, Annotated[tuple[Level, ...], Field(min_length=1)]] = field(default_factory=dict)
     part: Text = ""
+    unit: ClassVar[str] = "L/min"
 
     @cached_property
     def rig(self) -> Rig:
@@ -240,11 +240,13 @@ class RecordingSet(_TomlTable):
 class RecordedPlan(_Plan):
     """The plan of a campaign over recordings of real machines, which are files in a folder.
 
-    `channel_map`: by channel, the name of its column; `rate_hz` [Hz]: sampling rate of files without times.
+    `channel_map`: by channel, the name of its column; `rate_hz` [Hz]: sampling rate of files without times; `unit`:
+    unit of the leaks' sizes.
     """
 
     channel_map: Annotated[Mapping[str, str], Field(alias="map")] = field(default_factory=dict)
     rate_hz: Annotated[Number | None, _quantity_validator("Hz"), Field(alias="rate")] = None
+    unit: Text = "L/min"
     sets: Annotated[tuple[RecordingSet, ...], Field(min_length=1)]
 
     @cached_property

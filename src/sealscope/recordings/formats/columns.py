@@ -37,6 +37,8 @@ _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: a mapping does this for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
 REST = "*"
+#: Label of a file's own sampling times, which come after its columns if none of these is called t.
+CLOCK_LABEL = Label("t [s]", "t", "s")
 
 
 @dataclass(frozen=True)
@@ -310,7 +312,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
 
     - Columns of hours, minutes and seconds form the time, alone or with a date.
     - Otherwise, without a time column and a rate, the time is a column of dates, or the only column in a unit of time.
-    - Columns with parts of a second are added to the time.
+    - Columns with parts of a second are added to the time, unless it is the file's own (`CLOCK_LABEL`).
     """
     labels, used = choice.labels, choice.channel_of
     parts = find_time_parts(labels, used)
@@ -331,7 +333,7 @@ def _choose_time_columns(choice: ColumnMap) -> None:
         if dates or len(in_time_units) == 1:  # `x-axis` over `second`, as oscilloscopes write
             choice.time = (dates or in_time_units)[0]
             choice.time_label = labels[choice.time]
-    if choice.time is not None:
+    if choice.time is not None and labels[choice.time] is not CLOCK_LABEL:
         choice.parts = find_time_parts(labels, {*used, choice.time}, only_subsecond=True)
 
 

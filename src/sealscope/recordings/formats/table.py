@@ -24,7 +24,7 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import format_count, join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.cells import MAX_WORD_FRACTION, parse_numbers
-from sealscope.recordings.formats.columns import ColumnMap, Request, choose_columns
+from sealscope.recordings.formats.columns import CLOCK_LABEL, ColumnMap, Request, choose_columns
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
@@ -48,8 +48,6 @@ _MIN_LIMIT, _MAX_EXPANSION = 2**26, 4096
 #: Most texts in a column, most bytes of each text, and most bytes of all texts together.
 _MAX_TEXTS, _MAX_TEXT_WIDTH, _MAX_TEXT_BYTES = 2**22, 400, 2**29
 FORMAT_VERSION = 1
-#: Label of a file's own clock, added to the columns if none of them is the time.
-_CLOCK_LABEL = Label("t [s]", "t", "s")
 #: Channels whose clock all others are brought to, in order of preference.
 _BASE_CHANNELS = ("p_A", "p_B", "p_1", "p_2")
 _MAX_INTERVAL = 3.0  # longest interval of a slower series that is interpolated, in median intervals
@@ -57,6 +55,7 @@ _SAME_CLOCK = 1e-2  # largest difference of equal clocks, as a fraction of an in
 #: Relative difference up to which the written rate of a recording takes precedence over the rate of its time stamps.
 _SAME_RATE = 0.01
 _MAX_NAMES = 4096  # most names in a long table
+_HALF_DAY = np.timedelta64(12, "h")
 #: Function that reads columns before their values are used, and returns lines for the history. Arguments: column ->
 #: kind of its values, as for `text._Log`; and the column of the date that belongs to the time, or None.
 Prepare = Callable[[Mapping[int, str], int | None], Sequence[str]]
@@ -143,20 +142,20 @@ def build_fields(
     # sampling times of series count as one more column, unless a series is called t
     uses_clock = any(member.clock is not None for member in candidates) and all(label.name != "t" for label in labels)
     try:
-        choice = choose_columns([*labels, _CLOCK_LABEL] if uses_clock else labels, request, rate)
+        choice = choose_columns([*labels, CLOCK_LABEL] if uses_clock else labels, request, rate)
     except InputError:
         if (long_columns := _find_long_columns([member.label for member in series])) is None:
             raise
         channel_series, more_notes = _pivot_long_table(series, long_columns, prepare)
         table = build_fields(channel_series, request, kind, remarks)  # their values are read already
         return table._replace(history=(*more_notes, *table.history))
-    # the series to read; `_CLOCK_LABEL`, which may come after all series, is not one
+    # the series to read; `CLOCK_LABEL`, which may come after all series, is not one
     kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}
     members = {column: candidates[column] for column in kinds}
     if prepare is not None:
         notes += prepare(kinds, choice.date)
     check_size(max(member.count for member in members.values()), len(choice.columns), size)
-    if choice.time == len(candidates):  # `_CLOCK_LABEL`: sampling times of the series, not a column
+    if choice.time == len(candidates):  # `CLOCK_LABEL`: sampling times of the series, not a column
         columns, more_notes = _align_clocks(choice, members)
         notes = [*notes, *more_notes]
     else:
@@ -476,27 +475,31 @@ def _read_long_channel(
 ) -> tuple[Array, Array, np.datetime64 | None]:
     """Read a channel of a long table, in which each row is one sample of a named channel; `rows` (k,) are its rows.
 
-    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. `choice`: the time column, and
-    the values as the only channel `u`, in counts (`_count_request`); `table`: column -> cells; `value_column`: column
-    of the values. Rows without a time are left out. Raises InputError for too many words.
+    Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. Times of day without a date
+    count from the first of the table. `choice`: the time column, and the values as the only channel `u`, in counts
+    (`_count_request`); `table`: column -> cells; `value_column`: column of the values. Rows without a time are left
+    out. Raises InputError for too many words.
     """
     assert choice.time is not None
-    times = table[choice.time][rows]
-    timed_rows = rows[~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)]
+    times = table[choice.time]
+    is_known = ~np.isnat(times) if times.dtype.kind == "M" else np.isfinite(times)
+    timed_rows = rows[is_known[rows]]
     columns = {column: cells[timed_rows] for column, cells in table.items()}
     is_word = np.isinf(columns[value_column])  # a column of the kind "any" has inf in place of words
     if np.count_nonzero(is_word) > MAX_WORD_FRACTION * is_word.size:
         raise InputError(f"{label.whole[:40]} must hold numbers, got text")
     columns[value_column][is_word] = np.nan
     fields = convert_columns(choice, columns, "", _count_request(value_column))
-    start: np.datetime64 | None = None
+    t, start = fields.t, None
     if "start_epoch_s" in fields.provenance:
         start = np.datetime64(round(fields.provenance["start_epoch_s"] * 1e9), "ns")
     elif "start" in fields.provenance:
         start = np.datetime64(fields.provenance["start"]).astype("datetime64[ns]")
-    elif times.dtype.kind == "M" and times.size > 0:  # times of day without a date
-        start = np.nanmin(times)  # the first, or the last of rows that are reversed
-    return fields.channels["u"], fields.t, start
+    elif times.dtype.kind == "M":  # times of day without a date
+        first = -1 if is_falling(times[timed_rows]) else 0  # falling times are read in reverse
+        delay = times[timed_rows][first] - times[is_known][first]  # from the first time in the table
+        t = t + timedelta_seconds((delay + _HALF_DAY) % (2 * _HALF_DAY) - _HALF_DAY)  # across midnight, if nearer
+    return fields.channels["u"], t, start
 
 
 def _count_request(value_column: int) -> Request:

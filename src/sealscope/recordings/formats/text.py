@@ -230,18 +230,22 @@ class _Block:
 
     columns: dict[int, NDArray[Any]] = field(default_factory=dict)  # column -> values (n,)
     word_rows: dict[int, NDArray[np.intp]] = field(default_factory=dict)  # column -> rows with a word for a number
-    first_words: dict[int, str] = field(default_factory=dict)  # column -> the first of them with its place
+    #: Column -> the first of these words with its place; without it if the block is a slice that begins after it.
+    first_words: dict[int, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values())))
 
     def __getitem__(self, rows: slice) -> _Block:
-        """Return the block of the rows in a slice; `first_words` stay those of the whole block."""
+        """Return the block of the rows in a slice."""
         first, stop, _ = rows.indices(len(self))
+        first_words = {
+            column: word for column, word in self.first_words.items() if first <= self.word_rows[column][0] < stop
+        }
         word_rows = {
             column: indices[(indices >= first) & (indices < stop)] - first for column, indices in self.word_rows.items()
         }
-        return _Block({column: cells[rows] for column, cells in self.columns.items()}, word_rows, self.first_words)
+        return _Block({column: cells[rows] for column, cells in self.columns.items()}, word_rows, first_words)
 
 
 class _Log:
@@ -268,6 +272,7 @@ class _Log:
         self.day_first: bool | None = None  # None until the first date such as 05/06/2024
         self.order_note = ""  # line for the history if the dates leave the order of day and month open
         self.n_words = Counter[int]()  # column -> number of words
+        self.first_words: dict[int, str] = {}  # column -> the log's first word with its place, for messages
         self.last_width = 0  # number of cells in the last row
 
     def iter_blocks(self) -> Iterator[_Block]:
@@ -289,7 +294,8 @@ class _Log:
         The bytes before index `end` are complete lines; the others come again in the next block. Lines end at a
         newline; in a one-byte encoding, those of a block without any newline end at a carriage return. Only the last
         block may have an incomplete last line, without a line end: then `is_cut` is True, and `end` is the block's
-        length. Raises InputError for binary data, and for a line that is too long.
+        length. In a one-byte encoding, it is the block's only line. Raises InputError for binary data, and for a line
+        that is too long.
         """
         encoding = self.layout.encoding
         character_bytes = 2 if encoding.startswith("utf-16") else 1
@@ -304,12 +310,12 @@ class _Log:
                 if character_bytes == 1 and b"\0" in block:
                     line = first_line + block[: block.index(b"\0")].count(b"\n")
                     raise InputError(f"a text log must be text throughout, got binary data (line {line}, {self.path})")
-                if end < 0 and len(block) >= _MAX_LINE:
-                    if b"\r" not in block or character_bytes == 2:
-                        raise InputError(f"a text log must have lines, got {len(block)} bytes without")
+                if end < 0 and character_bytes == 1:
                     end = block.rfind(b"\r")
                 if end < 0:
-                    yield first_line, block, len(block), not block.endswith(b"\r")
+                    if len(block) >= _MAX_LINE:
+                        raise InputError(f"a text log must have lines, got {len(block)} bytes without")
+                    yield first_line, block, len(block), True
                     return
                 end += character_bytes
                 file.seek(end - len(block), SEEK_CUR)  # reading again costs less than copying the block
@@ -477,6 +483,7 @@ class _Log:
                 self.n_words[column] += len(word_rows)
                 first_word = cells[word_rows[0]].strip()[:40]
                 block.first_words[column] = f"{first_word!r} {format_place(word_rows[0])}"
+                self.first_words.setdefault(column, block.first_words[column])
         return block
 
     def _is_stamped(self, cells: Sequence[str], rows: Sequence[Sequence[str]]) -> bool:
@@ -572,13 +579,14 @@ class _Log:
             for column in self.kinds
         }
         for column, indices in word_rows.items():  # frees each column's blocks before the next is joined
-            first = next((block.first_words[column] for block in blocks if len(block.word_rows.get(column, ()))), "")
+            blocks_with_words = (block for block in blocks if len(block.word_rows.get(column, ())))
+            first = next((block.first_words.get(column, "") for block in blocks_with_words), "")
             if indices and self.n_words[column] > MAX_WORD_FRACTION * self.n_rows:
-                is_stamp_column = self.has_stamps and self.kinds[column] == "time"
-                raise InputError(f"{_STAMP_RULE if is_stamp_column else 'a sample must be a number'}, got {first}")
+                is_stamp_column, first_word = self.has_stamps and self.kinds[column] == "time", self.first_words[column]
+                raise InputError(f"{_STAMP_RULE if is_stamp_column else 'a sample must be a number'}, got {first_word}")
             if indices:
                 cells_text = f"{format_count(len(indices), 'cell')} without a number read as missing"
-                notes.append(f"column {labels[column].whole}: {cells_text}, first {first}")
+                notes.append(f"column {labels[column].whole}: {cells_text}" + (f", first {first}" if first else ""))
             parts = [block.columns.pop(column) for block in blocks] or [np.empty(0)]
             if self.has_stamps and self.kinds[column] == "time":  # blocks before the first stamp were read as numbers
                 parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]

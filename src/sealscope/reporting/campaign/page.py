@@ -15,7 +15,7 @@ from sealscope.campaigns.judging.alarms import AlarmFractions
 from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
 from sealscope.campaigns.judging.judge import Judgement
 from sealscope.campaigns.judging.tables import PriorKnowledge
-from sealscope.campaigns.plans.detectors import DIAGNOSE, parse_detector_name
+from sealscope.campaigns.plans.detectors import DIAGNOSE, WATCH, parse_detector_name
 from sealscope.campaigns.plans.model import RecordedPlan, SimulatedPlan
 from sealscope.campaigns.results import CampaignResult
 from sealscope.diagnosis.detectors.registry import detectors
@@ -282,7 +282,7 @@ def _size_text(roc: SizeRoc, unit: str) -> str:
 
 
 def _describe_score(name: str) -> str:
-    """Describe the score from which the ROC curve of a detector is computed; "" for `watch` and if it is not installed.
+    """Describe the score from which the ROC curve of a detector is computed; "" if the detector is not installed.
 
     The word after the "@" in a `name` such as "diagnose @ pressures" is the view, i.e. the set of channels it is given.
     """
@@ -292,7 +292,8 @@ def _describe_score(name: str) -> str:
         return detector.scorer.description + view_text
     if detector.base == DIAGNOSE:
         return f"score over threshold of the detector that judged{view_text}"
-    return f"the score of the detector {detector.base!r}{view_text}" if detector.base in detectors() else ""
+    is_known = detector.base == WATCH or detector.base in detectors()
+    return f"the score of the detector {detector.base!r}{view_text}" if is_known else ""
 
 
 #: A curve of a plot: label, x, y, and lower and upper end of its confidence band, None for none.

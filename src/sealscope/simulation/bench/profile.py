@@ -161,7 +161,7 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
     parameters = tuple(resolve_name(name) for name in entry.parameters)
     declarations = [declared_fields()[parameter] for parameter in parameters]
     kinds = {(choices_of(declaration), unit_of(declaration)) for declaration in declarations}
-    choices, si_unit = next(iter(kinds))  # several are refused below, except for a `scale`, which has no unit
+    choices, si_unit = next(iter(kinds))  # several are refused below, unless the SI unit is not used
     if entry.values is not None:
         if len(kinds) > 1 or entry.range or entry.scale or entry.drift or entry.each:
             raise InputError(
@@ -182,6 +182,9 @@ def _convert_to_si(entry: _NuisanceEntry) -> AnyNuisance:
         low, high = (to_si(value, entry.unit, si_unit, name="range") for value in entry.range)
     else:
         raise InputError("there must be a range with a unit, or a scale without a unit")
+    if entry.drift is not None and len(kinds) > 1 and is_absolute_drift(parameters[0]):
+        units = ", ".join(sorted(unit for _, unit in kinds))
+        raise InputError(f"parameters that drift by one size must have one unit, got {units}")
     drift = None if entry.drift is None else _parse_drift(entry.drift, parameters, si_unit)
     scales = entry.scale is not None
     return Nuisance(entry.name, parameters, low, high, scales=scales, each=entry.each, drift=drift, why=entry.why)

@@ -45,11 +45,12 @@ def compare_sheets(sheet: DataSheet, measured: DataSheet | None) -> list[tuple[C
 
     The cells are change of the RMS [%], simulated and measured (geometric means over the tests); ratio of simulated to
     measured RMS without the leak, mean and scatter; tests with the same sign of change, and correlation of the changes.
+    Without a measured sheet all but the simulated change are None.
     """
     rows: list[tuple[Cell, ...]] = []
     for chamber, name in COLUMNS:
         simulated_change = sheet.log_change(chamber, name)
-        comparison: tuple[Cell, ...] = (None,) * 5  # the five columns that need a measured sheet
+        comparison: tuple[Cell, ...] = (None,) * 5
         if measured is not None:
             measured_change = measured.log_change(chamber, name)
             log_ratio = sheet.log_ratio(measured, chamber, name)

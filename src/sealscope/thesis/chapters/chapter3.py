@@ -82,7 +82,7 @@ def continuous_transform(x: Array, rate: float, scales: Array) -> Array:
     record is mirrored at its ends. Returns the transform (scales, n) [unit of x times s^0.5]; the centre of the
     wavelet's energy is at each sample in turn.
     """
-    # db8 is 15 samples long at scale 1; 16 leaves a margin
+    # db8 is 15 samples long at scale 1; 16 leaves a margin. The mirror images are shorter than the record
     pad = min(x.size - 1, int(np.ceil(16.0 * float(np.max(scales)) * rate)))
     padded = np.pad(x - x.mean(), pad, mode="symmetric")
     omega = 2.0 * np.pi * np.fft.rfftfreq(padded.size, 1.0 / rate)
@@ -140,7 +140,8 @@ def short_time_spectrum(x: Array, rate: float, window: int, step: int) -> tuple[
     starts = np.arange(0, x.size - window + 1, step)
     hann = np.hanning(window + 1)[:-1]  # periodic: the last value is the first of the next period
     segments = np.lib.stride_tricks.sliding_window_view(x, window)[starts] * hann
-    # 2: half is at the negative frequency; at 0 and the Nyquist frequency, which is not so, the result is double
+    # 2: half of a cosine's amplitude is at its negative frequency; mean and Nyquist frequency have no such half,
+    # and come out doubled
     amplitudes = np.abs(np.fft.rfft(segments, axis=1)).T * 2.0 / hann.sum()
     frequency = np.asarray(np.fft.rfftfreq(window, 1.0 / rate), dtype=np.float64)
     middles = np.asarray((starts + window / 2.0) / rate, dtype=np.float64)
@@ -244,7 +245,7 @@ def transform_figure(context: Context, item: Item) -> tuple[Figure, ...]:
 
 
 def _width(t: Array, values: Array) -> float:
-    """Compute the width [s] of the largest peak: standard deviation of the times near it, weighted by `values`^2."""
+    """Compute the width [s] of the largest peak: deviation of the times within 0.1 s of it, weighted by `values`^2."""
     near_peak = np.abs(t - t[values.argmax()]) < 0.1  # [s]
     weight = values[near_peak] ** 2 / np.sum(values[near_peak] ** 2)
     centre = np.sum(t[near_peak] * weight)

@@ -105,7 +105,7 @@ class FigureView:
     def _curve(
         self, y: Array, label: str, role: Role, t: Array | None = None, start: float = 0.0, stop: float = math.inf
     ) -> FigureCurve:
-        """Build the curve of `y` over `t` [s], by default the recording's times, from `start` to `stop` at most."""
+        """Build the curve of `y` over `t` [s], by default the recording's times, in `span` from `start` to `stop`."""
         t = self.run.recorded.t if t is None else t
         is_drawn = (t >= max(start, self.span[0])) & (t <= min(stop, self.span[1]))
         return FigureCurve(t[is_drawn], y[is_drawn], label, role)
@@ -191,7 +191,7 @@ _VIEWS: dict[str, tuple[str, Callable[[FigureView], PanelsAndNumbers]]] = {
 
 
 def iter_views() -> Iterator[tuple[str, str, dict[str, object]]]:
-    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: views of the tests, whole or 10 s around the leak's opening."""
+    """Yield (id, title, inputs) of Figs. 5.1 to 5.89: views of the tests, whole or 10 s to either side of the onset."""
     for test in TESTS.values():
         input_views = [("input", "", False), ("input", "", True)]  # (view, chamber, is_closeup)
         test_views = [*input_views[: test.n_input_figures], ("leak", "", False), ("leak", "", True)]
@@ -251,7 +251,7 @@ class LeakTestMeasures:
 def fit_step_time(t: Array, y: Array, min_points: int = 5) -> float:
     """Estimate the time [s] at which a series `y` (n,) over `t` (n,) [s] changes its mean, by least squares.
 
-    The time is halfway between two points, with at least `min_points` points on each side.
+    The time is halfway between two points, with at least `min_points` points on each side; n >= 2 `min_points`.
     """
     n = y.size
     n_before = np.arange(min_points, n - min_points + 1)

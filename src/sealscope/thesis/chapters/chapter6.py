@@ -81,7 +81,7 @@ def _amplitude_at(run: Trajectory, mask: NDArray[np.bool_], f: float) -> float:
 
 
 def supply_flow(run: Trajectory) -> Array:
-    """Compute the flow [m^3/s] (n,) from the supply of a servo valve: into A for a spool at x_s > 0, else into B."""
+    """Compute the flow [m^3/s] (n,) from the supply of a servo valve: Q_A into A for x_s > 0, else -Q_B into B."""
     return np.asarray(np.where(run["x_s"] > 0.0, run["Q_A"], -run["Q_B"]))
 
 
@@ -102,7 +102,7 @@ class ControlledRig:
     def run(self, command: str, duration: float, load: str = "0 N") -> Trajectory:
         """Simulate the rig for `duration` [s] under the load `LOAD` plus `load`, the text of a force against +x.
 
-        `command`: text of a position target or, in an open loop, a voltage.
+        An "F_l" in `values` replaces `LOAD`. `command`: text of a position target or, in an open loop, a voltage.
         """
         rig = load_rig(self.rig)
         leak_conductance = conductance(self.lpm, rig)
@@ -171,7 +171,8 @@ class ControlledRig:
 def tracking(run: Trajectory, mask: Array) -> tuple[float, float, float]:
     """Compute how the piston follows the position sine `DUTY` in the samples `mask` of whole cycles.
 
-    Returns rms error [mm], electrical energy in a cycle [J], and mean leakage that the controller compensates [L/min].
+    Returns rms error [mm], electrical energy in a cycle [J], and mean leakage that the controller compensates [L/min],
+    0 if it compensates none.
     """
     error = AMPLITUDE * np.sin(OMEGA * run.t[mask]) - run["x"][mask]
     flow = 0.0 if run.compensated is None else float(np.mean(run.compensated[mask])) / LITRE_PER_MINUTE
@@ -215,7 +216,7 @@ def _figure_over_leak(
 
 
 def open_loop_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
-    """Tabulate the drift of the piston's mean position by leak: by a sine of the voltage, and with two controllers."""
+    """Tabulate the drift of the piston's mean position by leak, without a controller and with two of them."""
     rows: list[tuple[Cell, ...]] = []
     healthy_drift = 0.0
 
@@ -264,8 +265,8 @@ def load_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
 def external_leak_table(context: Context, item: Item) -> tuple[ThesisTable, ...]:
     """Tabulate tracking and stiffness of each controller with a leak past the rod seal of either side.
 
-    The last column [kPa] shows the loss of oil by the lower pressure's mean over a cycle. The flow of a leak is stated
-    for the mean pressure on its side in a run without leaks.
+    The last column [kPa] shows the loss of oil: the change of the lower chamber pressure's mean from the third to the
+    fifth cycle. The flow of a leak is stated for the mean pressure on its side in a run without leaks.
     """
     healthy, mask = ControlledRig("pi", 0.0).run_duty()
     mean_pressure = {side: float(np.mean(healthy[f"p_{side}"][mask])) for side in ("A", "B")}

@@ -39,7 +39,7 @@ _COMPARED_CLOSING = 75.0
 def claims(evidence: ClaimEvidence) -> tuple[Claim, ...]:
     """Judge the claims of the abstract and of chapters 1, 5 and 6 that the data sheet alone cannot decide."""
     return (
-        judge_claim("1.3.1", []),
+        judge_claim("1.3.1", []),  # no test: it cannot be tested
         *_wavelet_claims(),
         *_printed_test_claims(evidence),
         _d3_sign_claim(evidence),

@@ -34,6 +34,7 @@ Progress = Callable[[int, int, Sequence[str]], None]
 State = Literal["made", "kept", "left out", "failed", "not made"]
 #: Libraries whose versions results and drawings depend on.
 _LIBRARIES = ("numpy", "scipy", "numba", "PyWavelets", "matplotlib")
+#: Name of the stored results in error messages.
 _WHAT = "a reproduction"
 
 
@@ -126,6 +127,7 @@ def reproduce(
                 in_work.append(name)
                 progress(n_done, len(waiting), in_work)
                 item = waiting[name]
+                # an item that was left out counts as made, without products
                 made_needs = [need for need in item.needs if statuses[need].state != "failed"]
                 yield item, keys[name], {need: statuses[need].products for need in made_needs}
 
@@ -191,7 +193,10 @@ def _parse_row(keys: Mapping[str, str], tree: Any) -> ItemRow | None:
 
 
 def _item_status(item: Item, sheet: DataSheet | None, row: ItemRow | None, folder: Path) -> ItemStatus:
-    """Determine an item's status before anything is made, from its stored result `row` and the files in `folder`."""
+    """Determine an item's status before anything is made, from its stored result and the files in `folder`.
+
+    `row`: the stored result of the same inputs, None if there is none.
+    """
     if item.needs_sheet and sheet is None:
         return ItemStatus(item, "left out", MISSING)
     if row is None or row.error or not all(is_file_path(folder / name) for name in row.files):
@@ -241,7 +246,7 @@ def drop_curves(product: Product | Claim) -> Product | Claim:
 @cache
 def sources_key() -> str:
     """Compute a digest of this package's sources and of the versions of the libraries on which results depend."""
-    package = Path(__file__).parents[2]
+    package = Path(__file__).parents[2]  # folder of `sealscope`
     suffixes = (".py", ".toml", ".csv", ".j2", ".css", ".js")
     sources = files_digest(path for path in sorted(package.rglob("*")) if path.suffix in suffixes)
     versions = {distribution.name.lower(): distribution.version for distribution in metadata.distributions()}

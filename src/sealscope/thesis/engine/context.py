@@ -25,10 +25,10 @@ Products = tuple[Product | Claim, ...]
 class SimulatedRun:
     """The result of one simulated run, which may have failed: `recording` is then None, and `t`, `outputs` are empty.
 
-    `t` [s], `outputs`: noise-free outputs at the samples; `mean_leak_lpm`: mean leak while open [L/min]; `resolved`:
-    True if the run changed little when the solver's step was halved, False if not or if it failed, None if this was
-    not tested; `step_changes`: changes of states, pressures and details by this halving [SI], by name; `diverged`:
-    one-line reason of a failed run, "" for none.
+    `t` [s], `outputs`: noise-free outputs at the samples; `mean_leak_lpm`: mean leak while open [L/min], 0 if the run
+    failed; `resolved`: True if it changed little when the solver's step was halved, False if not or if it failed, None
+    if this was not tested; `step_changes`: changes of states, pressures and details by this halving [SI], by name;
+    `diverged`: one-line reason of a failed run, "" for none.
     """
 
     recording: Recording | None
@@ -105,7 +105,7 @@ class Context:
 
 
 def first_table(context: Context, item: str) -> ThesisTable:
-    """Return the first table of the needed item `item`; raise InputError if the item failed or made no table."""
+    """Return the first table of the needed item `item`; raise InputError if that failed, was left out or made none."""
     table = next((product for product in context.product(item) if isinstance(product, ThesisTable)), None)
     if table is None:
         raise InputError(f"{item} must make a table, which another item needs, got none")

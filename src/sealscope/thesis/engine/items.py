@@ -84,7 +84,8 @@ def load_items() -> tuple[Item, ...]:
 def _iter_row_items(name: str, chapter: int, row: Mapping[str, Any]) -> Iterator[Item]:
     """Yield the item `name`, or the items that a function `each` lists, which a row of `items.toml` describes.
 
-    Entries of the row that are not fields of `Item` become its `inputs`.
+    Entries of the row that are not fields of `Item` become its `inputs`; with `each`, the function states id, title and
+    inputs of each item instead.
     """
     row_inputs: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in row.items()}
     row_fields: dict[str, Any] = {key: row_inputs.pop(key) for key in row if key in _FIELDS}

@@ -137,7 +137,10 @@ def claim_verdict(tests: Iterable[bool]) -> Verdict:
 
 
 def thin_curve(x: Array, y: Array, max_points: int = 4000) -> tuple[Array, Array]:
-    """Thin a curve (x, y) of more than `max_points` points to the minimum and maximum of each whole block of points."""
+    """Thin a curve (x, y) of more than `max_points` points to the minimum and maximum of each block of points.
+
+    Points after the last whole block are left out. A shorter curve is returned unchanged.
+    """
     if x.size <= max_points:
         return x, y
     block_size = int(np.ceil(2 * x.size / max_points))  # two points of each block

@@ -19,7 +19,7 @@ def publish(item: Item, products: Sequence[Product | Claim], folder: Path) -> tu
     """Write an item's products into `folder` as files; return their paths, relative to the folder.
 
     A figure becomes `figures/ID.svg` and `.png`, and `tables/ID.csv`; a table `tables/ID.csv`; an item's claims
-    `tables/ID.csv`, or `tables/ID-claims.csv` beside a table.
+    `tables/ID.csv`, or `tables/ID-claims.csv` if a figure or table has that name.
     """
     for name in ("figures", "tables"):
         make_inner_folder(folder, name)
@@ -68,5 +68,5 @@ def figure_rows(figure: Figure) -> Iterable[Sequence[object]]:
             heads += [f"{label}; {panel_text}" for label in (panel.x_label, panel.y_label, image.label)]
             cells = [(x, y, image.values[j, i]) for j, y in enumerate(image.y) for i, x in enumerate(image.x)]
             columns += [[f"{cell[k]:.7g}" for cell in cells] for k in range(3)]
-    yield [head.removesuffix("; ") for head in heads]
+    yield [head.removesuffix("; ") for head in heads]  # "; " ends a head without curve label and panel number
     yield from zip_longest(*columns, fillvalue="")

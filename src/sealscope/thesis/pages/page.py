@@ -94,7 +94,7 @@ def _page_product(
     """
     picture = _encode_picture(folder, product.id) if isinstance(product, Figure) else ""
     product_claims = [claims[name] for name in product.claims if name in claims]
-    # (format, path) of the product's files, which are named by its id
+    # (format, path) of the product's files, named by its id; "/" and "." exclude longer names that contain the id
     links = [(Path(name).suffix[1:].upper(), name) for name in status.files if f"/{product.id}." in f"/{name}"]
     heading = caption(product.id, product.title)
     value_names = [number.name for number in product.numbers] if isinstance(product, Figure) else list(product.columns)
@@ -105,7 +105,7 @@ def _page_product(
         "heading": heading,
         "product": product,
         "picture": picture,
-        "links": links,  # (format, path) of its files
+        "links": links,
         "claims": product_claims,
         "search_text": text.casefold(),
     }

@@ -27,8 +27,8 @@ SETTINGS = Path(__file__).with_name("thesis.mplstyle")
 def caption(figure_id: str, title: str) -> str:
     """Format a caption from the id and the title of a product, such as "Fig. 4.22. Pressures in the chambers".
 
-    The end of an id such as "fig-4.2-a" is written "a)", or in brackets if it is a word. It is the title alone if the
-    id does not begin with the number of a figure, table or equation.
+    The end of an id such as "fig-4.2-a" is written "a)", or in brackets if it is a word. The caption is the title alone
+    if the id does not begin with the number of a figure, table or equation.
     """
     kind, _, number_and_part = figure_id.partition("-")
     prefix = {"fig": "Fig.", "table": "Table", "eq": "Eq."}.get(kind)
@@ -45,7 +45,7 @@ def typeset(label: str) -> str:
     text = label.replace("$", r"\$")
     text = re.sub(r"\bd3d4\b", r"$d_3 d_4$", text)
     text = re.sub(r"\bd([1-9])\b", r"$d_\1$", text)
-    # symbols with a subscript, then Greek letters without
+    # symbols with a subscript, then Greek letters without; not within a word or a formula between $
     text = re.sub(
         r"(?<![\w$])(omega|theta|[A-Za-z])_([A-Za-z0-9]{1,4})(?![\w$])",
         lambda m: f"${_GREEK.get(m[1], m[1])}_{{\\mathrm{{{m[2]}}}}}$",

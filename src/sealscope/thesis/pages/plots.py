@@ -27,7 +27,7 @@ DPI = 200
 _WIDTH = 7.2
 _TOP_MARGIN, _WARNING_HEIGHT, _LEGEND_HEIGHT = 0.03, 0.34, 0.24
 _LINE_HEIGHT, _CAPTION_MARGIN = 0.16, 0.14
-#: Number of panels, one below the other -> height of a panel [inch], smaller for more panels.
+#: Number of panels, one below the other -> height of a panel [inch]; it is 1.35 for more panels.
 _ROW_HEIGHTS = {1: 3.4, 2: 2.35, 3: 1.85, 4: 1.6}
 _CAPTION_CHARACTERS = 122
 #: Width [characters] of a label's line and margin in a legend, and of all labels above a figure.
@@ -170,7 +170,7 @@ def _draw_panel(mpl_figure: MplFigure, ax: Axes, panel: Panel, *, label_marks: b
     if panel.x_range is not None:
         ax.set_xlim(*panel.x_range)
     elif panel.image is None and all(curve.kind == "line" for curve in panel.curves):
-        ax.margins(x=0)
+        ax.margins(x=0)  # lines fill the width; points and stems at its ends would be cut off
     ax.tick_params(width=0.6, length=3)
 
 
@@ -186,12 +186,12 @@ def _use_plain_numbers(axis: Axis) -> None:
 
 
 def drawn_points(curve: FigureCurve) -> tuple[np.ndarray, np.ndarray]:
-    """Select the points (x, y) of a curve that are drawn: about `_MAX_POINTS` of a line, which preserve its peaks."""
+    """Select the points (x, y) of a curve that are drawn: at most `_MAX_POINTS` of a line, with its peaks."""
     return thin_curve(curve.x, curve.y, _MAX_POINTS) if curve.kind == "line" else (curve.x, curve.y)
 
 
 def _draw_curve(ax: Axes, curve: FigureCurve, *, is_only: bool) -> None:
-    """Draw a curve into `ax` in the line style of its role; the only one of a panel is solid, also as a "reference"."""
+    """Draw a curve into `ax` in the line style of its role; a panel's only curve is solid if it is a "reference"."""
     style = STYLES["other" if is_only and curve.role == "reference" else curve.role]
     x, y = drawn_points(curve)
     is_dense = x.size > _DENSE_POINTS
@@ -221,7 +221,10 @@ def _has_shared_legend(panels: Sequence[Panel]) -> bool:
 
 
 def _add_legend(ax: Axes, panel: Panel) -> None:
-    """Add the legend of a panel above the axes, unless the title or the y axis names its only curve."""
+    """Add the legend of a panel above the axes, if it has several curves, or one that the y axis does not name.
+
+    A panel's only curve has no legend if the y axis's label contains its label, or if the panel has no title.
+    """
     labels = [curve.label for curve in panel.curves]
     if len(labels) > 1 or (labels and panel.title and labels[0] not in panel.y_label):
         legend = ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(labels), borderaxespad=0.1)

@@ -95,14 +95,17 @@ def _restarts_each_second(base: NDArray[Any], offset: Array) -> bool:
 
 
 def _date_stamps(base: NDArray[Any], parts: Mapping[str, Array]) -> NDArray[np.datetime64]:
-    """Build stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,), else of 1970-01-01."""
+    """Build stamps (n,) at midnight from year, month and day in `parts`, else from `base` (n,), else of 1970-01-01.
+
+    NaT where year, month or day is missing.
+    """
     if all(part in parts for part in _DATE):
-        # 1 for a missing part: its row is assumed to lack the hour, too, which makes the stamp NaT
-        year, month, day = (np.nan_to_num(parts[part], nan=1.0) for part in _DATE)
+        is_known = np.isfinite([parts[part] for part in _DATE]).all(axis=0)
+        year, month, day = (np.where(is_known, parts[part], 1.0) for part in _DATE)
         # months since 1970, as numpy counts them
         months = ((np.clip(year, 1.0, 9999.0) - 1970) * 12 + month - 1).astype(np.int64).astype("datetime64[M]")
         dates = months.astype("datetime64[D]") + (day - 1).astype("timedelta64[D]")
-        return np.asarray(dates.astype("datetime64[ns]"))
+        return np.where(is_known, dates.astype("datetime64[ns]"), np.datetime64("NaT"))
     if base.dtype.kind == "M":
         return base.astype("datetime64[D]").astype("datetime64[ns]")
     return np.full(base.shape, np.datetime64("1970-01-01", "ns"))

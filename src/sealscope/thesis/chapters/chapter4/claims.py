@@ -192,7 +192,8 @@ def _judge_runs(
     """Judge claim 4.`claim_number` by the runs with the converged solver, and state the results of both solvers.
 
     `results`: results of the runs by solver and interpretation (`Reading`); `test`: yields True or False for each test
-    on the results under one interpretation; `format_results`: formats the results under all interpretations.
+    on the results under one interpretation; `format_results`: formats the results under all interpretations. Results of
+    a run that diverged are NaN, which passes no test.
     """
     texts: list[str] = []
     passed: dict[cases.Solver, Iterable[bool]] = {}
@@ -294,7 +295,7 @@ def _judge_larger_closings(context: Context) -> Iterator[Claim]:
         )
 
     def ranges_grow(rows: Rows) -> Iterator[bool]:
-        """Yield for each pressure True if its range grows from 25 to 50 to 75 % closed orifices, visibly in all."""
+        """Yield for each pressure True if its range grows from 25 to 50 and to 75 %, and visibly from 25 to 75 %."""
         for name in PRESSURES:
             at_25, at_50, at_75 = (row[f"range of {name}"] for row in rows)
             yield at_25 < at_50 < at_75 and at_75 - at_25 > min_visible
@@ -319,7 +320,7 @@ def _judge_drift(context: Context) -> Iterator[Claim]:
         """Compute the piston's drift [m] in a long run; `closed`: closing of the orifices [%], None for none."""
         return cases.piston_drift(context.run(cases.make_drift_experiment(reading, closed, solver)))
 
-    drift_without = drift(cases.DEFAULT_READING, None, "converged")
+    drift_without = drift(cases.DEFAULT_READING, None, "converged")  # without orifices, readings do not differ
     min_change = DRIFT_FRACTION * abs(drift_without)
     drifts = {
         solver: {reading: [drift(reading, closed, solver) for closed in cases.CLOSINGS] for reading in cases.READINGS}

@@ -49,7 +49,8 @@ def _run_case(context: Context, item: Item) -> tuple[cases.Runs, str]:
 def _run_notes(runs_of_cases: Sequence[cases.Runs], reading: cases.Reading | None) -> str:
     """Format the notes on some cases: reading of the equations, failed or unresolved runs, and pressures below vacuum.
 
-    `reading`: None for cases without orifices.
+    `reading`: None for cases without orifices. Unresolved runs are noted if the thesis's solver has them in all cases,
+    and the converged one in none.
     """
     notes = [format_note("measured-curve")]
     if reading is not None:
@@ -129,7 +130,7 @@ def time_figure(context: Context, item: Item) -> tuple[Figure, ...]:
     command, _ = cases.CASES[item.inputs["case"]]
     t = runs["converged"].t
     panels, numbers = [], []
-    for letter, name in zip("abc", item.inputs["quantities"], strict=False):
+    for letter, name in zip("abc", item.inputs["quantities"], strict=False):  # three at most
         if name == "u":
             curves: tuple[FigureCurve, ...] = (FigureCurve(t, parse_command(command).volts(t), command, "command"),)
         else:

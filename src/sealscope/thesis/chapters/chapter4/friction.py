@@ -28,7 +28,8 @@ def stribeck_force(v: Array, F_C: float, *, literal_bracket: bool = False) -> Ar
     friction then jumps at the threshold velocity v_th.
     """
     f = load_rig("thesis").friction
-    friction = getattr(stribeck_friction, "py_func", stribeck_friction)  # uncompiled: a few hundred points
+    # `py_func`: the law in Python, as 1601 points at most need no compilation; missing if numba is switched off
+    friction = getattr(stribeck_friction, "py_func", stribeck_friction)
     return np.array([friction(float(value), F_C, f.K_brk, f.C_c, f.F_v, f.v_th, literal_bracket) for value in v])
 
 
