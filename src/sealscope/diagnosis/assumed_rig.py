@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     packaged rig of the same areas and displacement; otherwise all its values are marked as assumptions. Raises
     InputError if `rig` cannot be read.
     """
-    rig = infer_rig(None if rig is None else load_rig(rig), recording)
+    rig = infer_rig(None if rig is None else load_rig(rig), [recording])
     used_rig = load_rig(DEFAULT) if rig is None else rig
     stated_by: StatedBy = "call" if rig is not None and states_rig(rig) else "nobody"
     if rig is None and _names_rig_of_same_geometry(recording.provenance, used_rig):
@@ -53,19 +53,19 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
     )
 
 
-def infer_rig(rig: Rig | None, recording: Recording) -> Rig | None:
-    """Replace a rig that nobody stated as a whole, if the recording shows the circuit of the machine.
+def infer_rig(rig: Rig | None, recordings: Sequence[Recording]) -> Rig | None:
+    """Replace a rig that nobody stated as a whole, if recordings of the machine show its circuit.
 
-    With stated areas, the circuit of a pump is that of `shows_open_circuit`; the rig notes it, so that the first
-    recording decides for all later ones of a machine. A recording may also show a servo valve (`_shows_valve_supply`).
+    With stated areas, the circuit of a pump is that of `shows_open_circuit`; the rig notes it, so that these recordings
+    decide for all later ones of a machine. The first recording may also show a servo valve (`_shows_valve_supply`).
     Stated sizes are kept.
     """
     circuit = OPEN_CIRCUIT.parameter
     if rig is not None and (states_rig(rig) or rig.entry(circuit).source == _SHOWN):
         return rig
-    if rig is not None and (is_open := shows_open_circuit(rig, recording)) is not None:
+    if rig is not None and (is_open := shows_open_circuit(rig, recordings)) is not None:
         return rig.with_overrides({circuit: OPEN_CIRCUIT.value if is_open else "closed"}, source=_SHOWN)
-    if not _shows_valve_supply(rig, recording):
+    if not recordings or not _shows_valve_supply(rig, recordings[0]):
         return rig
     valve_rig = load_rig(_BEHIND_VALVE).as_assumed(UNSTATED)
     if rig is None or not rig.states("cylinder.A_A", "cylinder.A_B"):

@@ -336,7 +336,7 @@ def commission(
         A folder of healthy recordings, or their files.
     rig : Rig, str or path-like, optional
         Stated parameters of the machine: a Rig, the name of a packaged rig or the path of a TOML file; by default
-        nothing is stated, but the first recording may show a servo valve (`infer_rig`).
+        nothing is stated, but the recordings may show the circuit (`infer_rig`).
     map : mapping of str to str, or "auto", optional
         Name of the column in the logs by channel, such as ``{"p_A": "PG_1"}``, as for `sealscope.read`; by default the
         map in the rig's file.
@@ -379,23 +379,16 @@ def commission(
         map = {} if stated_rig is None else stated_rig.channel_map
     machine = CommissionedMachine(name, (), stated_rig, map, rate, limit)
     problems: list[str] = []
-    path_of: dict[str, Path] = {}  # path of each recording, by its label
-    recording_of: dict[str, Recording] = {}  # recordings by label, as many as fit into memory
-    n_samples = 0
     files = recordings_in(paths)
-    for label, path in zip(_distinct_names(files), files, strict=True):
+    path_of = dict(zip(_distinct_names(files), files, strict=True))  # by label
+    recording_of = _read_into_memory(machine, path_of)  # by label, too
+    machine = replace(machine, rig=infer_rig(stated_rig, list(recording_of.values())))
+    for label, path in path_of.items():
         try:
-            recording = machine.read(path)
-            if not machine.healthy:
-                machine = replace(machine, rig=infer_rig(stated_rig, recording))
+            recording = recording_of.get(label) or machine.read(path)
             machine = machine._with_recording(recording, label, checksum_of(path))
         except SealscopeError as error:
             problems.append(str(error))
-            continue
-        path_of[label] = path
-        n_samples += len(recording) * len(recording.channels)
-        if n_samples < _MAX_SAMPLES:
-            recording_of[label] = recording
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
     if stated_map is not None and not any(_fits_map(recording, stated_map) for recording in machine.healthy):
@@ -408,6 +401,18 @@ def commission(
 
     healthy, leaking = cross_check(machine.healthy, judge, keep)
     return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
+
+
+def _read_into_memory(machine: CommissionedMachine, path_of: Mapping[str, Path]) -> dict[str, Recording]:
+    """Read recordings by label, in order, until they have `_MAX_SAMPLES` samples; unreadable ones are left out."""
+    recordings, n_samples = dict[str, Recording](), 0
+    for label, path in path_of.items():
+        with suppress(SealscopeError):
+            recordings[label] = machine.read(path)
+            n_samples += len(recordings[label]) * len(recordings[label].channels)
+        if n_samples >= _MAX_SAMPLES:
+            break
+    return recordings
 
 
 def _fits_map(recording: SummarisedRecording, channel_map: ChannelMap) -> bool:

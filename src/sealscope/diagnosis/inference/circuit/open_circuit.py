@@ -8,6 +8,7 @@ ratios of flow to speed under the same load tell the two circuits apart.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,8 +30,18 @@ if TYPE_CHECKING:
 _PUMP_FLOWS = ("theta", "omega", "q_pump")
 
 
-def shows_open_circuit(rig: Rig, recording: Recording) -> bool | None:
-    """Return True if a recording shows that the pump feeds one chamber at a time (`open_circuit_log_odds`).
+def shows_open_circuit(rig: Rig, recordings: Sequence[Recording]) -> bool | None:
+    """Return True if recordings show that the pump feeds one chamber at a time.
+
+    Their mean evidence (`open_circuit_evidence`) counts, since its errors repeat in all recordings of a machine, beside
+    the log odds `feed.one` (`priors.toml`) before any recording. The result is None if no recording can tell.
+    """
+    evidence = [value for recording in recordings if (value := open_circuit_evidence(rig, recording)) is not None]
+    return INFERENCE.feed.one + float(np.mean(evidence)) > 0.0 if evidence else None
+
+
+def open_circuit_evidence(rig: Rig, recording: Recording) -> float | None:
+    """Compute the log Bayes factor of an open circuit that a recording gives (`open_circuit_log_factor`).
 
     The result is None if the recording cannot tell: the areas of the piston in `rig` are not stated, or hardly differ;
     the flow of the pump or the position is not recorded, or a valve meters the flow; a chamber pressure is not recorded
@@ -47,11 +58,11 @@ def shows_open_circuit(rig: Rig, recording: Recording) -> bool | None:
         return None
     limits = find_rest_limits(samples.channels, samples.rate, balances[0])
     signals = Signals(samples.channels, samples.rate, rest_limits=limits)
-    return open_circuit_log_odds(feed_one_chamber(balances[0], signals), signals) > 0.0
+    return open_circuit_log_factor(feed_one_chamber(balances[0], signals), signals)
 
 
-def open_circuit_log_odds(equation: Equation, signals: Signals) -> float:
-    """Compute the log odds of an open circuit, from the pump's flow in either direction of motion.
+def open_circuit_log_factor(equation: Equation, signals: Signals) -> float:
+    """Compute the log Bayes factor of an open circuit, from the pump's flow in either direction of motion.
 
     With the volume V that the pump delivers and the distance X of the piston, under the load of one side, let
 
@@ -59,12 +70,12 @@ def open_circuit_log_odds(equation: Equation, signals: Signals) -> float:
 
     In a closed circuit r is 0, in an open one log(A_A / A_B). Losses of the pump and oil that is compressed let r
     scatter: it has a normal density of the variance `feed.scatter`^2 (1/w_A + 1/w_B) / 4 (`priors.toml`), where w is
-    the fraction of the whole distance. The log odds under the loads of A and of B are added to those before any
-    recording (`feed.one`). Only the time in which pump and piston move counts, with the weight
-    1 - exp(-dp^2 / (2 z^2)): p_A - p_B = dp within the sensors' offsets z (`zero.pressure`) does not tell which side
-    carries the load. `equation`: volume balance of an open circuit (`feed_one_chamber`).
+    the fraction of the whole distance. The log factors under the loads of A and of B are added. Only the time in which
+    pump and piston move counts, with the weight 1 - exp(-dp^2 / (2 z^2)): p_A - p_B = dp within the sensors' offsets z
+    (`zero.pressure`) does not tell which side carries the load. `equation`: volume balance of an open circuit
+    (`feed_one_chamber`).
     """
-    prior, log_odds = INFERENCE.feed, float(INFERENCE.feed.one)
+    log_factor = 0.0
     volume, step = equation.left(signals), signals.step("x")
     certainty = -np.expm1(-0.5 * (signals.pressure_difference / INFERENCE.zero.pressure) ** 2)
     is_counted = np.isfinite(volume * step * certainty) & (signals.moving(equation.left) > 0.0)
@@ -82,6 +93,6 @@ def open_circuit_log_odds(equation: Equation, signals: Signals) -> float:
         if not (volumes[of_A] * volumes[of_B] < 0.0 and distances[of_A] * distances[of_B] < 0.0):
             continue  # the piston does not move both ways under this load
         ratio = float(np.log(volumes[of_A] * distances[of_B] / (distances[of_A] * volumes[of_B])))
-        variance = prior.scatter**2 * sum(whole / abs(distances[name]) for name in (of_A, of_B)) / 4.0
-        log_odds += (ratio**2 - (ratio - in_open_circuit) ** 2) / (2.0 * variance)
-    return log_odds
+        variance = INFERENCE.feed.scatter**2 * sum(whole / abs(distances[name]) for name in (of_A, of_B)) / 4.0
+        log_factor += (ratio**2 - (ratio - in_open_circuit) ** 2) / (2.0 * variance)
+    return log_factor
