@@ -176,6 +176,18 @@ def test_a_leak_moves_none_of_them(leak: str) -> None:
     assert other_event(recording) is None
 
 
+@pytest.mark.parametrize("leak", few(["0.02 L/min from 60 s", "0.2 L/min from 60 s"], 1))
+def test_a_motion_without_a_command_that_falls_is_no_changed_duty(leak: str) -> None:
+    """A leak of 3 % was a changed duty, 100 % sure; a motion that rises is none of a leak."""
+    recording = simulate(command="3 sin(4t)", leak=leak, duration="120 s", seed=1).only(("p_A", "p_B", "x"))
+    names = {observable.name: observable.chance for observable in observe_signals(recording).observables}
+    assert names["fall of the motion"] < CHANCE
+    assert diagnose(recording).cause is None
+    larger = machine(x=1e-3 * np.sin(4.0 * T) * LATE).only(("p_A", "p_B", "x"))
+    event = other_event(larger)
+    assert event is not None and event.cause == "changed duty"
+
+
 @pytest.mark.parametrize(
     "leak",
     [

@@ -180,6 +180,16 @@ def test_cannot_tell_where_it_must_and_says_why(change: str, leaky: Recording) -
     assert result.onset_s is None
 
 
+def test_pressures_along_a_straight_line_are_compared_with_no_baseline(records, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
+    """It was a leak: the response of p_B alone differs from that of healthy recordings."""
+    channels = ("u", "p_A", "p_B")
+    baseline = [records(seed, duration=60.0, throttled=True).only(channels) for seed in (2, 3, 4)]
+    line = with_channels(leaky.only(channels), p_A=3e5 + 100.0 * leaky.t)
+    result = diagnose(line, baseline)
+    assert (result.verdict, result.score) == ("cannot tell", None)
+    assert "p_A moves along a straight line" in result.reason
+
+
 def test_unusable_is_one_line(detector, leaky: Recording) -> None:  # type: ignore[no-untyped-def]
     assert isinstance(detector.name, str)
     for change in ("no samples", "30 samples", "no pressure", "constant pressure"):

@@ -183,6 +183,13 @@ def test_equalised_pressures_tell_a_leak_though_the_gains_of_the_sensors_differ(
     assert chambers.piston_leak.probability > 0.99
 
 
+def test_pressures_that_a_leak_equalised_drive_no_flow_if_the_offset_is_exactly_their_difference() -> None:
+    hold = held_press(piston=100.0 * SEAL).holds[0]
+    offset, _, is_equalised = hold.offset_in_hold(0.0)
+    assert is_equalised
+    np.testing.assert_allclose(hold.driving_pressure(offset), hold.driving_pressure(offset + 1e-3), atol=1.0)
+
+
 def test_pressures_that_decay_tell_the_law_of_the_leak() -> None:
     for exponent, other in ((1.0, 0.5), (0.5, 1.0)):
         chambers = held_press(piston=SEAL, exponent=exponent)

@@ -120,6 +120,14 @@ def test_only_a_missing_end_hides_a_leak(seconds: tuple[float, float], verdict: 
     assert (diagnosis.verdict, diagnosis.share < 0.95) == (verdict, True)
 
 
+def test_a_missing_start_makes_a_missing_end_no_longer(healthy: Recording) -> None:
+    """The position lacks in the last 5 s: 4.2 % of the recording, but 8.3 % of the part with pressures."""
+    without_start = holed(healthy, healthy.t < 60.0, "p_A", "p_B")
+    diagnosis = diagnose(holed(without_start, healthy.t >= 115.0, "x"))
+    assert diagnosis.verdict == "no leak", diagnosis.reason
+    assert 0.4 < diagnosis.share < 0.5
+
+
 @pytest.mark.slow
 def test_what_a_hole_touches_weighs_less_and_is_not_lost(
     late_leak: Recording, of_late_leak: Diagnosis, healthy: Recording

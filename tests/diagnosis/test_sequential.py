@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -235,3 +236,10 @@ def test_a_live_balance_is_restored_at_any_instant():
         again = LiveBalance(RIG, names)
         again.load_state(json.loads(json.dumps(live.state(), allow_nan=False)))
         assert before + conductances(again, stop, len(WORN)) == whole
+
+
+def test_first_blocks_that_cannot_be_estimated_are_counted():
+    """Readings beyond all pressures overflow: the watch waited without saying why."""
+    watch = Watch(RIG, 1000.0, 1000.0)
+    watch.update(replace(WORN, channels={**WORN.channels, "p_A": 1e90 * WORN["p_A"]}))
+    assert watch.counters == {"blocks: at standstill": 2}

@@ -130,8 +130,7 @@ class Examination:
         with np.errstate(all="ignore"):
             evidence = decide(self.report(name), reports, self.null, probability, weigh_rivals=weigh_rivals)
         # the detector states fractions of the examined part; converted to fractions of the whole recording
-        # (`judged_until` to a lower bound of it, which is exact if the part begins with the first sample)
-        judged_until = self.judged_until * evidence.judged_until
+        judged_until = self.judged_until - self.share * (1.0 - evidence.judged_until)
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
 

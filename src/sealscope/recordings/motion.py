@@ -81,6 +81,18 @@ def describe_hold(recording: Recording) -> str | None:
             # the sample before the flagged ones is the reading that they repeat
             start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))
             return f"{name} does not move from {start:.4g} s to {stop:.4g} s"
+    return describe_line(recording)
+
+
+def describe_line(recording: Recording) -> str | None:
+    """Describe a chamber pressure that follows a straight line throughout, without noise; None if there is none.
+
+    A pressure that is constant or has at most 64 samples is skipped, as in `describe_hold`.
+    """
+    for name in chambers_of(recording):
+        values = recording[name]
+        if len(values) <= _HOLD.samples or is_constant(values):
+            continue
         if np.abs(np.diff(values, 2)).max() <= ROUNDING * np.abs(values).max():
             return f"{name} moves along a straight line only, as if its samples were interpolated"
     return None

@@ -236,13 +236,12 @@ def integrate_run(
     run = _Integration(experiment, leaks, n_out, rate, progress and partial(progress, task))
     start_state = loaded_standstill_state(experiment.rig, experiment.load, experiment.x_0)
     windows = comparison_windows(n_out, rate) if is_checked else []
-    bounds = {0, n_out}  # outputs at which the run stops
+    # outputs at which the run stops: a step that fails in a window is abandoned at its end
+    bounds = sorted({0, n_out, *itertools.chain.from_iterable(windows)})
     shortest_step = LONGEST_STEP / MAX_STEP_REFINEMENT
     max_steps = steps_per_output(rate, shortest_step)  # most steps per output that are tried
     first_step = step
     if first_step is None:
-        # the run stops at the end of each window, so that a step that fails is abandoned at once
-        bounds |= {bound for window in windows for bound in window}
         max_G, max_C = run.inputs.max_leakage(np.arange(n_out) / rate)
         longest = min(LONGEST_STEP, *(longest_step(p, max_G, max_C) for p in run.schedule.numbers))
         first_step = max(longest, shortest_step)
@@ -258,11 +257,11 @@ def integrate_run(
         y = start_state.copy()
         if run.feedback is not None:
             run.feedback.restart()
-        for start, stop in itertools.pairwise(sorted(bounds)):
+        for start, stop in itertools.pairwise(bounds):
+            window_state = y.copy()
             run.advance(y, start, stop, n_steps, rows)
-            for first, end in windows:
-                if start <= first and end <= stop:
-                    excess = max(excess, run.compare_with_half_step(rows, first, end, n_steps, check))
+            if (start, stop) in windows:
+                excess = max(excess, run.compare_with_half_step(window_state, rows, start, stop, n_steps, check))
             if excess > 1.0 and n_steps < max_steps and step is None:
                 break  # a shorter step is tried at once
         # the check is passed, or no other step is to be tried
@@ -349,14 +348,16 @@ class _Integration:
                 self.reported = last
                 self.progress(last / self.n_out)
 
-    def compare_with_half_step(self, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck) -> float:
+    def compare_with_half_step(
+        self, y: Array, rows: Array, first: int, end: int, n_steps: int, check: StepErrorCheck
+    ) -> float:
         """Integrate a window of the run again at half the step; return the largest ratio of an error to its tolerance.
 
-        `rows`: outputs of the run, with `n_steps` steps between them; the window has the outputs first <= k < end.
+        `y` (14,): state at the window's start, which is changed (not an output, whose pressures are at least that of
+        vapour); `rows`: outputs of the run, with `n_steps` steps between them; the window has first <= k < end.
         """
-        from sealscope.physics.state import OUTPUTS, P_2, P_A, STATES
+        from sealscope.physics.state import OUTPUTS, P_2, P_A
 
-        y = rows[first, : len(STATES)].copy()  # the state, except pressures below that of vapour (`observe`)
         fine = np.empty((end - first, len(OUTPUTS)))
         self.advance(y, first, end, 2 * n_steps, fine, origin=first)
         pressures = slice(P_A, P_2 + 1)

@@ -18,6 +18,7 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import parse_moment
+from sealscope.diagnosis.detectors.observation import compare_healthy
 from sealscope.errors import InputError
 from sealscope.storage.atomic import remove_temporaries
 
@@ -368,3 +369,14 @@ def test_what_would_not_be_read_again_is_not_written(machine, tmp_path):
 def test_a_time_without_a_zone_is_utc(text: str) -> None:
     # as on a computer of any time zone: local time would differ between the engineer's desk and the machine
     assert parse_moment(text) == datetime(2026, 3, 1, 6, 30, tzinfo=UTC).timestamp()
+
+
+def test_recordings_whose_rates_differ_by_rounding_are_compared_with_each_other(file):
+    """The least error of a clock made of a machine's null one without comparisons."""
+    healthy = list(ss.read_machine(file).healthy)
+    assert len(list(compare_healthy(healthy))) == len(healthy)
+    for factor, compared in ((1.0 + 1e-12, len(healthy)), (1.0 - 5e-4, len(healthy)), (1.01, 0)):
+        ringing = healthy[1].summaries["rms change"]
+        summaries = {**healthy[1].summaries, "rms change": {**ringing, "rate": factor * ringing["rate"]}}
+        others = [healthy[0], replace(healthy[1], summaries=summaries), *healthy[2:]]
+        assert len(list(compare_healthy(others))) == compared

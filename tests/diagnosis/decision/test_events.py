@@ -80,8 +80,11 @@ def known_names() -> frozenset[str]:
     swapped = {
         name: np.where(late, recording[other], recording[name]) for name, other in (("p_A", "p_B"), ("p_B", "p_A"))
     }
-    for changed in (larger, swapped):
-        report = observe_signals(replace(recording, channels={**recording.channels, **changed}))
+    slower = {"x": np.where(late, 0.7, 1.0) * recording["x"]}
+    pressures = recording.only(("p_A", "p_B"))
+    for part, changed in ((recording, larger), (recording, swapped), (pressures, slower)):
+        units = {name: recording.units[name] for name in (*part.channels, *changed)}
+        report = observe_signals(replace(part, channels={**part.channels, **changed}, units=units))
         names |= {f"{observable.data}: {observable.name}" for observable in report.observables}
     return frozenset(names)
 

@@ -25,10 +25,10 @@ from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries
+from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
-from sealscope.recordings.motion import describe_hold
+from sealscope.recordings.motion import describe_hold, describe_line
 from sealscope.recordings.recording import Recording, compute_once
 
 #: Key of the surprisals of a recording's observables in its cache (`compute_once`).
@@ -101,8 +101,9 @@ def _observe(detector: Detector, recording: Recording, baseline: Sequence[Health
     The report only states the reason if the recording, or all of a given baseline, cannot be used.
     """
     lack = unusable_reason(detector, recording) or distrust
-    if lack is None and not baseline and detector.name not in _AT_REST:
-        lack = describe_hold(recording)
+    if lack is None and detector.name not in _AT_REST:
+        # beside other samples of the same recording a hold looks like a change; healthy recordings may have it, too
+        lack = describe_line(recording) if baseline else describe_hold(recording)
     if lack is None and baseline:
         reasons = [_unusable_baseline(detector, entry) for entry in baseline]
         baseline = tuple(entry for entry, reason in zip(baseline, reasons, strict=True) if reason is None)
@@ -200,7 +201,7 @@ def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable
     comparable = [
         summary
         for summary in summaries
-        if summary["chambers"] == summaries[0]["chambers"] and summary["rate"] == summaries[0]["rate"]
+        if summary["chambers"] == summaries[0]["chambers"] and has_same_rate(summary["rate"], summaries[0]["rate"])
     ]
     if len(comparable) < MIN_COMPARED:
         return

@@ -237,7 +237,7 @@ class LiveBalance(SavedAttributes):
             return NotJudged(end, "learning")
         first_blocks = self._stored[-self._waiting :].unpack(self._n_columns)
         self._waiting = 0
-        return self._estimate_first_blocks(first_blocks) or NotJudged(end, "at standstill")
+        return self._estimate_first_blocks(first_blocks) or NotJudged.with_count(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
         """Fit the balances to the first blocks together, then estimate the conductance in each that is not at rest."""

@@ -94,9 +94,9 @@ def duty_observables(time: Array, amplitudes: Mapping[str, Array]) -> Iterator[O
 
     `time` (K,): middles of the blocks [s]; `amplitudes`: log amplitudes (K,) of command and motion (`log_amplitudes`).
     Both must rise, or both fall, by similar amounts (`_MIN_STEP_RATIO`), since a leak changes only one amplitude; a
-    motion without a recorded command is tested alone. Score, onset and size are those of the test with the lower score.
-    The p-value is twice the higher one, since a step may be up or down. Nothing is yielded if an amplitude cannot be
-    tested.
+    motion without a recorded command is tested alone, and its fall, which a leak may cause, has a name of its own.
+    Score, onset and size are those of the test with the lower score. The p-value is twice the higher one, since a step
+    may be up or down. Nothing is yielded if an amplitude cannot be tested.
     """
     tests = [test for values in amplitudes.values() if (test := feature_step_test(time, values)) is not None]
     if len(tests) < len(amplitudes):
@@ -107,7 +107,7 @@ def duty_observables(time: Array, amplitudes: Mapping[str, Array]) -> Iterator[O
         weakest = min(tests, key=lambda test: test.score)
         least_certain = max(tests, key=lambda test: test.chance)
         yield Observable(
-            name="size of the duty",
+            name="size of the duty" if "command" in amplitudes or weakest.sign > 0.0 else "fall of the motion",
             data="duty",
             score=weakest.score,
             chance=min(1.0, 2.0 * least_certain.chance),

@@ -260,7 +260,7 @@ class HeldChambers:
         sign = 1.0 if is_A else -1.0
         flows = []
         for hold in self.holds:
-            hold_offset, _ = hold.offset_in_hold(0.0)  # 0: the offset of the recording is not known here
+            hold_offset, *_ = hold.offset_in_hold(0.0)  # 0: the offset of the recording is not known here
             flow = np.maximum(sign * (hold.p_A - hold.p_B - hold_offset), 0.0)
             flows.append(flow_of_side(flow, is_A))
         return UnitLeak(flows)

@@ -68,7 +68,7 @@ class LockedHold:
         centred[:first] = 0.0
         return centred
 
-    def offset_in_hold(self, offset: float) -> tuple[float, float]:
+    def offset_in_hold(self, offset: float) -> tuple[float, float, bool]:
         """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
 
         If the two sensors differ in gain, the offset of a hold is normal about `offset`, with a standard deviation s of
@@ -76,7 +76,7 @@ class LockedHold:
         is assumed: a leak has equalised the pressures, and the recorded p_A - p_B at the end is the offset of the hold;
         or a load causes p_A - p_B, equally probable up to the higher pressure, and the offset is `offset`.
 
-        Returns the offset of the hold, and ((offset of the hold - `offset`) / s)^2.
+        Returns the offset of the hold, ((offset of the hold - `offset`) / s)^2, and True in the first case.
         """
         last_A, last_B = (float(p[self.edges[-2] :].mean()) for p in (self.p_A, self.p_B))
         pressure, difference = max(last_A, last_B), last_A - last_B
@@ -84,7 +84,7 @@ class LockedHold:
         cost = ((difference - offset) / deviation) ** 2
         # log densities of `difference` in the two cases
         is_equalised = -0.5 * cost - math.log(deviation * math.sqrt(2.0 * math.pi)) > -math.log(pressure)
-        return (difference, cost) if is_equalised else (offset, 0.0)
+        return (difference, cost, True) if is_equalised else (offset, 0.0, False)
 
     def driving_pressure(self, offset: float) -> Array:
         """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
@@ -93,9 +93,9 @@ class LockedHold:
         exceed that of the large difference before. In such holds d is multiplied by d^2 / (d^2 +
         `held_oil.resolved`^2).
         """
-        offset_here, cost = self.offset_in_hold(offset)
+        offset_here, _, is_equalised = self.offset_in_hold(offset)
         difference = np.asarray(self.difference - offset_here)
-        if cost > 0.0:  # a leak has equalised the pressures
+        if is_equalised:
             difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
         return difference
 
