@@ -283,9 +283,13 @@ class AlarmJudge:
     def apply_mark(self, mark: str, t: float, *, until: float = 0.0, reason: str = "") -> Alarm:
         """Apply the mark (`MARKS`) that a person gives the open alarm at time `t` [s], and return the changed alarm.
 
-        `until` [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid. A
-        comment changes nothing. If its leak has ended, "acknowledged" and "valid" close the alarm. Raises InputError
-        for an unknown mark or one that the alarm has already, if there is no open alarm, or if "invalid" has no reason.
+        `until` [s]: end of the shelving, during which the alarm is not announced; `reason`: why the alarm is invalid.
+        If its leak has ended, "acknowledged" and "valid" close the alarm. A comment changes nothing. Any other mark
+        restarts the debounce: the person has judged the blocks so far, so that a further change needs `debounce_blocks`
+        new ones. "invalid" and "repaired" also reset `evidence`, as there was no leak or it is gone.
+
+        Raises InputError for an unknown mark, without an open alarm, for "invalid" without a reason, for the state that
+        the alarm has already, and for "acknowledged" if it is valid. A shelved alarm may be shelved again.
         """
         if mark not in MARKS:
             raise InputError(f"the mark of an alarm must be one of {', '.join(MARKS)}, got {mark[:40]!r}")

@@ -137,7 +137,7 @@ class Rig(Part):
             swept = getattr(cylinder, symbol) * cylinder.L / 2.0
             if swept >= volume:
                 rule = f'must be > {symbol} L/2 = {with_unit(swept, "m^3")} when volumes = "position"'
-                # V is shown as stated, V - V_rod rounded
+                # `volume` is less than V only if it is V - V_rod; this is shown rounded, V in SI without rounding
                 text, value = ("V - V_rod", with_unit(volume, "")) if volume < V else ("V", str(volume))
                 raise ValueError(f"cylinder.{text} {rule}, got {value}")
         if makeup.G_relief > 0 and makeup.check_valves == "absent":
@@ -537,7 +537,11 @@ def flatten_entries(tree: Iterable[tuple[str, Any]], place: str, prefix: str = "
 
 
 def _parse_entry(full_name: str, item: Any, place: str) -> ParameterEntry:
-    """Check the table of a parameter with value, unit and source, and convert it; raise InputError if it is wrong."""
+    """Check the form of a parameter's table, and make its entry of value, unit and source.
+
+    Raises InputError if the table is wrong. Nothing is converted (`_si_value` does that); a missing unit or source
+    becomes "".
+    """
     short_name = _short_name(full_name)
     if not isinstance(item, dict):
         raise InputError(f"{short_name} must be {{ value = ..., unit = ..., source = ... }}, got {item!r} ({place})")

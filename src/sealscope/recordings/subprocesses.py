@@ -157,7 +157,8 @@ def run_on_file(work: Callable[..., T], file: Path, *arguments: Any, **limits: A
 def _set_limits(seconds: float, memory: int, disk: int) -> None:
     """Limit this process to `seconds` [s], `memory` [bytes] and written files of up to `disk` [bytes] each.
 
-    The system's timer ends the process even if its parent is dead; 0 s is no limit. Only Unix has these limits.
+    The memory is limited to `MAX_MEMORY` and half the machine's, too. The system's timer ends the process even if its
+    parent is dead; 0 s is no limit. Only Unix has these limits.
     """
     with suppress(ImportError, AttributeError, OSError, ValueError):
         signal.setitimer(signal.ITIMER_REAL, seconds)

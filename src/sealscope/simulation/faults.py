@@ -302,6 +302,7 @@ def _shut_off_effects(fault: Fault, rig: Rig) -> tuple[Effect, ...]:
         def change(t: Array) -> Array:
             """Compute the change of the coefficient [m^3/(s Pa^0.5)] at times t [s]."""
             opening = initial_opening + (fault.value - initial_opening) * fault.opening.value_at(t)
+            # exactly `c_open` while fully open, as for `c_initial`, without the rounding of `series_coefficient`
             return np.asarray(np.where(opening >= 1.0, c_open, series_coefficient(c_open, c_line, opening)) - c_initial)
 
         max_change = 1e-6 * c_open  # so small that the coefficient of a moving valve changes at each solver output

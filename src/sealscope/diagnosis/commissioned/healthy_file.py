@@ -350,7 +350,13 @@ def read_summaries(path: Path, files: Mapping[str, str]) -> list[SummarisedRecor
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Read all lines of a file of summaries, without parsing or checking them; an empty list if it cannot be read."""
+    """Read the lines of a file of summaries, without parsing or checking them, to keep them in a new file.
+
+    The first line, and lines without a checksum and a blank, are skipped (`_iter_lines`). If the file is missing, of
+    another kind, too large or cannot be read to its end, the list is empty: there is then nothing to keep, and the new
+    file must be written nevertheless. It does not need the old one, as the summaries of the machine are in memory
+    (`machine_file`).
+    """
     try:
         return list(_iter_lines(path))
     except InputError:

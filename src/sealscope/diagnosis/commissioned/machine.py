@@ -159,10 +159,11 @@ class CommissionedMachine:
         )
 
     def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
-        """Return a copy of the machine with one more healthy recording.
+        """Return the machine with one more healthy recording.
 
         `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
-        is judged leaking, overlaps in time with a confirmed leak, is a copy of a known one, or cannot be trusted.
+        is judged leaking, overlaps in time with a confirmed leak, has the samples of a known one, cannot be trusted, or
+        if no detector can use it.
         """
         extended = self._with_recording(recording, file, checksum)
         if self.healthy:
@@ -175,11 +176,15 @@ class CommissionedMachine:
         return extended
 
     def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
-        """Return a copy as `with_healthy` does, untested for leaks; raise InputError if it is a copy or not trusted."""
+        """Return the machine with one more healthy recording, which is not tested for leaks (`with_healthy`).
+
+        Raises InputError if the recording has the samples of a known one, cannot be trusted, or if no detector can use
+        it.
+        """
         rig, _ = assumed_rig(self.rig, recording)
         summarised = summarise_healthy(recording, rig, file, checksum)
-        if copy := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
-            raise InputError(f"a healthy recording must be new, got the samples of {copy.file} ({file})")
+        if known := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
+            raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
         # sorted by date; recordings of unknown date come first
         healthy = sorted((*self.healthy, summarised), key=lambda entry: (entry.start_s or 0.0, entry.file))
         return replace(self, healthy=tuple(healthy))

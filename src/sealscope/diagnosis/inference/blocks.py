@@ -324,7 +324,7 @@ class ColumnRoles:
         The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice. It
         is 0 if no pressure drives the column's term, and in an equation without flow offset, whose column is needed to
         remove the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the
-        mean of abs(p_A - p_B) over `blocks`: pressures recorded in counts are much smaller numbers.
+        mean of abs(p_A - p_B - zero) over `blocks`: pressures recorded in counts are much smaller numbers.
         """
         driver = self.drivers[column] if self.bias is not None else ""
         root = float(np.mean(blocks.mean_root()))
@@ -501,25 +501,34 @@ def _fit_nuisance(
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
     `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `deviations`,
-    `prior_mean` (c,): normal priors on the c other coefficients; `n_rows`: number of rows in all blocks. The variance
-    weights the prior, and so determines the fit: both are found by iteration, until the variance changes by at most the
-    fraction `TOLERANCE`. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
+    `prior_mean` (c,): standard deviations and means of the normal priors on the c other coefficients (a deviation of 0
+    fixes a coefficient, an infinite one is no prior); `n_rows`: number of rows in all blocks.
+
+    The variance of a row, `row_variance`, weights the prior, and so determines the fit: both are found by iteration,
+    until the variance changes by at most the fraction `TOLERANCE`, or for `MAX_ITERATIONS`. Rows that overlap are
+    correlated, as if their variance were OVERLAP times as large. The weight of the prior and the returned variance
+    contain this factor. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
-    variance = max(left_square / n_rows, min_variance)
+    row_variance = max(left_square / n_rows, min_variance)
     for _ in range(MAX_ITERATIONS):
-        # precision times the variance of a row; rows that overlap are correlated, as if their variance were OVERLAP
-        # times as large. A drift is relative to the coefficient, which may be 0: the precision is then infinite
+        # prior precision times the variance; the deviation of a drift is relative to the coefficient, which may be 0:
+        # the precision is then infinite
         with np.errstate(divide="ignore", over="ignore"):
-            precision = OVERLAP * variance / deviations**2
-        prior_precision = np.minimum(precision, 1e9 * np.diag(normal.gram))  # enough to fix a coefficient
+            precision = OVERLAP * row_variance / deviations**2
+        # this limit is enough to fix a coefficient; the diagonal of `gram` would be no measure, as the elimination may
+        # leave only rounding errors of it
+        prior_precision = np.minimum(precision, 1e9 * np.diag(normal.gram))
         prior_moment = prior_precision * prior_mean
         coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
-        previous, variance = variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
-        if abs(variance - previous) <= TOLERANCE * previous:
+        # by the normal equations, the difference is the sum of squared residuals plus c' P (c - mu), with the prior's
+        # precision P and mean mu; this is about OVERLAP row variances for each coefficient with a prior, a small share
+        # with many rows
+        previous, row_variance = row_variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
+        if abs(row_variance - previous) <= TOLERANCE * previous:
             break
-    return coefficients, prior_precision, prior_moment, max(OVERLAP * variance, np.finfo(float).tiny)
+    return coefficients, prior_precision, prior_moment, max(OVERLAP * row_variance, np.finfo(float).tiny)
 
 
 class _EquationFit(NamedTuple):

@@ -161,9 +161,10 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
     """Add the products in `model.block` to the sums over blocks, update the usual noise, and return the block's weight.
 
     `model` is a `Coefficients`, `rows` the number of equations in the block, and `g` its leak coefficient. Column n of
-    `model.matrix` holds the nuisances (`_solve`). The weight is 1, or `JUMP`^2 / MISFIT if this is less. If g differs
-    from its earlier estimate by more than `JUMP` standard deviations, the leak has stepped, and earlier blocks do not
-    constrain it any more.
+    `model.matrix` holds the nuisances (`_solve`). The weight is 1, or `JUMP`^2 / MISFIT if this is less: residuals
+    whose rms exceeds `JUMP` usual standard deviations are due to a glitch or a step within the block, and count as if
+    the rms were `JUMP` deviations. If g differs from its earlier estimate by more than `JUMP` standard deviations, the
+    leak has stepped, and earlier blocks do not constrain it any more.
     """
     sums, numbers, n = model.sums, model.numbers, len(model.matrix)
     variance = max(_sum_residual_squares(model.block, model.matrix[:, n:]), 0.0) / rows
@@ -175,7 +176,8 @@ def _learn_block(model: Any, rows: float, g: float) -> float:
         moment -= sums[n, i] * model.matrix[i, n]
     step = g - moment / information
     energy = max(model.block[n, n], TINY)
-    # variances of g, of the leak's random step, assumed to be equal to it, and of the earlier estimate; as successive
+    # variances over that of an equation: 1/(energy weight) of g, the same of the leak's random step, and 1/information
+    # of the earlier estimate; `add_block` takes 1/energy for the random step, without the weight. As successive
     # equations overlap, all are raised by the factor OVERLAP
     step_variance = OVERLAP * numbers[NOISE] * (2.0 / (energy * weight) + 1.0 / information)
     has_stepped = step**2 > JUMP**2 * step_variance

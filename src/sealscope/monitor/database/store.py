@@ -367,10 +367,16 @@ class MonitorStore:
 
 
 def outage_reason(error: BaseException) -> str | None:
-    """Describe in one line the database outage that an error reports; return None for an error of another kind."""
+    """Describe in one line the database outage that an error reports; return None for an error of another kind.
+
+    After an outage the monitor writes the same rows again; after an error of another kind it drops them. All errors of
+    the driver but DataError count as an outage: drivers report a lost connection, a full or read-only database and a
+    missing right by different classes, and may accept the rows later. A DataError concerns the rows themselves, which
+    would be refused again.
+    """
     if isinstance(error, PoolTimeout):
         return "every connection to the database is in use"
-    if not isinstance(error, DBAPIError) or isinstance(error, DataError):  # DataError: waiting would not help
+    if not isinstance(error, DBAPIError) or isinstance(error, DataError):
         return None
     return " ".join(str(error.orig).split())[:200]
 

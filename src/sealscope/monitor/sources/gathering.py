@@ -28,7 +28,7 @@ LATE = "values that came after their block"
 class _Channel:
     """The values of one channel that are not in a block yet."""
 
-    values: dict[int, float] = field(default_factory=dict)  # by index of the sample on the time axis
+    values: dict[int, float] = field(default_factory=dict)  # by index on the time axis: round(time [s] x rate [Hz])
     previous: float | None = None  # the last value before them
     arrival: float = -math.inf  # time at which the last value arrived [s]
     newest: int | None = None  # largest index of any value so far
@@ -121,15 +121,19 @@ class ValueGatherer:
         self._start = None
 
     def _pop_blocks(self) -> list[Recording]:
-        """Remove and return the complete blocks, up to whose end every channel has values or is silent."""
+        """Remove and return the complete blocks, up to whose end every channel has values or is silent.
+
+        The first block waits until every channel has a value and one of them a new one. A channel with a `previous`
+        value has a sample at every index, so that the block begins at the first index at which the others have theirs,
+        too; if there are no others, at the first new value.
+        """
         channels = self._channels.values()
         if self._start is None:
             has_new_values = any(channel.values for channel in channels)
             if not has_new_values or any(channel.last_value() is None for channel in channels):
                 return []
-            # start at the first index at which every channel has a value from then on or from before
             first_indices = [min(channel.values) for channel in channels if channel.previous is None]
-            if not first_indices:  # each channel has a value from before: start at the first new value
+            if not first_indices:
                 first_indices = [min(min(channel.values) for channel in channels if channel.values)]
             self._start = max(first_indices)
         newest_indices = [channel.newest for channel in channels if channel.arrival >= self._now() - SILENT_S]

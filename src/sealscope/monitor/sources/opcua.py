@@ -116,8 +116,10 @@ class _OpcUaSession:
     def datachange_notification(self, node: Any, value: Any, data: Any) -> None:
         """Add a new value of the variable `node`, and queue the blocks that are then complete; called by asyncua.
 
-        `value`: number or array of samples; numbers that are not finite or not of good quality become NaN, and values
-        of other types are dropped and counted. `data`: time and quality of the value.
+        `value`: number or array of samples. True, False and texts such as "3.5" count as numbers. None and numbers that
+        are not finite become NaN; a value that is not of good quality becomes a single NaN, even if it is an array.
+        Other texts and types, and empty or nested arrays, are dropped and counted. `data`: time and quality of the
+        value.
         """
         actuator, channel = self._channels[node.nodeid]
         data_value = data.monitored_item.Value

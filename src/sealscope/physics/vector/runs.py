@@ -65,10 +65,12 @@ def leak_opening(leak: Leak, t: float) -> float:
 def _build_inputs_law(count: int) -> Any:
     """Compile the function (t, nodes, shape, k, drive, leak, p) that computes the inputs of a group of runs in step k.
 
-    It returns the inputs u, G, C, F of `rates`, each at the `count` times within a step (nodes) that the integration
-    method needs. Its arguments are the start `t` [s] of the step, the gain and offset `drive` [V] of each run's
-    command, each run's `leak` (`LEAK_ROWS`), and others as in `advance`. In the generated source, s is the opening of
-    the leak at each node.
+    It returns the inputs u [V], G [m^3/(s Pa)], C [m^3/(s Pa^0.5)] and F [N] of `rates`, each at the `count` times
+    within a step (nodes) that the integration method needs. Its arguments are the start `t` [s] of the step, the gain
+    and offset `drive` [V] of each run's command, each run's `leak` (`LEAK_ROWS`), and `nodes` and `shape` as in
+    `advance`. The row `k` of `shape` is called `step` there, and the numbers `p` of the cell `q`. In the generated
+    source, s is the opening of the leak at each node. Only with a load `p.pushed` is not empty and `shape` has columns
+    for it. The length of a tuple is part of its type, so that this is decided when the function is compiled.
     """
 
     def for_nodes(text: str) -> str:

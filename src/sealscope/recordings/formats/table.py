@@ -281,8 +281,9 @@ def _has_time_of_day(time: NDArray[Any]) -> bool:
 def _assign_clocks(series: Sequence[Series]) -> list[Series]:
     """Assign sampling times to the series that have none, from the column of times in the same group of the file.
 
-    The columns of times are then left out. If the file has only one such column, it stays as the time of all groups. A
-    series that is alone in its group gets the group's name if its own name says nothing, such as `data` or `value`.
+    Only series with as many samples as this column get its times. The columns of times are then left out. If only one
+    group has such a column, it stays, as the time of all groups. A series that is alone in its group gets the group's
+    name if its own name says nothing, such as `data` or `value`.
     """
     time_of_group: dict[str, Series] = {}
     for member in series:

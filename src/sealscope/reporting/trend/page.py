@@ -129,10 +129,11 @@ def _y_limits(trend: Trend) -> tuple[float, float]:
 
 
 def _fitted_line(days: list[float], episode: Episode) -> list[tuple[float, float]]:
-    """Compute the vertices (day, leakage) of the line fitted to an episode, which ends at the present leakage.
+    """Compute the vertices (day, leakage) of the line fitted to an episode.
 
-    With an alarm and an onset it rises from the healthy level, linearly or in a step, else all along with the fitted
-    growth. `days` [d]: times of the compared recordings (`Trend.rows`).
+    It ends with the last recording of the episode, at the leakage then (`Wear.total`): for the last episode, the
+    present one. With an alarm and an onset it rises from the healthy level, linearly or in a step, else all along with
+    the fitted growth. `days` [d]: times of the compared recordings (`Trend.rows`).
     """
     first, last, wear = days[episode.begin], days[episode.end - 1], episode.wear
     if episode.alarm is None or wear.onset is None:

@@ -191,7 +191,10 @@ def simulate_batch(
 def _run_set(
     experiment_set: ExperimentSet, batch: Batch, error: float, threads: int, progress: Callable[[float], None]
 ) -> None:
-    """Simulate a set of experiments with a pressure error up to `error` [Pa rms]; write the results into `batch`."""
+    """Simulate a set of experiments, and write the results into `batch`.
+
+    `error` [Pa rms]: largest error of the pressures, for the choice of the step; not used if the experiments state one.
+    """
     members, stated_step = experiment_set.members, experiment_set.experiment.step
     rows = [member.row for member in members]
     coefficients = np.array([member.leak.coefficient or 0.0 for member in members])

@@ -400,14 +400,17 @@ class SetRun:
         advance = advance_lanes_imex if self.method == "imex" else advance_lanes_rk4
         a, b = groups
         state, leaks, totals = self.state[a:b], self.leaks[a:b], self.totals[a:b]
-        table, cells = np.empty((0, 0, 0, 0)), (-1, -1)
+        table, cells = np.empty((0, 0, 0, 0)), (-1, -1)  # no table yet
         chunks = self._chunks()
-        history = self.taps_before + self.taps_after + self.oversampling  # outputs for later samples, with a margin
+        # outputs that later samples need, with a margin: a sample is read once its last tap is known, so that the next
+        # one begins fewer outputs back than the filter is long
+        history = self.taps_before + self.taps_after + self.oversampling
         longest = max(stop - start for _, _, start, stop in chunks)
         # (groups, outputs of history and chunk, channels, width)
         pressures = np.zeros((b - a, history + longest, self.channels, self.width))
         offset_drifts = np.zeros((b - a, self.channels, self.width))
-        wavelet = DetailStream((self.channels, (b - a) * self.width))  # its taps and buffers only
+        # used for its taps, and its buffers (groups, channels, levels, samples, width), which `sense_lanes` updates
+        wavelet = DetailStream((self.channels, (b - a) * self.width))
         n_read = 0  # samples read so far
         output_steps = self.steps_per_output
         for first, last, start, stop in chunks:  # cells first <= cell < last, outputs start <= output < stop

@@ -44,10 +44,12 @@ def observe_duty(recording: Recording) -> Iterator[Observable]:
     The recording is divided into `BLOCKS` blocks of equal length, or with a position and a periodic motion into blocks
     of whole cycles.
     """
-    length, cycle = len(recording) // BLOCKS, find_cycle(recording)
+    length, cycle = len(recording) // BLOCKS, find_cycle(recording)  # [samples]; period [s], None if nothing repeats
+    # Without a position, command and motion are both those of the drive, and a leak may change both a little and alike.
+    # The amplitudes of whole cycles hardly scatter, so that this change would look like another duty. Blocks of equal
+    # length also contain a part of a cycle, another one in each block: the amplitudes then scatter, which hides the
+    # change.
     if "x" in recording and cycle is not None:
-        # Without a position, command and motion are both those of the drive. A leak may change both alike within a
-        # cycle, and would look like another duty in blocks of whole cycles.
         cycle_samples = cycle * recording.rate
         length = round(max(1, math.ceil(length / cycle_samples)) * cycle_samples)
     time, blocks, is_moving = _split_blocks(recording, length)

@@ -154,17 +154,16 @@ def _log_frictions(
 
 
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float) -> Iterator[Observable]:
-    """Compare the drifts of p_A and p_B during motion, over the `duration` [s], with those of healthy recordings.
+    """Compare the drifts of p_A and p_B during motion [Pa over the recording] with those of healthy recordings.
 
-    Yields a test for each of three alternative explanations: p_A drifts, p_B drifts, or both drift alike. Yields
-    nothing unless the judged recording and enough healthy ones have both drifts. If both drift alike, p_A - p_B does
-    not drift, and p-value and score of this explanation are
+    `duration` [s]: that of the judged recording. Yields a test for each of three alternative explanations: p_A drifts,
+    p_B drifts, or both drift alike. Yields nothing unless the judged recording and enough healthy ones have both
+    drifts. If both drift alike, p_A - p_B does not drift, and p-value and score of this explanation are
 
         chance = min(1, chance_A chance_B / chance_difference),    score = max(0, score_A + score_B - score_difference).
 
     A score is the square of a z score. With equal errors of both drifts, z_A^2 + z_B^2 = z_mean^2 + z_difference^2, so
-    that what remains is the score of their mean; a p-value is about exp(-z^2 / 2). The size of "drift of both" is still
-    that of the difference.
+    that what remains is the score of their mean; a p-value is about exp(-z^2 / 2).
     """
     judged_drifts = _read_drifts(judged, MOTION)
     if len(judged_drifts) < 2:
@@ -177,6 +176,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
         for side, name in zip("AB", DRIFTS[:2], strict=True)
     )
     differences = [subtract_drifts(drifts) for drifts in healthy_drifts]
+    # named "drift of both", since it becomes that test at the end; its size, which is not used, stays that of p_A - p_B
     difference = compare_estimates(DRIFTS[2], DRIFT, subtract_drifts(judged_drifts), differences, scatter)
     if drift_A is None or drift_B is None or difference is None:
         return

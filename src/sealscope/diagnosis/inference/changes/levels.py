@@ -250,8 +250,9 @@ def _test_patterns(time: Array, values: Array) -> list[Observable | None]:
 def _pressure_scale(before: Array, after: Array) -> Estimate | None:
     """Compute the logarithm of the factor on both pressures that would explain a change of the friction.
 
-    `before`, `after` (k, 4) [Pa]: levels of the blocks before and after the change. half_A - half_B is the friction.
-    Return None if there are fewer than two blocks before or after, or if a mean friction is not positive.
+    `before`, `after` (k, 4) [Pa]: level_A, level_B, half_A and half_B of the blocks before and after the change. Only
+    the half changes are used: half_A - half_B is the friction. Return None if there are fewer than two blocks before or
+    after, or if a mean friction is not positive.
     """
     if min(len(before), len(after)) < 2:
         return None

@@ -132,7 +132,11 @@ _AMBIGUOUS_UNITS = {**dict.fromkeys(("s", "min", "h", "d"), "time"), "m": "posit
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if no channel has such a unit."""
+    """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if there is no such unit at the end.
+
+    The unit must be familiar (`is_familiar`), and one of a channel, a time, a velocity, or of a spool or command, such
+    as mA or %. One in `_AMBIGUOUS_UNITS` counts only after a word for its quantity.
+    """
     parts = name.replace(" ", "_").split("_")
     # the last two words, such as l/min, and the last one
     endings = [("_".join(parts[:-2]), "/".join(parts[-2:])), ("_".join(parts[:-1]), parts[-1])]

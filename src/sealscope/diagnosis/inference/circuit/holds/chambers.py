@@ -247,7 +247,11 @@ class HeldChambers:
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
-        """Compute the flow [Pa], at least 0, out of A (or B, if not `is_A`) to the outside, for a conductance of 1."""
+        """Compute the flow [Pa] out of A (or B, if not `is_A`) to the outside for a conductance of 1.
+
+        It is the gauge pressure of the side, at least 0, and 0 while the side is not closed: its supply, in `supplies`,
+        then replaces or takes the oil.
+        """
         pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
         flows = [flow_of_side(np.maximum(p - P_ATM, 0.0), is_A) for p in pressures]
         return self._while_closed(flows, supplies)
