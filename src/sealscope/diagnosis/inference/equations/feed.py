@@ -1,8 +1,9 @@
 """Volume balance of a pump in an open circuit, which feeds one chamber at a time while the other drains to the tank.
 
 The coefficient of a term of motion is the area of the side that the pump feeds in this direction, whichever side
-carries the load; oil that the other chamber compresses or loses to the outside does not count. While the piston rests,
-the side that carries the load counts instead, by whose oil the load creeps.
+carries the load; oil that the other chamber loses to the outside does not count. While the piston rests, the side that
+carries the load counts instead, by whose oil the load creeps. Compliances count on both sides: if that of the other
+chamber counted as nothing, 3 of 18 leaks of presses by another hand would be missed.
 """
 
 from __future__ import annotations
@@ -19,7 +20,6 @@ from sealscope.diagnosis.inference.equations.terms import (
     MOTIONS,
     Equation,
     Term,
-    chamber_terms,
     compensated_leak_term,
     external_leak_term,
 )
@@ -27,20 +27,16 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
 
-#: Side of the terms of one chamber, by their names: its compliance, its air, and leaks from it to the outside.
-_SIDES = {
-    term.name: side
-    for side in "AB"
-    for term in (*chamber_terms(side), external_leak_term(side), compensated_leak_term(side))
-}
+#: Side of the terms of leaks to the outside, by their names.
+_SIDES = {term.name: side for side in "AB" for term in (external_leak_term(side), compensated_leak_term(side))}
 
 
 def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
     """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
 
     `fed_outward` of the result names the chamber that the pump feeds while x grows (`_find_fed_outward`). The terms of
-    motion count the creep of a piston at rest with the area of the side that carries the load. The terms of one chamber
-    count while it is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of rest.
+    motion count the creep of a piston at rest with the area of the side that carries the load. A leak to the
+    outside counts while its chamber is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of rest.
     """
     adapted = equation._replace(fed_outward=_find_fed_outward(equation, signals))
     volumes = equation.left(signals) * signals.step("x")  # > 0 if flow and position have one sense
@@ -111,7 +107,7 @@ def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
 
 
 def _counted_increments(signals: Signals, *, term: Term, left: Callable[[Signals], Array], sign_A: float) -> Array:
-    """Compute the increments (n - 1,) of a term of one chamber, 0 while neither the pump's flow nor a load shows it.
+    """Compute the increments (n - 1,) of a leak to the outside, 0 while neither the pump's flow nor a load shows it.
 
     `left`: left side of the volume balance, the pump's flow; `sign_A`: its sign while the pump feeds A.
     """
