@@ -35,8 +35,9 @@ def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
     """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
 
     `fed_outward` of the result names the chamber that the pump feeds while x grows (`_find_fed_outward`). The terms of
-    motion count the creep of a piston at rest with the area of the side that carries the load. A leak to the
-    outside counts while its chamber is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of rest.
+    motion count the creep of a piston at rest with the area of the side that carries the load. A leak to the outside
+    counts while its chamber is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of
+    rest.
     """
     adapted = equation._replace(fed_outward=_find_fed_outward(equation, signals))
     volumes = equation.left(signals) * signals.step("x")  # > 0 if flow and position have one sense
