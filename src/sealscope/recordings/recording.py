@@ -217,7 +217,7 @@ class Recording:
 
     @property
     def pressure_unit(self) -> str:
-        """Unit in which pressures are displayed: the first unit of a logged pressure in `DISPLAY_UNITS`, else bar."""
+        """Unit in which pressures are displayed, the first unit of a logged pressure in `DISPLAY_UNITS`, else bar."""
         units = (self.unit_in_log(name) for name in self.channels if name.startswith("p_"))
         return next((unit for unit in units if unit in DISPLAY_UNITS), "bar")
 

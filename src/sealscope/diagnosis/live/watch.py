@@ -160,7 +160,7 @@ class Watch:
 
     @property
     def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Settings of the baseline: rig, for each method True if it states L/min, and the time to learn [h]."""
+        """Rig of the baseline, for each method True if it states L/min, and the time to learn [h]."""
         return self._rig, self._litres, self.learn_hours
 
     @property
