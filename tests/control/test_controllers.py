@@ -283,6 +283,12 @@ def test_the_source_of_an_unknown_name_is_refused_by_that_name():
         find_controller_source("flatnes")
 
 
+def test_a_module_that_is_no_package_has_no_modules_inside():
+    """Another module of the same last name, here of the standard library, is not taken in its place."""
+    with refusal("file must exist", "tokenize.json"):
+        find_controller_source("tokenize.json:Own")
+
+
 def test_numbers_that_cannot_be():
     with refusal("displacement", "0"):
         replace(Drive.from_rig(RIG), displacement=0.0)

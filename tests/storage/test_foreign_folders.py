@@ -109,6 +109,17 @@ def test_a_file_to_write_takes_the_place_of_a_link(name: str, outside: Path, tmp
     assert (tmp_path / name).read_text() == "new"
 
 
+def test_a_long_name_of_wide_letters_can_be_written(tmp_path: Path) -> None:
+    """A file system limits names in bytes: the temporary file's name is cut in bytes, too."""
+    name = "\N{CJK UNIFIED IDEOGRAPH-20000}" * 62 + ".csv"  # 252 bytes
+    with atomic_write(tmp_path / name) as temporary:
+        temporary.write_text("new")
+        assert len(temporary.name.encode()) <= 255
+        remove_temporaries(tmp_path, name)  # of this process, which is alive
+        assert temporary.exists()
+    assert (tmp_path / name).read_text() == "new"
+
+
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, None])
 def test_a_file_that_is_replaced_keeps_its_mode(mode: int | None, tmp_path: Path) -> None:
     """And is private while it is written."""
