@@ -295,7 +295,8 @@ def test_a_machine_whose_recordings_are_all_healthy_has_a_bound(days: int) -> No
 def test_a_worn_pump_and_a_seal_are_one_cause_and_the_balance_names_its_rivals(simulated: Trend) -> None:
     points = [simulated.points[row] for row in simulated.rows]
     assert simulated.wear is not None and simulated.decision.cause == "piston, pump or external leak"
-    names = {observable.name for observable in trend_leak._rival_changes(points, simulated.wear)}
+    before, since = trend_leak._split_at_onset(points, simulated.wear)
+    names = {observable.name for observable in trend_leak._rival_changes(points[-1], before, since)}
     assert {"external leak A", "external leak B", "free air"} <= names
 
 
