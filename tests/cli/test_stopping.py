@@ -79,7 +79,7 @@ def test_an_interrupt_within_a_finalizer_is_not_lost(untouched, surroundings):
         "def integrate(*arguments, **options):\n"
         "    Finalized()\n"
         "    time.sleep(50)\n"
-        "module.integrate = integrate\n"
+        "module.integrate_run = integrate\n"
         "sealscope.cli.main()\n"
     )
     child = subprocess.Popen(

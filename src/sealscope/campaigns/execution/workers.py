@@ -130,15 +130,15 @@ def _local_processes(task: Callable[[Any], Any], max_items: int) -> Iterator[_Po
 
     def start_process() -> Executor:
         """Start one worker process, as a pool of its own, with the variables `_ENVIRONMENT` unless they are set."""
-        pool = ProcessPoolExecutor(1, context, initializer=_initialise_worker, initargs=(task, lifeline))
-        pools.append(pool)
         added = {name: value for name, value in _ENVIRONMENT.items() if not os.environ.get(name)}
         os.environ.update(added)
-        try:
+        try:  # the pool itself starts a process, too, that keeps account of semaphores
+            pool = ProcessPoolExecutor(1, context, initializer=_initialise_worker, initargs=(task, lifeline))
+            pools.append(pool)
             pool.submit(os.getpid)  # the first item starts the process
         finally:
             for name in added:
-                del os.environ[name]
+                os.environ.pop(name, None)
         return pool
 
     try:
