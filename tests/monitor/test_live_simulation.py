@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from sealscope.live_simulation import DEMO, make_simulated_sources
+from sealscope.monitor.database import tables
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import MonitorSettings, read_settings
@@ -98,10 +99,10 @@ def test_a_kill_changes_no_row(tmp_path):
             run(settings)
         finally:
             os._exit(0)
-    until(lambda: store.last_number(store.tables.blocks, "press 1") >= 20)
+    until(lambda: store.last_number(tables.blocks, "press 1") >= 20)
     os.kill(child, signal.SIGKILL)
     assert os.WIFSIGNALED(os.waitpid(child, 0)[1])
-    assert store.last_number(store.tables.blocks, "press 1") < 75
+    assert store.last_number(tables.blocks, "press 1") < 75
     service = run(settings)
     assert rows_of(settings.database) == rows_of(whole.database)
     assert service.actuators.counters == {}
