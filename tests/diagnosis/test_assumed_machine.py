@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.assumed_rig import assumed_rig
+from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.detectors import observation
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
@@ -146,6 +146,13 @@ def test_a_supply_above_both_chambers_is_that_of_a_valve() -> None:
     assert abs(used.cylinder.A_A - 1e-3) < 1e-9
     assert not assumed_rig("thesis", recording)[0].circuit.valve_controlled
     assert not assumed_rig(stated(displacement="5 cm^3/rev"), recording)[0].circuit.valve_controlled
+
+
+def test_the_first_recording_with_the_supplys_pressure_shows_a_valve() -> None:
+    recording = logged("servo-valve", "2 sin(4t)", "0 N")
+    inferred = infer_rig(None, [recording.only(["u", "x", "p_A", "p_B"]), recording])
+    assert inferred is not None and inferred.circuit.valve_controlled
+    assert infer_rig(None, []) is None
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from sealscope import diagnose, load_rig, simulate
-from sealscope.diagnosis.assumed_rig import assumed_rig
+from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
@@ -99,10 +99,19 @@ def test_a_pump_between_the_chambers_is_in_a_closed_circuit() -> None:
     assert not is_open(press(0.0, seed=1), rig)
 
 
-def test_the_first_recording_decides_for_a_machine() -> None:
+def test_what_healthy_recordings_show_holds_for_later_ones() -> None:
     rig, _ = assumed_rig(stated_areas(), press(0.0, seed=1))
-    double_rod = simulate(rig="single-rod-eha", command="2 sin(4t)", load="8 kN", duration="20 s", seed=1)
-    assert is_open(replace(double_rod, provenance={}), rig)
+    closed = simulate(rig="single-rod-eha", command="2 sin(4t)", load="8 kN", duration="20 s", seed=1)
+    assert is_open(replace(closed, provenance={}), rig)
+
+
+def test_recordings_whose_piston_moves_one_way_tell_nothing() -> None:
+    recording = press(0.0, seed=1)
+    closing = recording.between(0.0, 2.5)
+    rig = infer_rig(stated_areas(), [closing] * 100 + [recording])
+    assert rig is not None and rig.circuit.feeds_one_chamber
+    alone = infer_rig(stated_areas(), [closing])
+    assert alone is not None and not alone.circuit.feeds_one_chamber
 
 
 @pytest.mark.parametrize(("flow", "idle"), [(0.05, 0.0), (0.3, 0.0), (0.3, 1.0)])

@@ -57,15 +57,16 @@ def infer_rig(rig: Rig | None, recordings: Sequence[Recording]) -> Rig | None:
     """Replace a rig that nobody stated as a whole, if recordings of the machine show its circuit.
 
     With stated areas, the circuit of a pump is that of `shows_open_circuit`; the rig notes it, so that these recordings
-    decide for all later ones of a machine. The first recording may also show a servo valve (`_shows_valve_supply`).
-    Stated sizes are kept.
+    decide for all later ones of a machine. The first recording with the supply's pressure may also show a servo valve
+    (`_shows_valve_supply`). Stated sizes are kept.
     """
     circuit = OPEN_CIRCUIT.parameter
     if rig is not None and (states_rig(rig) or rig.entry(circuit).source == _SHOWN):
         return rig
     if rig is not None and (is_open := shows_open_circuit(rig, recordings)) is not None:
         return rig.with_overrides({circuit: OPEN_CIRCUIT.value if is_open else "closed"}, source=_SHOWN)
-    if not recordings or not _shows_valve_supply(rig, recordings[0]):
+    is_valve = (shown for recording in recordings if (shown := _shows_valve_supply(rig, recording)) is not None)
+    if not next(is_valve, False):
         return rig
     valve_rig = load_rig(_BEHIND_VALVE).as_assumed(UNSTATED)
     if rig is None or not rig.states("cylinder.A_A", "cylinder.A_B"):
@@ -73,22 +74,23 @@ def infer_rig(rig: Rig | None, recordings: Sequence[Recording]) -> Rig | None:
     return valve_rig.with_areas(rig.cylinder.A_A, rig.cylinder.A_B, source=rig.entry("cylinder.A_A").source)
 
 
-def _shows_valve_supply(rig: Rig | None, recording: Recording) -> bool:
-    """Return True if a recording shows the supply of a servo valve.
+def _shows_valve_supply(rig: Rig | None, recording: Recording) -> bool | None:
+    """Return True if a recording shows the supply of a servo valve; None if it cannot tell.
 
     That is so if no flow and no pump is recorded, only the command, and if p_1 exceeds both chamber pressures by
     `supply.margin` (`priors.toml`) in more than the fraction `supply.above` of the samples that have all three: at the
-    port of a pump, p_1 is about the pressure of one chamber. Pressures in raw counts cannot be compared, and a
-    displacement that `rig` states is that of a pump that feeds the chambers: the result is then False.
+    port of a pump, p_1 is about the pressure of one chamber. A recording cannot tell without these pressures in Pa: raw
+    counts cannot be compared. A displacement that `rig` states is that of a pump that feeds the chambers: the result is
+    then False.
     """
     states_pump = rig is not None and rig.states("pump.q_b")
     if states_pump or flow_source(recording.channels) != "u":
         return False
     if any(recording.units.get(name) != "Pa" for name in ("p_1", "p_A", "p_B")):
-        return False
+        return None
     excess = recording["p_1"] - np.maximum(recording["p_A"], recording["p_B"])
     excess = excess[np.isfinite(excess)]
-    return bool(excess.size and np.mean(excess > VERDICT.supply.margin) > VERDICT.supply.above)
+    return bool(np.mean(excess > VERDICT.supply.margin) > VERDICT.supply.above) if excess.size else None
 
 
 def _names_rig_of_same_geometry(provenance: Mapping[str, Any], rig: Rig) -> bool:

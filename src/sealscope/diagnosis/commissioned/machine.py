@@ -410,14 +410,18 @@ def commission(
 
 
 def _read_into_memory(machine: CommissionedMachine, path_of: Mapping[str, Path]) -> dict[str, Recording]:
-    """Read recordings by label, in order, until they have `_MAX_SAMPLES` samples; unreadable ones are left out."""
+    """Read recordings by label, in order, as many as have less than `_MAX_SAMPLES` samples together, but at least one.
+
+    Unreadable recordings are left out.
+    """
     recordings, n_samples = dict[str, Recording](), 0
     for label, path in path_of.items():
         with suppress(SealscopeError):
-            recordings[label] = machine.read(path)
-            n_samples += len(recordings[label]) * len(recordings[label].channels)
-        if n_samples >= _MAX_SAMPLES:
-            break
+            recording = machine.read(path)
+            n_samples += len(recording) * len(recording.channels)
+            if recordings and n_samples >= _MAX_SAMPLES:
+                break
+            recordings[label] = recording
     return recordings
 
 

@@ -34,10 +34,13 @@ def shows_open_circuit(rig: Rig, recordings: Sequence[Recording]) -> bool | None
     """Return True if recordings show that the pump feeds one chamber at a time.
 
     Their mean evidence (`open_circuit_evidence`) counts, since its errors repeat in all recordings of a machine, beside
-    the log odds `feed.one` (`priors.toml`) before any recording. The result is None if no recording can tell.
+    the log odds `feed.one` (`priors.toml`) before any recording. A recording whose evidence is 0, because its piston
+    moves one way only under each load, does not count. The result is None if the channels of no recording can tell.
     """
     evidence = [value for recording in recordings if (value := open_circuit_evidence(rig, recording)) is not None]
-    return INFERENCE.feed.one + float(np.mean(evidence)) > 0.0 if evidence else None
+    if not evidence:
+        return None
+    return INFERENCE.feed.one + float(np.mean([value for value in evidence if value] or [0.0])) > 0.0
 
 
 def open_circuit_evidence(rig: Rig, recording: Recording) -> float | None:

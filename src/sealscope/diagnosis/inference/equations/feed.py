@@ -2,8 +2,8 @@
 
 The coefficient of a term of motion is the area of the side that the pump feeds in this direction, whichever side
 carries the load; oil that the other chamber loses to the outside does not count. While the piston rests, the side that
-carries the load counts instead, by whose oil the load creeps. Compliances count on both sides: if that of the other
-chamber counted as nothing, 3 of 18 leaks of presses by another hand would be missed.
+carries the load counts instead, by whose oil the load creeps. Compliances count on both sides, although the pump's flow
+shows that of the fed chamber only: without the other, more leaks are missed (decision 68).
 """
 
 from __future__ import annotations
@@ -57,13 +57,14 @@ def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
 def _find_fed_outward(equation: Equation, signals: Signals) -> Literal["A", "B"]:
     """Find the chamber that the pump feeds while x grows: that of the larger area if more flow moves the piston then.
 
-    Flows are compared per distance, whatever the signs of flow and position. With equal areas it is A if the flow is
-    positive while x grows.
+    Flows are compared per distance, whatever the signs of flow and position. If the areas differ by less than these
+    ratios scatter (`feed.scatter` of `priors.toml`), it is A if the flow is positive while x grows.
     """
     volume, step = equation.left(signals), signals.step("x")
     is_moving = np.isfinite(volume * step) & (signals.moving(equation.left) > 0.0)
     outward, inward = is_moving & (step > 0.0), is_moving & (step < 0.0)
-    if equation.area_ratio == 1.0 or not (outward.any() and inward.any()):
+    areas_tell = abs(float(np.log(equation.area_ratio))) > INFERENCE.feed.scatter
+    if not (areas_tell and outward.any() and inward.any()):
         feeds_A = float(volume[is_moving] @ step[is_moving]) >= 0.0
     else:
         flow_out, flow_in = (abs(float(volume[flags].sum() / step[flags].sum())) for flags in (outward, inward))
