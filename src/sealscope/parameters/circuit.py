@@ -13,29 +13,51 @@ class HydraulicCircuit(NamedTuple):
 
     Other modules read the properties below instead of comparing circuits. `CONTRIBUTING.md` says what a further circuit
     needs.
+
+    Attributes
+    ----------
+    name : str
+        Name in messages.
+    parameter, value : str
+        Parameter that chooses the circuit, and its value.
+    required : mapping of str to str
+        Further parameters that must have a value in a rig with this circuit.
+    simulated : bool
+        A rig with this circuit can be simulated, by laws in `physics`; otherwise it can only be diagnosed.
+    valve_controlled : bool
+        A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
+    pump_feeds_chambers : bool
+        The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
+        chambers, but it cannot tell leakage of the pump from leakage past the piston. If the piston areas are equal,
+        the balance does not need the piston's position.
+    feeds_one_chamber : bool
+        The pump delivers into one chamber at a time, through directional valves, and the other drains to the tank.
+    pump_is_measured : bool
+        An encoder on the pump's motor records its angle and speed.
+    holds_load : bool
+        Both chambers are shut while the command rests at zero, so that a load creeps by leakage alone.
+    flow_size : {"area", "displacement"}
+        The machine's size, piston area or pump displacement, to which flows in L/min from the balance of volumes are
+        proportional. Its uncertainty is in ``diagnosis/inference/priors.toml``, table ``[size]``, under the same name.
+    watched_by : tuple of tuple of str
+        Sets of channels from which the balance of volumes watches a running machine, the best set first.
+    needed_channels : str
+        Channels that the balance of volumes of a recording needs, in words for a message.
     """
 
-    name: str  # name in messages
-    parameter: str  # parameter that chooses the circuit
-    value: str  # value of this parameter
-    required: Mapping[str, str]  # further parameters, and the value of each in a rig with this circuit
-    simulated: bool  # there are laws in `physics` to simulate the circuit; otherwise it can only be diagnosed
-    #: A servo valve on a supply of constant pressure meters the flow into each chamber; else the pump's speed does.
+    name: str
+    parameter: str
+    value: str
+    required: Mapping[str, str]
+    simulated: bool
     valve_controlled: bool
-    #: The pump delivers into chamber A and draws from B, or the reverse. One balance of volumes then holds for both
-    #: chambers, but it cannot tell leakage of the pump from leakage past the piston. If the piston areas are equal, the
-    #: balance does not need the piston's position.
     pump_feeds_chambers: bool
-    #: The pump delivers into one chamber at a time, through directional valves, and the other drains to the tank.
     feeds_one_chamber: bool
-    pump_is_measured: bool  # an encoder on the pump's motor records its angle and speed
-    holds_load: bool  # both chambers are shut while the command rests at zero: a load creeps by leakage alone
-    #: The machine's size to which flows in L/min from the balance of volumes are proportional. Its uncertainty is in
-    #: `diagnosis/inference/priors.toml`, table `[size]`, under the same name.
+    pump_is_measured: bool
+    holds_load: bool
     flow_size: Literal["area", "displacement"]
-    #: Sets of channels from which the balance of volumes watches a running machine, the best set first.
     watched_by: tuple[tuple[str, ...], ...]
-    needed_channels: str  # channels that the balance of volumes of a recording needs, in words for a message
+    needed_channels: str
 
     def __str__(self) -> str:
         return f"{self.name} ({self.parameter} = {self.value})"

@@ -53,17 +53,23 @@ _MAX_OFFSET_STEPS = 3
 class Blocks:
     """Consecutive blocks of a recording, each a few seconds long and reduced to a regression's Gram matrices.
 
-    - `start`, `end` (K,): times of the first and the last row of each block [s], i.e. of the middles of their test
-      functions.
-    - `gram` (K, E, m, m): Gram matrices of each block for each of E equations: weighted sums, over the rows, of the
-      products of the m columns with each other. The left side is the last column.
-    - `rows` (K,): number of the regression's rows (one for each test function of the weak form) without missing
-      samples; a row next to a hole counts as a fraction of one.
-    - `flow` (K,): mean magnitude of the first equation's left side, as a flow [m^3/s].
-    - `pressures` (K, p): means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded
-      (`sorted_part_means`).
-    - `zero` (K,): sensor offset [Pa] that was subtracted from p_A - p_B in `gram`
-      (`pressure_offset.remove_pressure_offset`), the same in all blocks of a recording.
+    Parameters
+    ----------
+    start, end : array of float, shape (K,)
+        Times of the first and the last row of each block [s], i.e. of the middles of their test functions.
+    gram : array of float, shape (K, E, m, m)
+        Gram matrices of each block for each of E equations: weighted sums, over the rows, of the products of the m
+        columns with each other. The left side is the last column.
+    rows : array of float, shape (K,)
+        Number of the regression's rows (one for each test function of the weak form) without missing samples; a row
+        next to a hole counts as a fraction of one.
+    flow : array of float, shape (K,)
+        Mean magnitude of the first equation's left side, as a flow [m^3/s].
+    pressures : array of float, shape (K, p)
+        Means of p equal parts of the sorted samples of p_A - p_B [Pa], as recorded (`sorted_part_means`).
+    zero : array of float, shape (K,)
+        Sensor offset [Pa] that was subtracted from p_A - p_B in `gram` (`pressure_offset.remove_pressure_offset`), the
+        same in all blocks of a recording.
     """
 
     start: Array

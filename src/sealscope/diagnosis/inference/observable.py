@@ -23,20 +23,30 @@ from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak
 class Observable:
     """Result of testing one quantity, estimated by a detector, for a change.
 
-    - `name`: name of the quantity: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
-    - `data`: kind of data from which the quantity is computed, such as "volumes", "rise", "drift" or "details", as the
-      patterns in `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative
-      descriptions of one change in these data.
-    - `score`: twice the logarithm of the likelihood ratio of the change.
-    - `chance`: probability that a healthy recording scores as high, as stated by the detector.
-    - `onset`: time of the change [s]; None for a comparison with other recordings.
-    - `size`: amount of the change, in the unit of the quantity; negative for a fall.
-    - `advantage`: twice the log odds of this description over the alternative ones, from sources other than the score,
-      such as a prior on its size.
-    - `log_ratio_to_leak`: log likelihood ratio of this change to a leak, as explanations of a difference from healthy
-      recordings.
-    - `pressure_scale`: logarithm of a factor on both recorded pressures that would cause this change without a change
-      of the machine; None if it is unknown, or if no factor would.
+    Parameters
+    ----------
+    name : str
+        Name of the quantity: a term of the volume balance, "noise of the pressures", "RMS of d3 of p_A".
+    data : str
+        Kind of data from which the quantity is computed, such as "volumes", "rise", "drift" or "details", as the
+        patterns in `decision/events.toml` list it, or "plug-in". Observables of the same data are alternative
+        descriptions of one change in these data.
+    score : float
+        Twice the logarithm of the likelihood ratio of the change.
+    chance : float
+        Probability that a healthy recording scores as high, as stated by the detector.
+    onset : Interval, optional
+        Time of the change [s]; None for a comparison with other recordings.
+    size : float
+        Amount of the change, in the unit of the quantity; negative for a fall.
+    advantage : float
+        Twice the log odds of this description over the alternative ones, from sources other than the score, such as a
+        prior on its size.
+    log_ratio_to_leak : float, optional
+        Log likelihood ratio of this change to a leak, as explanations of a difference from healthy recordings.
+    pressure_scale : Estimate, optional
+        Logarithm of a factor on both recorded pressures that would cause this change without a change of the machine;
+        None if it is unknown, or if no factor would.
     """
 
     name: str
@@ -139,31 +149,45 @@ class LeakMeasure:
     flows (`size_deviation`). A subclass may replace fields by properties, which are computed when they are first read
     (`BalanceLeak`), and overrides the methods, which here return `total_leakage` or None.
 
-    - `provider`: name of the detector; `cause`: cause of a leak, e.g. "piston or pump leak", as precise as the recorded
-      channels allow.
-    - `step`: test for a leak that begins within the recording; None if the recording is too short.
-    - `step_flow`: mean flow [m^3/s] of such a leak, averaged from its onset to the end.
-    - `flow_factors`: smallest and largest ratio of the leak's true flow to the stated one, if its path or law is
-      unknown.
-    - `flow_per_conductance`: mean flow [m^3/s] of a leak of 1 m^3/(s Pa) at the recording's pressures.
-    - `rise`: test of the mean leakage against that of healthy recordings; None without such recordings.
-    - `rise_flow`: mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if
-      unknown.
-    - `rise_onset`: onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning.
-    - `step_rise`: the rise, and the evidence that a step within the recording explains it; None without healthy
-      recordings.
-    - `excess`: total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if
-      unknown.
-    - `bound_flow`: 95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested.
-    - `pump_flow`: mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers.
-    - `lpm_per_flow`: factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows
-      [L/min]. None if they depend on dimensions that the rig's file does not state, such as the piston's area.
-    - `size_deviation`: relative standard deviation of the dimension that scales all flows: pump's displacement or
-      piston's area.
-    - `ratio`: measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured.
-    - `remarks`: remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of
-      channels.
-    - `total_leakage`: total leakage, if the detector does not state the smallest detectable leak with it (`total`).
+    Parameters
+    ----------
+    provider : str
+        Name of the detector that measured the leakage.
+    cause : str
+        Cause of a leak, e.g. "piston or pump leak", as precise as the recorded channels allow.
+    step : DatedTest, optional
+        Test for a leak that begins within the recording; None if the recording is too short.
+    step_flow : Estimate
+        Mean flow [m^3/s] of a leak that begins within the recording, averaged from its onset to the end.
+    flow_factors : tuple of two floats
+        Smallest and largest ratio of the leak's true flow to the stated one, if its path or law is unknown.
+    flow_per_conductance : float
+        Mean flow [m^3/s] that a leak with a conductance of 1 m^3/(s Pa) has at the recording's pressures.
+    rise : RiseTest, optional
+        Test of the mean leakage against the leakage of healthy recordings; None without such recordings.
+    rise_flow : Estimate, optional
+        Mean leakage [m^3/s] above that of healthy recordings, or in total if there are none; None if unknown.
+    rise_onset : Interval, optional
+        Onset [s] of the leakage above that of healthy recordings; None if nothing shows its beginning.
+    step_rise : LeakRise, optional
+        The rise, and the evidence that a step within the recording explains it; None without healthy recordings.
+    excess : float, optional
+        Total leakage minus the limit in the rig's file (`pump.G_healthy`) [standard deviations]; None if unknown.
+    bound_flow : float
+        95 % upper bound of the mean flow of an undetected leak [m^3/s]; infinite if nothing was tested.
+    pump_flow : tuple of two floats
+        Mean flow of the pump [m^3/s] over the whole recording, and while the pump delivers.
+    lpm_per_flow : float, optional
+        Factor from this detector's flows [m^3/s], computed with an assumed machine, to the true flows [L/min]. None if
+        they depend on dimensions that the rig's file does not state, such as the piston's area.
+    size_deviation : float
+        Relative standard deviation of the dimension that scales all flows: pump's displacement or piston's area.
+    ratio : Interval, optional
+        Measured over assumed ratio of the pump's displacement to the piston's area; None if it is not measured.
+    remarks : sequence of Remark
+        Remarks for the reader of the verdict: contradicting dimensions, offsets of sensors, delays of channels.
+    total_leakage : TotalLeakage, optional
+        Total leakage, if the detector does not state the smallest detectable leak with it (`total`).
     """
 
     provider: str
@@ -222,13 +246,26 @@ class Ringing(NamedTuple):
 class Observed:
     """Report of one detector on a recording.
 
-    - `provider`: name of the detector; `observables`: tests of the quantities that it estimates.
-    - `leak`: the leakage, if the detector measures it; `ringing`: facts on the comparison of the pressures' ringing, if
-      it makes one.
-    - `lack`: reason for an empty report, else ""; `has_failed`: true if the detector raised an error.
-    - `share`: fraction of the recording's samples that were used; `judged_until`: time of the last judged sample, as a
-      fraction of the recording.
-    - `refusal`: reason why none of the given healthy recordings could be compared, else "".
+    Parameters
+    ----------
+    provider : str
+        Name of the detector.
+    observables : tuple of Observable
+        Tests of the quantities that the detector estimates.
+    leak : LeakMeasure, optional
+        The leakage, if the detector measures it.
+    ringing : Ringing, optional
+        Facts on the comparison of the pressures' ringing, if the detector makes one.
+    lack : str
+        Reason for an empty report, else "".
+    share : float
+        Fraction of the recording's samples that were used.
+    judged_until : float
+        Time of the last judged sample, as a fraction of the recording.
+    has_failed : bool
+        True if the detector raised an error.
+    refusal : str
+        Reason why none of the given healthy recordings could be compared, else "".
     """
 
     provider: str

@@ -115,15 +115,27 @@ class Interval(NamedTuple):
 class StepTest:
     """Result of the test for a step, a sudden lasting change, of one coefficient at an unknown onset (`step_test`).
 
-    - `score`: twice the logarithm of the likelihood ratio of the best step; `law`: its distribution without a step.
-    - `positions`, `onsets` (o,): onsets that were tried, counted in blocks, and as times [s]; `best`: index of the most
-      likely one. A prior on the level counts as one block before the first.
-    - `likelihood` (o,): log likelihood of a step at each onset, with fitted size and random walk.
-    - `size`, `deviation` (o,): step at each onset and its standard error, with the walk's variance as fitted without a
-      step; `fitted`: both at the best onset, with the walk's variance as fitted together with the step.
-    - `walk`, `noise`: variance q of the walk over that of the noise, and the latter, kappa, each without a step and
-      with the best one.
-    - `sign`: 1 for a step up; -1 for a step down, whose sizes are stated as positive.
+    Parameters
+    ----------
+    score : float
+        Twice the logarithm of the likelihood ratio of the best step.
+    best : int
+        Index of the most likely onset.
+    positions, onsets : array of float, shape (o,)
+        Onsets that were tried, counted in blocks, and as times [s]. A prior on the level counts as one block before the
+        first.
+    likelihood : array of float, shape (o,)
+        Log likelihood of a step at each onset, with fitted size and random walk.
+    size, deviation : array of float, shape (o,)
+        Step at each onset and its standard error, with the walk's variance as fitted without a step.
+    fitted : Estimate
+        Step at the best onset and its standard error, with the walk's variance as fitted together with it.
+    walk, noise : tuple of two floats
+        Variance q of the walk over that of the noise, and the latter, kappa, each without a step and with the best one.
+    law : NullLaw
+        Distribution of the score under the null.
+    sign : float
+        1 for a step up; -1 for a step down, whose sizes are stated as positive.
     """
 
     score: float

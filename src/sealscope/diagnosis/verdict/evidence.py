@@ -47,9 +47,14 @@ VOLUME_BALANCE, PRESSURE_RESPONSE, RMS_CHANGE = "volume balance", "pressure resp
 class LeakCourse:
     """Leak flow over the time of a recording.
 
-    `t` (k,): times of the estimates [s]; `lpm`, `low`, `high` (k,): flow at these times, and its 95 % interval [L/min];
-    `whole`: true for the total flow past pump and piston, without a known onset, false for its increase since the
-    onset.
+    Attributes
+    ----------
+    t : ndarray, shape (k,)
+        Times of the estimates [s].
+    lpm, low, high : ndarray, shape (k,)
+        Flow at these times, and its 95 % interval [L/min].
+    whole : bool
+        True for the total flow past pump and piston, without a known onset; False for its increase since the onset.
     """
 
     t: Array
@@ -63,14 +68,19 @@ class LeakCourse:
 class TotalLeakage:
     """Mean flow past pump and piston together in a recording, including any leak from before its start.
 
-    - `lpm`, `interval_lpm`: the flow and its 95 % interval [L/min], None if unknown, for example without the machine's
-      sizes.
-    - `pressure`: mean absolute pressure difference that drives the flow [Pa].
-    - `findable_lpm`: smallest step of the flow that would have been detected [L/min], None if a leak was detected or if
-      unknown.
-    - `healthy_lpm`: largest flow of a healthy machine at this pressure [L/min] by the rig; None if the rig does not
-      state it, or if healthy recordings are compared instead.
-    - `pump_share`, `findable_share`: flow and smallest step as fractions of the pump's mean flow; None if unknown.
+    Attributes
+    ----------
+    lpm, interval_lpm : float and pair of floats, or None
+        The flow and its 95 % interval [L/min], None if unknown, for example without the machine's sizes.
+    pressure : float
+        Mean absolute pressure difference that drives the flow [Pa].
+    findable_lpm : float or None
+        Smallest step of the flow that would have been detected [L/min], None if a leak was detected or if unknown.
+    healthy_lpm : float or None
+        Largest flow of a healthy machine at this pressure [L/min] by the rig; None if the rig does not state it, or if
+        healthy recordings are compared instead.
+    pump_share, findable_share : float or None
+        Flow and smallest step as fractions of the pump's mean flow, also if L/min are unknown; None if unknown.
     """
 
     lpm: float | None
@@ -92,10 +102,13 @@ class TotalLeakage:
 class RelativeLeak:
     """Size of a leak relative to other measured quantities, which needs no stated area or displacement.
 
-    - `pump_share`, `pump_share_interval`: leak as a fraction of the pump's mean flow, and its 95 % interval; None if
-      the pump's flow is 0 or unknown.
-    - `creep`, `creep_interval`: speed at which the leak would let the piston creep with its lines shut (leak over
-      piston area) [m/s], and its 95 % interval; None if the piston's area is unknown.
+    Attributes
+    ----------
+    pump_share, pump_share_interval : float and pair of floats, or None
+        Leak as a fraction of the pump's mean flow, and its 95 % interval; None if the pump's flow is 0 or unknown.
+    creep, creep_interval : float and pair of floats, or None
+        Speed at which the leak would let the piston creep with its lines shut (leak over piston area), and its 95 %
+        interval [m/s]; None if the piston's area is unknown.
     """
 
     pump_share: float | None = None

@@ -20,13 +20,22 @@ DEFAULT, UNSTATED = "thesis", "no rig was stated"
 class AssumedMachine:
     """Sizes of the machine that a diagnosis assumes.
 
-    - `rig`: name of the rig; `stated_by`: who stated it, the caller (`--rig` or a Rig), the recording's provenance, or
-      nobody.
-    - `area`: mean of the piston areas [m^2] of sides A and B, `areas`; `displacement`: that of the pump [m^3/rev].
-    - `area_stated`, `displacement_stated`: true if the size is known from the rig, or was stated separately.
-    - `flow_meter`: true if a flow meter, channel `q_pump` or `q_supply`, measures the flow, so that neither size is
-      needed.
-    - `bypass`: true if a flow meter in a bypass of the cylinder was recorded.
+    Attributes
+    ----------
+    rig : str
+        Name of the rig.
+    stated_by : {"call", "recording", "nobody"}
+        Source of the rig: the caller (`--rig` or a Rig), the recording's provenance, or a mere assumption.
+    area, displacement : float
+        Mean piston area of both sides [m^2], and displacement of the pump [m^3/rev].
+    area_stated, displacement_stated : bool
+        Whether the size is known from the rig, or was stated separately.
+    flow_meter : bool
+        Whether a flow meter, channel `q_pump` or `q_supply`, measures the flow, so that neither size is needed.
+    areas : tuple of float, optional
+        Piston areas of sides A and B [m^2].
+    bypass : bool
+        Whether a flow meter in a bypass of the cylinder was recorded.
     """
 
     rig: str

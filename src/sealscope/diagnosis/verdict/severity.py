@@ -28,8 +28,14 @@ _EXPONENT = re.compile(r"(?<=[\d.])[eE](?=[+-]?\d)")
 class RepairLimit:
     """Leak at which a machine must be repaired.
 
-    `value`: a flow [m^3/s] or, by `kind`, the speed at which the piston creeps with its lines shut [m/s]; `stated`:
-    true if the caller gave the limit, false for the default creep speed of `priors.toml`.
+    Attributes
+    ----------
+    value : float
+        A flow [m^3/s], or the speed at which the piston creeps with its lines shut [m/s].
+    kind : {"flow", "creep"}
+        Whether `value` is a flow or a creep speed.
+    stated : bool
+        True if the caller gave the limit, False for the default creep speed of `priors.toml`.
     """
 
     value: float
@@ -78,13 +84,20 @@ class RepairLimit:
 
 @dataclass(frozen=True)
 class Severity:
-    """Severity of a leak: figures with their 95 % intervals, (value, low, high), or None if not known.
+    """Severity of a leak, as far as it is known.
 
-    - `mL_per_min`: mean flow while the leak is open [mL/min].
-    - `pump_share`: this flow as a fraction of the pump's mean flow.
-    - `creep_mm_per_min`: speed at which the piston would creep with its lines shut under the same pressure difference
-      [mm/min].
-    - `of_limit`: the leak divided by the repair limit.
+    Attributes
+    ----------
+    mL_per_min : tuple of float, or None
+        Mean flow while the leak is open [mL/min].
+    pump_share : tuple of float, or None
+        This flow as a fraction of the pump's mean flow.
+    creep_mm_per_min : tuple of float, or None
+        Speed at which the piston would creep with its lines shut under the same pressure difference [mm/min].
+    of_limit : tuple of float, or None
+        The leak divided by the repair limit.
+
+    Each figure is a tuple of value and 95 % interval (value, low, high), or None if it is not known.
     """
 
     mL_per_min: _Figure

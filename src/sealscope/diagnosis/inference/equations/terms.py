@@ -36,15 +36,23 @@ Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "p
 class Term(NamedTuple):
     """A term of a volume balance: an unknown coefficient times a function of recorded channels.
 
-    - `name`: name of the term, for example "compliance A"; `unit`: unit of the coefficient, m^3 over that of the
-      increments;
-    - `increments`: computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,);
-    - `cause`: cause of a sudden change of the coefficient, for example "external leak";
-    - `drift`: kind of the coefficient, with its priors in `priors.toml`; "" if the coefficient is zero unless `cause`
-      is present;
-    - `needs`: channels from which the increments are computed;
-    - `driver`: "pressure" or "root" if the flow is driven by a pressure or its square root, so that an offset of a
-      pressure sensor changes the increments; "" if such an offset is neglected.
+    Parameters
+    ----------
+    name : str
+        Name of the term, for example "compliance A".
+    unit : str
+        Unit of the coefficient, m^3 over that of the increments.
+    increments : callable
+        Computes the increments f dg from `Signals` over each sampling interval, shape (n - 1,).
+    cause : str
+        Cause of a sudden change of the coefficient, for example "external leak".
+    drift : str
+        Kind of the coefficient, with its priors in `priors.toml`; "" if it is zero unless `cause` is present.
+    needs : tuple of str
+        Channels from which the increments are computed.
+    driver : {"", "pressure", "root"}
+        Pressure or square root of a pressure that drives the flow, so that an offset of a pressure sensor changes the
+        increments; "" if such an offset is neglected.
     """
 
     name: str
@@ -69,15 +77,25 @@ class Term(NamedTuple):
 class Equation(NamedTuple):
     """A volume balance of a machine: its left side equals the sum of its terms.
 
-    - `left`: computes the increments of the left side [m^3] from `Signals`, shape (n - 1,);
-    - `terms`: those of the leak are the last two;
-    - `healthy`: standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown;
-    - `by_command`: true if no channel gives the pump's flow, and a speed is computed from the command u
-      (`balance.derive_drive_signals`);
-    - `flow_sign`: 1 if a flow into A is positive on the left side, -1 if it is negative;
-    - `area_ratio`: area of the piston on side B over that on side A; 1 in a balance of one chamber;
-    - `fed_outward`: chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed
-      circuit.
+    Parameters
+    ----------
+    name : str
+        Name of the balance, for example "cylinder".
+    left : callable
+        Computes the increments of the left side [m^3] from `Signals`, shape (n - 1,).
+    terms : tuple of Term
+        The terms; those of the leak are the last two.
+    healthy : float
+        Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
+    by_command : bool
+        True if no channel gives the pump's flow. A speed is then computed from the command u
+        (`balance.derive_drive_signals`).
+    flow_sign : float
+        1 if a flow into A is positive on the left side, -1 if it is negative.
+    area_ratio : float
+        Area of the piston on side B over that on side A; 1 in a balance of one chamber.
+    fed_outward : {"", "A", "B"}
+        Chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed circuit.
     """
 
     name: str
