@@ -47,6 +47,8 @@ THROTTLED = ("--set", "orifices=present", "--set", "closed_A=50 %", "--set", "cl
         (("--method", "euler"), "method, 'euler'"),
         (("--method", "imex"), "imex, throttles"),
         (("--start-position", "2"), "x_0, 2.0"),
+        (("--fmu", "eha.fmu", "--map", " p_A = a", "--map", "p_A=b"), "--map, p_A, a, b"),
+        (("--fmu", "eha.fmu", "--map", "p_A= "), "--map, p_A="),
         (("-o", "nowhere/run.nc"), "folder, nowhere, nowhere/run.nc"),
         (("-o", "run.xls"), ".nc"),
         (("--truth", "nowhere/truth.json"), "folder, nowhere"),

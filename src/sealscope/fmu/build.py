@@ -178,15 +178,18 @@ class MockUp(NamedTuple):
         target = ["-target", platform.target] if compiler.cross_compiles else []
         flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
         command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
-        name = " ".join(compiler.command)
+        rule = f"the C compiler ({' '.join(compiler.command)}) must build the unit for {system}"
         try:
-            process = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+            process = subprocess.run(
+                command, capture_output=True, encoding="utf-8", errors="replace", timeout=_COMPILE_TIMEOUT, check=False
+            )
         except subprocess.TimeoutExpired:
-            rule = f"the C compiler ({name}) must build the unit for {system} within {_COMPILE_TIMEOUT:g} s"
-            raise InputError(f"{rule}, got none by then") from None
-        if process.returncode:
-            messages = process.stderr[-500:]
-            raise InputError(f"the C compiler ({name}) could not build the unit for {system}: {messages}")
+            raise InputError(f"{rule} within {_COMPILE_TIMEOUT:g} s, got none by then") from None
+        except OSError as error:
+            raise InputError(f"{rule}, got {error.strerror or error}") from None
+        if process.returncode or not output.is_file():
+            messages = " ".join(process.stderr[-500:].split())
+            raise InputError(f"{rule}, got {messages or f'none, and status {process.returncode}'}")
         return output.read_bytes()
 
 
