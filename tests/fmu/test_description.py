@@ -62,6 +62,7 @@ def test_references_and_names_are_unique_and_outputs_are_listed(version, tag):
         ({"platforms": ["amiga"]}, "platform, 'amiga'"),
         ({"platforms": ["macos-arm"]}, "platform, 'macos-arm'"),
         ({"step": 0.0}, "step, 0.0"),
+        ({"step": float("inf")}, "step, inf"),
         (
             {"rig": "servo-valve"},
             "unit, servo-valve",

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from typer import Argument, Context, Exit, Option, echo
 
 from sealscope.cli import options as opt
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError, UnreadableFile, printable
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -273,7 +273,7 @@ def report(
         write = partial(write_report, recording, page, diagnosis, rig=stated.rig, title=name)
         if opt.attempt(page, write) is not None:
             written_pages.append((page, diagnosis))
-            opt.say(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+            opt.say(printable(f"{diagnosis.file}: {diagnosis.verdict} -> {page}"))
     if has_folder and written_pages:
         write_index(output / "index.html", written_pages)
     if len(written_pages) < n_results:
@@ -380,6 +380,8 @@ def convert(
         return
     check_target(target)
     opt.check_folder(target)
+    if target.resolve() == source.resolve():
+        raise InputError(f"a converted recording must not replace its source, got {target}")
     recording = stated.read(source)
     write(recording, target)
     channels = ", ".join(recording.channels)

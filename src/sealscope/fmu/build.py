@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import shutil
@@ -247,7 +248,7 @@ def write_fmu(
     if step is None:
         step, found_error = choose_step(machine, error)
         accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {found_error:.2g} Pa rms"
-    elif step > 0:
+    elif 0 < step < math.inf:
         accuracy = f"steps of at most {step:.3g} s"
     else:
         raise InputError(f"step must be > 0 s, got {step}")
@@ -323,7 +324,7 @@ def write_sensor_fmu(
     chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
-    if not rate >= MIN_STRIDE / STRIDE:
+    if not MIN_STRIDE / STRIDE <= rate < math.inf:
         raise InputError(f"rate of a soft sensor must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
     machine = _load_pump_controlled_rig(rig)
     choice = sensor_unit.SensorChoice.from_rig(machine, float(rate))
