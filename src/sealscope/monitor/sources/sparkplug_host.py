@@ -304,7 +304,7 @@ def _is_number(value: object) -> bool:
 
 
 def _store_slow_values(group: dict[str, spb.SparkplugMetric], birth: _Birth) -> None:
-    """Store the last value of each slow channel's array in `birth`; remove arrays that are not as long as the samples.
+    """Store the last value of each slow channel's array in `birth`; remove arrays longer or shorter than the samples.
 
     `group`: metrics with the same timestamp, by channel. Raises RefusedMessage if a slow channel's array is empty.
     """
