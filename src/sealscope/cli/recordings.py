@@ -236,7 +236,7 @@ def report(
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.reporting.index import write_index
     from sealscope.reporting.page import report as write_report
-    from sealscope.reporting.template import parse_page_path
+    from sealscope.reporting.template import PAGE_SUFFIXES, parse_page_path
     from sealscope.storage.folders import make_folder
 
     check_probability(false_alarm)
@@ -246,6 +246,8 @@ def report(
         _report_machine(files, stated, output, false_alarm)
         return
     has_folder = (len(files) > 1 and not join) or output.is_dir()
+    if has_folder and not output.is_dir() and output.suffix.lower() in PAGE_SUFFIXES:
+        raise InputError(f"several pages need a folder, got the name of a page, {output}")
     input_files = {path.resolve() for path in (*files, *stated.baseline)}
     pages: dict[Path, Path] = {}
     for file in files[:1] if join else files:  # joined files have one page
