@@ -118,6 +118,7 @@ def test_an_incomplete_campaign_says_so(call, tiny, finished_tiny):
         (("campaign", "run", "rotary-seal", "--batch"), "--batch"),
         (("campaign", "run", "rotary-seal"), "--data"),
         (("campaign", "run", "rotary-seal", "--data", "nowhere"), "--data"),
+        (("campaign", "run", "rotary-seal", "--data", ".", "-o", "."), "--output, --data"),
     ],
 )
 def test_wrong_calls_are_one_line(call, tiny, tmp_path, monkeypatch, words, names):

@@ -85,6 +85,16 @@ def test_a_recording_is_added_and_the_old_file_kept(call, file, tmp_path):
     assert "which exists" in call("commission", new, "-o", file).refused()
 
 
+def test_what_is_added_after_a_repair_must_have_a_date(call, file, tmp_path):
+    """Recordings before it are forgotten, and so are those of which nobody knows."""
+    dated, undated = tmp_path / "run_2026-05-01.nc", tmp_path / "new.nc"
+    ss.write(record_press(5), dated)
+    ss.write(record_press(6), undated)
+    refused = call("commission", dated, undated, "-o", file, "--add", "--since", "2026-04-01").refused()
+    assert "must have a date, got none of new.nc" in refused
+    assert "1 healthy" in call("commission", dated, "-o", file, "--add", "--since", "2026-04-01").out
+
+
 def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rig", "thesis").refused()
     assert "--rig cannot be combined with --machine" in refused

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.monitor.database.store import MonitorStore
 
 from ..diagnosis.balance_machine import machine, step
 from ..monitor.plant import write_files
@@ -70,6 +71,10 @@ def test_a_dashboard_and_labelled_data_are_written(call, tmp_path):
     assert json.loads((tmp_path / "grafana.json").read_text())["panels"]
     settings = tmp_path / "monitor.toml"
     call("monitor", "init", "-o", settings)
-    done = call("monitor", "export", settings, "-o", tmp_path / "labels")
+    words = ("monitor", "export", settings, "-o", tmp_path / "labels")
+    assert f"database must exist, got none ({tmp_path / 'monitor.db'})" in call(*words).refused()
+    assert not (tmp_path / "monitor.db").exists()
+    MonitorStore(str(tmp_path / "monitor.db"))
+    done = call(*words)
     assert (done.status, done.out) == (0, f"{tmp_path / 'labels'}: 0 alarms, 0 estimates\n")
     assert (tmp_path / "labels" / "estimates.csv").read_text().startswith("actuator,t,status")

@@ -490,6 +490,12 @@ def test_a_recording_that_states_nothing_is_left_out() -> None:
     assert any("still.csv" in finding.text for finding in trend.findings)
 
 
+def test_a_level_that_overflows_is_none() -> None:
+    run = ss.simulate(duration="15 s", rate=100.0, seed=1)
+    reading = estimate_reading(replace(run, channels={**run.channels, "x": 1e200 * run["x"]}))
+    assert (reading.basis, reading.problem) == (None, "the volume balance states no finite level")
+
+
 def test_without_a_stated_machine_levels_are_relative_and_a_creep_is_still_a_limit() -> None:
     days = [replace(own, states_flow=False) for own in life(30, wears=0.01, since=10.0)]
     trend = trend_of(days, healthy=5)

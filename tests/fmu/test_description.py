@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from xml.etree import ElementTree
 
@@ -61,6 +62,7 @@ def test_references_and_names_are_unique_and_outputs_are_listed(version, tag):
         ({"platforms": ["amiga"]}, "platform, 'amiga'"),
         ({"platforms": ["macos-arm"]}, "platform, 'macos-arm'"),
         ({"step": 0.0}, "step, 0.0"),
+        ({"step": float("inf")}, "step, inf"),
         (
             {"rig": "servo-valve"},
             "unit, servo-valve",
@@ -80,3 +82,26 @@ def test_without_a_compiler_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with refusal("sealscope[fmu]"):
         build.find_compiler()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="the compilers are scripts of a shell")
+@pytest.mark.parametrize(
+    ("script", "names"),
+    [
+        ("#!/bin/sh\nexec sleep 60\n", "within 0.2 s"),
+        ("no program", "Exec format error"),
+        ("#!/bin/sh\nexit 0\n", "status 0"),
+        ("#!/bin/sh\nprintf 'one\\ntwo \\377' >&2; exit 1\n", "one two"),
+    ],
+)
+def test_a_compiler_that_builds_nothing_is_one_line(tmp_path, monkeypatch, script, names):
+    compiler = tmp_path / "cc"
+    compiler.write_text(script)
+    compiler.chmod(0o755)
+    monkeypatch.setattr(build, "find_compiler", lambda: build.Compiler([str(compiler)], cross_compiles=False))
+    monkeypatch.setattr(build, "fmi_headers", lambda: tmp_path)
+    monkeypatch.setattr(build, "_COMPILE_TIMEOUT", 0.2 if "sleep" in script else 60.0)
+    unit = build.MockUp("words", {}, (), (), n_inputs=1, n_results=1, n_states=1, step=1e-3, failures={})
+    with refusal("C compiler", compiler, "linux", names):
+        unit.write(tmp_path / "eha.fmu", 2, ["linux"])
+    assert list(tmp_path.iterdir()) == [compiler]

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import tracemalloc
 import warnings
+from codecs import BOM_UTF8
 from collections import Counter
 from dataclasses import replace
+from threading import Event
+from types import SimpleNamespace
 
 import cbor2
 import numpy as np
@@ -19,6 +23,7 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import _Actuator
 from sealscope.monitor.alarms import AlarmJudge
 from sealscope.monitor.settings import ActuatorSettings
+from sealscope.monitor.sources.lines import line_source
 from sealscope.monitor.sources.source_block import SourceBlock, decode_message
 from sealscope.recordings.recording import Recording
 
@@ -42,6 +47,8 @@ ODD = (
     b'{"t": 0, "rate": 50, "x": [], "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": {"0": 1}, "actuator": "a"}',
     b'{"t": 0, "rate": 50, "x": ["1e5"], "actuator": ["a"]}',
+    b'{"t": 0, "rate": 50, "x": ["1e5"], "actuator": "a"}',
+    b'{"t": 0, "rate": 50, "x": [2.0, true], "actuator": "a"}',
     b'{"t": true, "rate": 50, "x": [1], "actuator": "a"}',
     b"\x9b\xff\xff\xff\xff\xff\xff\xff\xff",  # CBOR: an array of 2^64 - 1
     b"\x5b\x7f\xff\xff\xff\xff\xff\xff\xff",  # CBOR: 2^63 - 1 bytes
@@ -70,6 +77,14 @@ def taken(payload: bytes) -> str:
 def test_an_odd_message_is_refused_in_one_line(payload: bytes):
     # samples at 1e308 Hz are a block, which the stream counts and drops
     assert taken(payload) == ("block" if b"1e308" in payload else "refused")
+
+
+def test_lines_may_begin_with_the_mark_of_utf_8():
+    taken_in: list[object] = []
+    receiver = SimpleNamespace(settings=SimpleNamespace(actuator=[]), stopping=Event(), submit=taken_in.append)
+    line_source(io.BytesIO(BOM_UTF8 + TEXTS[0]))(receiver)
+    (block,) = taken_in
+    assert isinstance(block, SourceBlock)
 
 
 @pytest.mark.parametrize(("tag", "kind"), [(81, ">f4"), (82, ">f8"), (85, "<f4"), (86, "<f8")])

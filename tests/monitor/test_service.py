@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 import sqlite3
 import threading
@@ -325,6 +326,12 @@ def test_a_fleet_shares_its_budget_and_keeps_its_baselines(tmp_path):
     assert again.actuators.summaries() == shown
     assert [alarm["state"] for alarm in again.store.alarms(open_only=True)] == ["new"]
     assert again.actuators.apply_mark("press 1", "valid").state == "valid"
+
+
+def test_all_may_be_kept(tmp_path):
+    settings = settings_in(tmp_path).model_copy(update={"keep_days": math.inf})
+    service, _ = served(settings, b"".join(LINES.splitlines(keepends=True)[:20]))
+    assert len(rows_of(service.settings.database)["estimates"]) > 0
 
 
 @pytest.mark.slow

@@ -295,6 +295,24 @@ def test_single_samples_by_exception_keep_what_did_not_change():
     assert plant.send("DDATA", SparkplugMetric("p_B", 9.0, 10), at=1060).samples["p_A"].tolist() == [7.0]
 
 
+def test_arrays_of_a_slow_channel_are_no_samples():
+    plant = Plant()
+    plant.born(*births())
+
+    def sent(*values: float, at: int, size: int = 3) -> Any:
+        x = [SparkplugMetric("x", np.ones(size), DOUBLES, timestamp=1000)] if size else []
+        oil = [SparkplugMetric("T_oil", np.array(values), DOUBLES, timestamp=at, unit="K")] if values else []
+        block = plant.send("DDATA", *x, *oil)
+        return block and (len(block.samples), block.samples["T_oil"].tolist())
+
+    assert sent(20.0, 21.0, 22.0, at=1000) == (3, [20.0, 21.0, 22.0])
+    assert sent(at=1000) == (3, [22.0] * 3)  # the last value holds
+    assert sent(23.0, at=1000) == (3, [23.0] * 3)
+    assert sent(24.0, 25.0, at=1000, size=0) is None
+    assert sent(at=1000) == (3, [25.0] * 3)
+    assert sent(26.0, 27.0, at=990) == (3, [27.0] * 3)
+
+
 def test_a_node_may_be_the_actuator_itself():
     plant = Plant(device=None)
     number = SparkplugMetric("bdSeq", 1, sparkplug.INT64)
@@ -343,10 +361,13 @@ X1 = SparkplugMetric("x", 1.0, 10, timestamp=1)
         ([SparkplugMetric("x", np.ones(0), DOUBLES, timestamp=1)], NO_SAMPLES),
         ([X3, SparkplugMetric("p_A", "a", 12, timestamp=1)], NO_SAMPLES),
         ([SparkplugMetric("x", "1, 2", 12, timestamp=1)], NO_SAMPLES),
+        ([SparkplugMetric("x", True, sparkplug.BOOLEAN, timestamp=1)], NO_SAMPLES),
+        ([X3, SparkplugMetric("T_oil", np.ones(0), DOUBLES, timestamp=1)], NO_SAMPLES),
         ([SparkplugMetric("x", 1.0, 10, timestamp=1, unit="bar")], WRONG_UNITS),
         ([SparkplugMetric("x", np.ones(3), DOUBLES, timestamp=1, unit="bar")], WRONG_UNITS),
         ([SparkplugMetric("rate", -1.0, 10), X1], NO_CLOCK),
         ([SparkplugMetric("rate", "a", 12), X1], NO_CLOCK),
+        ([SparkplugMetric("rate", True, sparkplug.BOOLEAN), X1], NO_CLOCK),
     ],
 )
 def test_data_without_sound_samples_are_refused(metrics, reason):

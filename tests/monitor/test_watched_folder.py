@@ -312,6 +312,20 @@ def test_a_file_without_a_date_ends_at_its_last_change(commissioned, tmp_path, m
     assert first == pytest.approx(APRIL - 19.99, abs=0.05)
 
 
+def test_long_names_that_differ_at_their_end_are_files_of_their_own(commissioned, tmp_path, monkeypatch):
+    """Of one size and unpacked in one second; bytes that are no text make a name longer still."""
+    monkeypatch.setattr(folder_module, "judge_recording", lambda *_, **__: verdict("no leak"))
+    folder, healthy = folder_of(tmp_path, commissioned), machine(4, rate=100.0, duration=20.0)
+    for day in (1, 2):
+        path = log(
+            tmp_path / f"incoming/{os.fsdecode(b'press_' + 20 * bytes([228]))}{'e' * 40}_2026-04-0{day}.csv", healthy
+        )
+        os.utime(path, times=(0.0, APRIL))
+    identities = [block.identity for block in folder.blocks()]
+    assert len(set(identities)) == 2
+    assert max(map(len, identities)) <= 120
+
+
 def test_after_a_restart_older_recordings_are_refused(commissioned, tmp_path):
     settings, healthy = watching(tmp_path, commissioned), machine(4, rate=100.0, duration=40.0)
     log(tmp_path / "incoming/run_2026-04-03_0600.csv", healthy)

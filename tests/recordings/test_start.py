@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,18 @@ def test_start_of_a_recording(name: str, start: str | None, stamp: str | None) -
     else:
         assert result == np.datetime64(stamp, "ms").astype(np.int64) / 1e3
         assert start_seconds(named(name, 2.0, start)) == result + 2.0
+
+
+def test_a_first_sample_without_a_time_is_dated_by_the_next() -> None:
+    recording = named("20260701_140509.csv", 2.0)
+    for n_unknown, first in ((3, 2.0), (10, 0.0)):
+        t = np.where(np.arange(10) < n_unknown, np.nan, recording.t)
+        expected = start_seconds(named("20260701_140509.csv", first))
+        assert start_seconds(replace(recording, t=t)) == pytest.approx(expected, abs=1e-6)
+
+
+def test_counts_of_another_unit_are_no_date() -> None:
+    assert start_seconds(named("20260701_140509.csv", 1.3e17)) is None
 
 
 def test_a_log_in_seconds_since_1970_starts_then_whatever_its_name_says(tmp_path: Path) -> None:

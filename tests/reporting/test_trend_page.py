@@ -59,6 +59,9 @@ def test_relative_levels_name_the_recordings_they_are_relative_to() -> None:
         mean = np.mean([point.value for point in trend.points[:healthy]])
         assert mean == pytest.approx(100.0)
         assert reference in figures(trend)["healthy"]
+    trend = trend_of([replace(day, level=-day.level) for day in days])  # errors may exceed the leakage
+    assert trend.points[0].value == pytest.approx(-100.0)
+    assert "% of the size of the first;" in figures(trend)["healthy"]
 
 
 @pytest.mark.parametrize("left_out", [0, 10])

@@ -186,6 +186,17 @@ def test_what_is_no_file_is_not_opened(tmp_path: Path) -> None:
         open_inner(tmp_path / "link", "a plan")
 
 
+def test_what_is_no_file_is_not_replaced(tmp_path: Path) -> None:
+    """As /dev/null would be, by a process that may."""
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "pipe")
+    for path, kind in ((tmp_path / "pipe", "a pipe"), (tmp_path / "link", "a pipe"), (tmp_path, "a folder")):
+        with refusal(kind, path), atomic_write(path):
+            pass
+    assert (tmp_path / "pipe").is_fifo()
+    assert (tmp_path / "link").is_symlink()
+
+
 def test_readers_do_not_wait_for_a_pipe(tmp_path: Path) -> None:
     from sealscope.parameters import load_rig
     from sealscope.recordings import read

@@ -157,6 +157,8 @@ def _write_report(plan: AnyPlan, folder: Path, data: Path | None) -> int:
         raise InputError("the plan needs recordings: give their folder with --data")
     elif not data.is_dir():
         raise InputError(f"--data must be the folder of recordings, got {data}")
+    elif data.resolve() == folder.resolve():  # a table might replace a recording, or be read as one
+        raise InputError(f"--output must be another folder than --data, got {folder} for both")
     else:
         with _show_progress() as progress:
             result = judge_recorded_campaign(plan, data, progress)

@@ -57,6 +57,9 @@ def commission(
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:
                 machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
+            undated = [recording.file for recording in machine.healthy if recording.start_s is None]
+            if repair_s is not None and (lost := [path.name for path in paths if path.name in undated]):
+                raise InputError(f"a recording added with --since must have a date, got none of {lost[0]}")
             return machine if repair_s is None else machine.since(repair_s)
 
         machine = update_machine(output, add_recordings)

@@ -84,7 +84,10 @@ def export(
     from sealscope.monitor.settings import read_settings
     from sealscope.storage.folders import make_folder
 
-    store = MonitorStore(read_settings(file).database)
+    database = read_settings(file).database
+    if "://" not in database and not Path(database).exists():  # it would be created, and empty
+        raise InputError(f"the monitor's database must exist, got none ({database})")
+    store = MonitorStore(database)
     make_folder(folder)
     alarms, estimates = export_labels(store, folder)
     echo(f"{folder}: {alarms} alarms, {estimates} estimates")

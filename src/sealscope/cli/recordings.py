@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from typer import Argument, Context, Exit, Option, echo
 
 from sealscope.cli import options as opt
-from sealscope.errors import InputError, UnreadableFile
+from sealscope.errors import InputError, UnreadableFile, printable
 
 if TYPE_CHECKING:
     from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -236,7 +236,7 @@ def report(
     from sealscope.diagnosis.diagnose import check_probability
     from sealscope.reporting.index import write_index
     from sealscope.reporting.page import report as write_report
-    from sealscope.reporting.template import parse_page_path
+    from sealscope.reporting.template import PAGE_SUFFIXES, parse_page_path
     from sealscope.storage.folders import make_folder
 
     check_probability(false_alarm)
@@ -246,6 +246,8 @@ def report(
         _report_machine(files, stated, output, false_alarm)
         return
     has_folder = (len(files) > 1 and not join) or output.is_dir()
+    if has_folder and not output.is_dir() and output.suffix.lower() in PAGE_SUFFIXES:
+        raise InputError(f"several pages need a folder, got the name of a page, {output}")
     input_files = {path.resolve() for path in (*files, *stated.baseline)}
     pages: dict[Path, Path] = {}
     for file in files[:1] if join else files:  # joined files have one page
@@ -273,7 +275,7 @@ def report(
         write = partial(write_report, recording, page, diagnosis, rig=stated.rig, title=name)
         if opt.attempt(page, write) is not None:
             written_pages.append((page, diagnosis))
-            opt.say(f"{diagnosis.file}: {diagnosis.verdict} -> {page}")
+            opt.say(printable(f"{diagnosis.file}: {diagnosis.verdict} -> {page}"))
     if has_folder and written_pages:
         write_index(output / "index.html", written_pages)
     if len(written_pages) < n_results:
@@ -380,6 +382,8 @@ def convert(
         return
     check_target(target)
     opt.check_folder(target)
+    if target.resolve() == source.resolve():
+        raise InputError(f"a converted recording must not replace its source, got {target}")
     recording = stated.read(source)
     write(recording, target)
     channels = ", ".join(recording.channels)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from shutil import get_terminal_size
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -56,7 +57,7 @@ def simulate(
         else:
             from sealscope.fmu.recording import record_fmu
 
-            recording = record_fmu(fmu, experiment, map=dict(map(_parse_map, maps or ())), progress=report)
+            recording = record_fmu(fmu, experiment, map=_parse_maps(maps or ()), progress=report)
             source, lines = fmu.name, []
     write(recording, output)
     if fmu is None and truth is not None:
@@ -68,12 +69,17 @@ def simulate(
         opt.say_wrapped(line)
 
 
-def _parse_map(text: str) -> tuple[str, str]:
-    """Split an option `--map CHANNEL=NAME` into channel and name; raise InputError for any other text."""
-    channel, _, name = map(str.strip, text.partition("="))
-    if not (channel and name):
-        raise InputError(f"--map must be CHANNEL=NAME, got {text}")
-    return channel, name
+def _parse_maps(options: Sequence[str]) -> dict[str, str]:
+    """Parse the options `--map CHANNEL=NAME`; raise InputError for any other text, or a channel given twice."""
+    names: dict[str, str] = {}
+    for text in options:
+        channel, _, name = map(str.strip, text.partition("="))
+        if not (channel and name):
+            raise InputError(f"--map must be CHANNEL=NAME, got {text}")
+        if channel in names:
+            raise InputError(f"--map {channel} must be given once, got {names[channel]} and {name}")
+        names[channel] = name
+    return names
 
 
 def parameters(

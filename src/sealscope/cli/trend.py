@@ -53,9 +53,9 @@ def trend(
     from sealscope.units import parse_quantity
 
     spacing = None if every is None else parse_quantity(every, "s", name="--every")
-    if output is not None:
-        _check_output(output, files)
     paths = recordings_in(files)
+    if output is not None:
+        _check_output(output, paths)
     readings: list[LeakReading] = []
     n_undated = 0
     name = "" if stated.commissioned is None else stated.commissioned.name

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import os
 import re
 import shutil
@@ -178,15 +179,18 @@ class MockUp(NamedTuple):
         target = ["-target", platform.target] if compiler.cross_compiles else []
         flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
         command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
-        name = " ".join(compiler.command)
+        rule = f"the C compiler ({' '.join(compiler.command)}) must build the unit for {system}"
         try:
-            process = subprocess.run(command, capture_output=True, text=True, timeout=_COMPILE_TIMEOUT, check=False)
+            process = subprocess.run(
+                command, capture_output=True, encoding="utf-8", errors="replace", timeout=_COMPILE_TIMEOUT, check=False
+            )
         except subprocess.TimeoutExpired:
-            rule = f"the C compiler ({name}) must build the unit for {system} within {_COMPILE_TIMEOUT:g} s"
-            raise InputError(f"{rule}, got none by then") from None
-        if process.returncode:
-            messages = process.stderr[-500:]
-            raise InputError(f"the C compiler ({name}) could not build the unit for {system}: {messages}")
+            raise InputError(f"{rule} within {_COMPILE_TIMEOUT:g} s, got none by then") from None
+        except OSError as error:
+            raise InputError(f"{rule}, got {error.strerror or error}") from None
+        if process.returncode or not output.is_file():
+            messages = " ".join(process.stderr[-500:].split())
+            raise InputError(f"{rule}, got {messages or f'none, and status {process.returncode}'}")
         return output.read_bytes()
 
 
@@ -244,7 +248,7 @@ def write_fmu(
     if step is None:
         step, found_error = choose_step(machine, error)
         accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {found_error:.2g} Pa rms"
-    elif step > 0:
+    elif 0 < step < math.inf:
         accuracy = f"steps of at most {step:.3g} s"
     else:
         raise InputError(f"step must be > 0 s, got {step}")
@@ -320,7 +324,7 @@ def write_sensor_fmu(
     chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
-    if not rate >= MIN_STRIDE / STRIDE:
+    if not MIN_STRIDE / STRIDE <= rate < math.inf:
         raise InputError(f"rate of a soft sensor must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
     machine = _load_pump_controlled_rig(rig)
     choice = sensor_unit.SensorChoice.from_rig(machine, float(rate))

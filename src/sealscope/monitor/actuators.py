@@ -432,7 +432,7 @@ class WatchedActuators:
         self._add_summary(actuator, rows)
         n_kept_estimates = self._keep_s / actuator.watch.block_seconds
         rows.old[tables.blocks][settings.name] = actuator.n_stored - MAX_IDENTITIES
-        rows.old[tables.estimates][settings.name] = math.floor(actuator.watch.blocks - n_kept_estimates)
+        rows.old[tables.estimates][settings.name] = math.floor(max(0.0, actuator.watch.blocks - n_kept_estimates))
         actuator.bytes = 0
 
     @staticmethod

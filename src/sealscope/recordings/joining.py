@@ -17,6 +17,7 @@ from sealscope.recordings.formats.timebase import counts_from_1970, parse_epoch
 from sealscope.recordings.recording import Recording
 
 _SAME_START = 1e-6  # starts that differ by less [s] are equal: the times then continue from file to file
+_MAX_SECONDS = 1e11  # start [s] beyond which times are in another unit than s: it would be in the year 5138
 _YEAR_FIRST = re.compile(
     r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
     r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"
@@ -39,7 +40,11 @@ def start_seconds(recording: Recording, file: str = "") -> float | None:
     start = _time_zero(recording)
     if start is None:
         start = _parse_file_name(str(recording.provenance.get("file") or file))
-    return None if start is None else start + (float(recording.t[0]) if len(recording) else 0.0)
+    if start is None:
+        return None
+    known = np.flatnonzero(np.isfinite(recording.t))  # samples with a time, which the first may lack
+    first = float(recording.t[known[0]]) - int(known[0]) / recording.rate if known.size else 0.0
+    return start + first if abs(start + first) < _MAX_SECONDS else None
 
 
 def file_seconds(recording: Recording, path: Path) -> float:

@@ -441,7 +441,7 @@ def table_line(diagnosis: Diagnosis, start_s: float | None = None) -> str:
     For a plain `no leak`, there is nothing to do. `start_s` [s since 1970]: start of the recording, None for a blank
     date.
     """
-    file = PurePath(diagnosis.file).name
+    file = printable(PurePath(diagnosis.file).name)
     date = "" if start_s is None else datetime.fromtimestamp(start_s, UTC).date().isoformat()
     file = file if len(file) <= _FILE_COLUMNS else f"{file}\n{' ' * _FILE_COLUMNS}"
     line = f"{file:<{_FILE_COLUMNS}} {date:<10} {diagnosis.verdict:<11} {format_leak_flow(diagnosis)}"

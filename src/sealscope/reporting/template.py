@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _PACKAGE = "sealscope.reporting"
 #: Invisible characters that a terminal or browser interprets: control codes, and changes of the writing direction.
 _CONTROL_CHARACTERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
-_SUFFIXES = (".html", ".htm", ".pdf", ".png")
+PAGE_SUFFIXES = (".html", ".htm", ".pdf", ".png")
 
 
 @cache
@@ -76,7 +76,7 @@ def _script_hash(code: str) -> Markup:
 
 def parse_page_path(path: str | os.PathLike[str], *, card: bool = True) -> Path:
     """Check that a path ends in .html, .htm or .pdf, or in .png if `card`; return it as a Path, or raise InputError."""
-    suffixes = _SUFFIXES if card else _SUFFIXES[:-1]  # the last one is .png
+    suffixes = PAGE_SUFFIXES if card else PAGE_SUFFIXES[:-1]  # the last one is .png
     if Path(path).suffix.lower() not in suffixes:
         raise InputError(f"a page's name must end in {', '.join(suffixes)}, got {os.fspath(path)}")
     return Path(path)

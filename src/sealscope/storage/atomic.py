@@ -13,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from sealscope.errors import InputError
+from sealscope.storage.opening import find_wrong_kind
 
 #: Bytes to which the file's name is cut in the name of its temporary file, as file systems limit names to 255 bytes.
 _MAX_NAME = 60
@@ -51,8 +52,8 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     target = Path(path)
     try:
         check_folder(target)
-        if target.is_dir():
-            raise InputError(f"a file to write must not be a folder, got {target}")
+        if target.exists() and (kind := find_wrong_kind(target.stat().st_mode)) is not None:
+            raise InputError(f"a file to write must not be {kind}, got {target}")
         # the name tells `remove_temporaries` which process of which computer fills the file
         prefix = f".{_cut_name(target.name)}.{_computer_hash()}-{os.getpid()}."
         handle, name = tempfile.mkstemp(prefix=prefix, suffix=".part", dir=target.parent)

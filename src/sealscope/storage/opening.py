@@ -23,6 +23,11 @@ _KINDS = (
 )  # fmt: skip
 
 
+def find_wrong_kind(mode: int) -> str | None:
+    """Name the kind of a file that is not regular, such as "a pipe", from its `st_mode`; return None for others."""
+    return next((name for is_kind, name in _KINDS if is_kind(mode)), None)
+
+
 def is_file_path(text: str | os.PathLike[str]) -> bool:
     """Return True if a text is the path of an existing file; False also for a text that cannot be a path."""
     return os.path.isfile(text)  # noqa: PTH113 - pathlib raises for texts that cannot be paths until Python 3.14
@@ -66,7 +71,7 @@ def _open_checked(path: str | os.PathLike[str], what: str, mode: Literal["rb", "
     except IsADirectoryError:
         raise InputError(f"{what} must be a file, got a folder ({path})") from None
     status = os.fstat(descriptor)
-    wrong_kind = next((name for is_kind, name in _KINDS if is_kind(status.st_mode)), None)
+    wrong_kind = find_wrong_kind(status.st_mode)
     if wrong_kind is None and mode != "rb" and status.st_nlink > 1:
         wrong_kind = f"one of {status.st_nlink} hard links"
     if wrong_kind is not None:

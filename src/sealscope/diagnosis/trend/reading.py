@@ -100,7 +100,10 @@ def estimate_reading(
     if reading.problem:
         return reading
     with np.errstate(all="ignore"):  # numbers of impossible readings may overflow
-        return replace(reading, **_estimate_level(part, used_rig, machine))
+        reading = replace(reading, **_estimate_level(part, used_rig, machine))
+    if reading.basis is not None and not np.isfinite([reading.level, reading.error]).all():
+        return replace(reading, basis=None, problem=f"the {reading.basis} states no finite level")
+    return reading
 
 
 def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from sealscope.monitor.sources.source_block import (
     BlockReceiver,
     RefusedMessage,
     SourceBlock,
+    compute_digest,
     count_bytes,
 )
 from sealscope.monitor.supervisor import DATABASE, PartAway, SupervisedPart, describe_error
@@ -46,6 +47,8 @@ _PATIENCE_FACTOR = 6.0
 _AHEAD_S = 60.0
 #: Recordings read to find their order are kept up to this many bytes.
 _READ_AHEAD_BYTES = 64_000_000
+#: Letters of a file's name in the identity of its block, at most; the database limits the identity to 120.
+_MAX_NAME = 60
 #: Gap between recordings of one day that state no time of day [s].
 _GAP_S = 1.0
 #: A recording and "", or None and the reason why its file cannot be read.
@@ -235,7 +238,7 @@ class WatchedFolder:
             except (OSError, RuntimeError):  # deleted meanwhile, or a loop of links
                 continue
             if S_ISREG(status.st_mode):
-                identity = f"{escape_text(path.name[:60])} {status.st_size} {status.st_mtime_ns}"
+                identity = f"{_shorten_name(path.name)} {status.st_size} {status.st_mtime_ns}"
                 yield _FoundFile(status.st_mtime, path, identity)
 
 
@@ -266,6 +269,12 @@ def watch_folders(service: BlockReceiver, *, once: bool) -> None:
         if once and (all(succeeded) or part(DATABASE).since is None):
             return
         service.stopping.wait(_LOOK_S)
+
+
+def _shorten_name(name: str) -> str:
+    """Escape a file's name, and replace the end of a long one by its hash: other names may differ only there."""
+    text = escape_text(name)
+    return text if len(text) <= _MAX_NAME else f"{text[:28]}{compute_digest(text.encode())}"
 
 
 def _is_midnight_before(start: float, t: float) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from collections.abc import Callable
 from typing import BinaryIO
 
@@ -26,7 +27,7 @@ def line_source(stream: BinaryIO) -> Callable[[BlockReceiver], None]:
                 while line and not line.endswith(b"\n"):  # skip the rest of the line
                     line = stream.readline(MAX_MESSAGE_BYTES)
                 service.submit(refusal)
-            elif line := line.strip():
+            elif line := line.removeprefix(BOM_UTF8).strip():  # some shells begin a stream with the mark
                 try:
                     service.submit(decode_message(line, units_of=units_of))
                 except RefusedMessage as error:

@@ -42,6 +42,8 @@ if TYPE_CHECKING:
 MAX_MESSAGE_BYTES = 16_000_000
 #: NumPy data types of arrays of numbers, by their CBOR tag.
 _ARRAY_DTYPES = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True))
+#: Types of the samples in a list, of which None is a missing one; texts and bool would become numbers, too.
+_SAMPLE_TYPES = {int, float, type(None)}
 #: Number of leading bytes of a refused message that are stored.
 _N_KEPT_BYTES = 4000
 _KNOWN_NAMES = {"actuator", "t", "rate", "units", "id", *CHANNELS}
@@ -273,7 +275,7 @@ def _parse_channel(values: Any, name: str, units: Mapping[str, Any]) -> np.ndarr
     try:
         if dtype is not None:
             values = np.frombuffer(values.value, dtype=dtype)
-        elif not isinstance(values, (list, tuple)):
+        elif not isinstance(values, (list, tuple)) or not {*map(type, values)} <= _SAMPLE_TYPES:
             raise TypeError
         array = np.array(values, dtype=np.float64)  # None becomes NaN
         if array.ndim != 1 or np.isinf(array).any():

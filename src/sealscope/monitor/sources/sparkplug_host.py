@@ -101,7 +101,7 @@ class _Birth:
         """Find the sampling rate [Hz] in the settings, else in the birth; raise RefusedMessage if it is not > 0."""
         metric = self.metrics.get(self.names.get(_RATE))  # None if the birth has no rate
         rate = actuator.rate or (math.nan if metric is None else metric.value)
-        if isinstance(rate, bool) or not isinstance(rate, (int, float)) or not 0.0 < rate < math.inf:
+        if not _is_number(rate) or not 0.0 < rate < math.inf:
             rule = f"{actuator.name} must have a rate > 0 Hz, in its settings or as the metric {_RATE!r}"
             raise RefusedMessage(blocks.NO_CLOCK, f"{rule}, got {str(rate)[:40]}")
         return float(rate)
@@ -239,9 +239,9 @@ class SparkplugHost:
         """Build a recording in SI units from the samples in a message's metrics; return None if there are none.
 
         `metrics`: metrics of channels or of the sampling rate, with names; `sent_ms` [ms since 1970]: time of sending,
-        used for metrics without a time. A single value of a slow channel, such as the oil temperature, is not a sample:
-        the `birth` of the actuator stores it, and all recordings repeat it until the next value. Raises RefusedMessage
-        if the samples cannot be used.
+        used for metrics without a time. The value of a slow channel, such as the oil temperature, is not a sample: the
+        `birth` of the actuator stores it, and all recordings repeat it until the next value. Only an array with the
+        time and length of the samples has one for each. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
         groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
@@ -254,6 +254,9 @@ class SparkplugHost:
             else:
                 groups[timestamp][channel_of[name]] = metric
                 birth.metrics[name] = replace(birth.metrics[name], unit=metric.unit)  # the message may state another
+        for group in groups.values():
+            _store_slow_values(group, birth)
+        groups = {timestamp: group for timestamp, group in groups.items() if group}
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []
@@ -270,7 +273,7 @@ class SparkplugHost:
                 series = [piece.get(channel, np.full(piece["t"].size, np.nan)) for piece in pieces]
                 values[channel] = np.concatenate(series)
         for name, channel in channel_of.items():
-            if channel in SLOW - values.keys() and isinstance(last := birth.metrics[name].value, (int, float)):
+            if channel in SLOW - values.keys() and _is_number(last := birth.metrics[name].value):
                 values[channel] = np.full(n_samples, float(last))
         for channel, array in values.items():
             unit = birth.metrics[birth.names[channel]].unit or actuator.units.get(channel)
@@ -295,6 +298,27 @@ class SparkplugHost:
         return np.asarray(start + np.arange(size) / rate)
 
 
+def _is_number(value: object) -> bool:
+    """Test whether the value of a metric is a number, which True and False are not."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _store_slow_values(group: dict[str, spb.SparkplugMetric], birth: _Birth) -> None:
+    """Store the last value of each slow channel's array in `birth`; remove arrays longer or shorter than the samples.
+
+    `group`: metrics with the same timestamp, by channel. Raises RefusedMessage if a slow channel's array is empty.
+    """
+    samples = [metric.value for channel, metric in group.items() if channel not in SLOW]
+    sizes = {values.size for values in samples if isinstance(values, np.ndarray)}
+    for channel in SLOW & group.keys():
+        metric = group[channel]
+        if not metric.value.size:
+            raise RefusedMessage(blocks.NO_SAMPLES, f"an array of {channel} must have a number, got none")
+        birth.metrics[metric.name] = replace(metric, value=float(metric.value[-1]))
+        if metric.value.size not in sizes:
+            del group[channel]
+
+
 def _simultaneous_samples(
     group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
 ) -> dict[str, Array]:
@@ -313,6 +337,6 @@ def _simultaneous_samples(
     birth.metrics.update({metric.name: metric for metric in group.values()})
     last_values = {channel: birth.metrics[name].value for name, channel in channel_of.items() if channel not in SLOW}
     numbers = {channel: value for channel, value in last_values.items() if not isinstance(value, np.ndarray)}
-    if not all(isinstance(value, (int, float, type(None))) for value in numbers.values()):
+    if not all(value is None or _is_number(value) for value in numbers.values()):
         raise RefusedMessage(blocks.NO_SAMPLES, "a single sample must be a number")
     return {channel: np.array([math.nan if value is None else float(value)]) for channel, value in numbers.items()}

@@ -89,7 +89,9 @@ def figures(trend: Trend) -> dict[str, str]:
     reference = ""
     if trend.unit == "%" and trend.basis != "ringing":
         healthy_mean = "the first" if trend.healthy == 1 else f"the mean of the first {trend.healthy}"
-        reference = f" of {healthy_mean}; no rig was stated"
+        healthy_levels = [trend.points[row].value or 0.0 for row in trend.rows[: trend.healthy]]
+        size = "the size of " if sum(healthy_levels) < 0.0 else ""  # errors may exceed the leakage of a tight machine
+        reference = f" of {size}{healthy_mean}; no rig was stated"
     high = healthy_end(wear)
     is_whole = high == wear.healthy.high
     remark = "95 of 100 recordings" if is_whole else "cut off at the limit; some healthy recordings lie above"
