@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.balance import flag_lowering
+from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
@@ -119,3 +120,13 @@ def test_an_actuator_that_is_damped_on_every_flight_shows_its_leak() -> None:
         chances.append(measured.step.chance)
     assert chances[0] > 0.05
     assert chances[1] < 1e-4
+
+
+def test_connected_chambers_show_the_zeros_of_their_sensors_and_a_lowered_load_none() -> None:
+    recording, lowered = flight(3), lift(0)
+    off = replace(recording, channels={**recording.channels, "p_A": recording["p_A"] + 7e5})
+    zeros = [estimate_connected_difference(record, record["omega"][1:] / RATE) for record in (recording, off)]
+    assert zeros[0] is not None and zeros[1] is not None
+    assert abs(zeros[0].value) < 3.0 * zeros[0].deviation < 1e5
+    assert zeros[1].value - zeros[0].value == pytest.approx(7e5, rel=0.05)
+    assert estimate_connected_difference(lowered, lowered["omega"][1:] / RATE) is None
