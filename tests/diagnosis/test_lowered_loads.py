@@ -1,4 +1,4 @@
-"""A lift that its pump raises and gravity lowers: past the pump, which then stands still."""
+"""A piston that moves past its pump, which stands still: a lift that gravity lowers, a damped flight actuator."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.balance import flag_lowering
+from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
+from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording
@@ -50,7 +52,7 @@ def lift(seed: int, leak: float = 0.0, load: float = 50e5) -> Recording:
 def test_only_the_piston_that_moves_while_the_pump_rests_is_lowered() -> None:
     recording = lift(0, leak=2e-12)
     pumped = DISPLACEMENT * recording["omega"][1:] / RATE
-    is_lowering = flag_lowering(pumped, np.diff(recording["x"]), RATE)
+    is_lowering = flag_lowering(pumped, Signals(recording.channels, RATE))
     phase = (recording.t % CYCLE)[1:]
     assert is_lowering[(phase > 24.5) & (phase < 29.5)].all()
     assert not is_lowering[phase < 23.5].any()  # neither the stroke up nor the sinking of the load in a hold
@@ -78,3 +80,53 @@ def test_lowering_changes_nothing_that_the_pump_shows() -> None:
     widths = [conductance.high - conductance.low for conductance in conductances]
     assert abs(conductances[1].value - conductances[0].value) < 0.5 * max(widths)
     assert widths[1] == pytest.approx(widths[0], rel=0.5)
+
+
+def flight(seed: int, leak: float = 0.0) -> Recording:
+    """Record an actuator that moves under a load, then is damped for 30 s, and a leak [m^3/(s Pa)] from 60 s on.
+
+    While it is damped, its pump rests, a valve connects the chambers, and another actuator moves the piston.
+    """
+    random = np.random.default_rng(seed)
+    t = np.arange(round(120.0 * RATE)) / RATE
+    is_damped = (t >= 40.0) & (t < 70.0)
+    fast, slow, load = (
+        sum(np.sin(2.0 * np.pi * (f * t + random.uniform())) for f in frequencies)
+        for frequencies in ((1.1, 1.7, 2.3), (0.2, 0.31, 0.47), (0.07, 0.19, 0.53))
+    )
+    x = 0.05 + np.where(is_damped, 3e-4 * fast, 5e-3 * slow)
+    v = np.gradient(x) * RATE
+    v[np.abs(np.gradient(is_damped.astype(float))) > 0.0] = 0.0
+    x = 0.05 + np.cumsum(v) / RATE
+    dp = np.where(is_damped, 2e9 * v * np.abs(v), 3e6 * load + 5e5 * np.sign(v))
+    omega = np.where(is_damped, 0.0, (AREA_A * v + (2e-13 + leak * (t >= 60.0)) * dp) / DISPLACEMENT)
+    noise = random.standard_normal((4, t.size))
+    channels = {
+        "p_A": 8e6 + 0.5 * dp + 1e4 * noise[0],
+        "p_B": 8e6 - 0.5 * dp + 1e4 * noise[1],
+        "x": x + 1e-6 * noise[2],
+        "omega": omega + 0.05 * noise[3],
+    }
+    return Recording(t, channels, CHANNEL_UNITS, RATE)
+
+
+def test_an_actuator_that_is_damped_on_every_flight_shows_its_leak() -> None:
+    """What passes a valve between the chambers, a thousand times a leak, is no drift of the leakage."""
+    rig = RIG.with_overrides({"cylinder.A_B": AREA_A})
+    chances = []
+    for leak in (0.0, 2e-13):
+        measured = VolumeBalance(rig=rig).observe(flight(2, leak)).leak
+        assert measured is not None and measured.step is not None
+        chances.append(measured.step.chance)
+    assert chances[0] > 0.05
+    assert chances[1] < 1e-4
+
+
+def test_connected_chambers_show_the_zeros_of_their_sensors_and_a_lowered_load_none() -> None:
+    recording, lowered = flight(3), lift(0)
+    off = replace(recording, channels={**recording.channels, "p_A": recording["p_A"] + 7e5})
+    zeros = [estimate_connected_difference(record, record["omega"][1:] / RATE) for record in (recording, off)]
+    assert zeros[0] is not None and zeros[1] is not None
+    assert abs(zeros[0].value) < 3.0 * zeros[0].deviation < 1e5
+    assert zeros[1].value - zeros[0].value == pytest.approx(7e5, rel=0.05)
+    assert estimate_connected_difference(lowered, lowered["omega"][1:] / RATE) is None

@@ -19,7 +19,7 @@ import sealscope as ss
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
 from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, sensor_features
-from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION
+from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION, ZEROS
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
@@ -62,7 +62,7 @@ def known_names() -> frozenset[str]:
     """Collect what providers report, as "data: name"."""
     names = {f"volumes: {name}" for name in volume_names()} | {f"response: {name}" for name in PARAMETERS}
     names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
-    names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in (*DRIFTS, FALL)}
+    names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in (*DRIFTS, ZEROS, FALL)}
     names |= {f"drift: {LOW.format(side)}" for side in "AB"}
     names |= {"motion: motion", "sides: filter of p_A", "sides: filter of p_B", f"{TURNING_DATA}: {TURNING}"}
     names.add(f"volumes: {TURNING}")  # behind valves that shut at rest

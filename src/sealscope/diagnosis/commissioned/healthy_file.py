@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
-from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS
+from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS, ZERO_KEYS
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
@@ -206,7 +206,7 @@ _RMS = table_type(
     duty=_Array,
 )
 #: Numbers in the summary of friction and drifts, and their standard errors.
-_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS)
+_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *ZERO_KEYS)
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),

@@ -50,6 +50,7 @@ from sealscope.recordings.corrections.gaps import flag_holes
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
+from sealscope.signals.smoothing import average_over
 from sealscope.storage.plain_state import SavedAttributes, plain_array, require_part, restore_array
 from sealscope.units import P_ATM
 
@@ -410,22 +411,32 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 
 
-def flag_lowering(pump_volume: Array, x_step: Array, rate: float) -> NDArray[np.bool_]:
+def flag_lowering(pump_volume: Array, signals: Signals) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n,) in which the piston moves for a time although the pump rests.
 
-    A valve then lowers a load past the pump, or an actuator that is switched off is moved from outside. A load that
-    sinks by a leak is slower, so the piston must be faster than the fraction `rest.lowers` (`priors.toml`) of its mean
-    speed in motion, for `MIN_REST` or longer. The flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond
-    either end. `pump_volume`, `x_step` (n,): increments of the pump's volume [m^3], NaN where missing, and of the
-    position [m]; `rate`: sampling rate [Hz].
+    A valve then lowers a load past the pump, or connects the chambers of an actuator that is moved from outside. A leak
+    is slower: it passes little of the pump's flow, and less at a smaller load. The piston must therefore be faster than
+    the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, reduced in the ratio of abs(p_A - p_B) to
+    its mean while the pump turns, on average over `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The
+    flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end. `pump_volume` (n,): increments of
+    the pump's volume [m^3], NaN where missing.
     """
+    rate, x_step, load = signals.rate, signals.step("x"), np.abs(signals.pressure_difference)
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
-    is_moved = rests & ~find_rests(x_step, rate, max_rest_rate(x_step, rate, INFERENCE.rest.lowers))
-    is_lowering, margin = np.zeros(len(rests), dtype=bool), math.ceil(AVERAGING_TIME * rate)
-    for first, length in find_runs(is_moved).tolist():
-        if length >= MIN_REST * rate:
-            is_lowering[max(first - margin, 0) : first + length + margin] = True
-    return is_lowering
+    mean_load = max(float(np.nan_to_num(load[~rests]).mean()) if not rests.all() else 0.0, np.finfo(float).tiny)
+    relative_load = np.where(np.isfinite(load), np.minimum(load / mean_load, 1.0), 1.0)
+    max_creep = max_rest_rate(x_step, rate, INFERENCE.rest.lowers) * relative_load
+    limit = np.maximum(max_creep, max_rest_rate(x_step, rate, fraction=0.0))
+    excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
+    window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
+    sums = np.cumsum(np.pad([excess, ~rests], ((0, 0), (1, 0))), axis=1)
+    mean_excess, n_turning = sums[:, window:] - sums[:, :-window]  # over the window after each sample, times its length
+    is_lowering = rests & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0.0), window)
+    for first, length in find_runs(~is_lowering).tolist():
+        if length < INFERENCE.rest.lasting * rate and rests[first : first + length].all():
+            is_lowering[first : first + length] = True
+    margin = math.ceil(AVERAGING_TIME * rate)
+    return extend_flags(is_lowering, 2 * margin + 1)[margin:-margin]
 
 
 def _absolute_offset(pressure: Array) -> float:
@@ -625,12 +636,12 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
 
 
 def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equation) -> dict[str, Array]:
-    """Set the channel of the pump's flow to NaN while a valve lowers the load past the pump (`flag_lowering`).
+    """Set the channel of the pump's flow to NaN while the piston moves past the resting pump (`flag_lowering`).
 
     `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
     """
     signals = Signals(samples, rate)
-    return _without_flow(samples, flag_lowering(balance.left(signals), signals.step("x"), rate))
+    return _without_flow(samples, flag_lowering(balance.left(signals), signals))
 
 
 def _without_flow(samples: Mapping[str, Array], is_unknown: NDArray[np.bool_]) -> dict[str, Array]:

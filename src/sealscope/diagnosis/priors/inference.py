@@ -241,7 +241,7 @@ class RestPriors(PriorTable):
     holding: float  # mean flow of a pump that holds a load
     # smallest mean flow of a block in motion; also the largest flow of a meter, or speed over the mean speed, at rest
     moves: float
-    lowers: float  # smallest speed, over the mean speed, of a load that a valve lowers while the pump rests
+    lowers: float  # smallest speed at the mean load, over the mean speed, of a piston that passes a resting pump
     shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
     open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
     compliance: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation

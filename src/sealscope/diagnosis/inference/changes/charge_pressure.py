@@ -60,6 +60,12 @@ WEIGHT_SCALE, MIN_SCALE = 2.0, 300.0
 N_VOLUMES = 25
 
 
+def turned_angle(recording: Recording, flow_channel: str) -> Array:
+    """Compute the angle [rad] by which the pump turns in each sampling interval, by "theta" or "omega"; (n - 1,)."""
+    drive = recording[flow_channel]
+    return np.asarray(np.diff(drive) if flow_channel == "theta" else drive[1:] / recording.rate)
+
+
 @np.errstate(all="ignore")
 def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     """Estimate the drifts [Pa/s] of the lowest pressures of the chambers, by their names "A" and "B".
@@ -76,8 +82,7 @@ def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return {}
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
-    drive, rate = recording[flow_channel], recording.rate
-    turned = np.diff(drive) if flow_channel == "theta" else drive[1:] / rate  # [rad] in each interval
+    rate, turned = recording.rate, turned_angle(recording, flow_channel)
     # one flag for each sample, that of the interval after it; none follows the last sample
     is_turning = np.append(~find_rests(turned, rate, max_rest_rate(turned, rate)), False)
     is_known = np.isfinite(regressors).all(axis=1) & is_turning

@@ -4,7 +4,8 @@
   since friction of seals and guides changes in proportion.
 - A drift of one pressure only is a drift of that sensor's offset; the charge pressure changes both pressures alike. The
   drifts are fitted over the samples in which the piston moves (`motion_fit`), and a second time over the low values of
-  each pressure, which also show a loss of oil (`charge_pressure`).
+  each pressure, which also show a loss of oil (`charge_pressure`). From day to day the zeros of both sensors are
+  compared while a valve connects the chambers (`connected`).
 - A filter of one sensor changes the ratio and the phase of the spectra of both pressures (`pressure_bands`).
 
 A number is tested against its scatter between healthy recordings (`differences`). Called for recordings with both
@@ -21,10 +22,13 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
+    PUMP,
     compare_low_drifts,
     estimate_low_drifts,
     subtract_drifts,
+    turned_angle,
 )
+from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
 from sealscope.diagnosis.inference.changes.motion_fit import (
     TIME,
     fit_difference,
@@ -37,6 +41,8 @@ from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter,
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
+from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Recording, compute_once
 from sealscope.signals.smoothing import TINY
 
@@ -46,6 +52,8 @@ FRICTION, DRIFTS = "friction", ("drift of p_A", "drift of p_B", "drift of both")
 MOTION, LOW = "drift", "low"
 #: Keys of the drifts, and of their standard errors.
 DRIFT_KEYS = tuple(f"{kind}_{side}{suffix}" for kind in (MOTION, LOW) for side in "AB" for suffix in ("", "_error"))
+#: Name of the observable of the zeros of both sensors, and keys of p_A - p_B of connected chambers and of its error.
+ZEROS, ZERO_KEYS = "drift of p_A - p_B", ("connected_difference", "connected_difference_error")
 #: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_log_frictions`).
 UPPER_QUARTILE = 0.75
 #: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
@@ -83,6 +91,8 @@ class HealthyLevels:
         if (friction := _compare_friction(judged, healthy)) is not None:
             yield friction
         yield from _compare_drifts(judged, healthy, recording.duration)
+        if (zeros := _compare_zeros(judged, healthy)) is not None:
+            yield zeros
 
 
 def _read_octaves(summary: Summary) -> dict[str, Octaves]:
@@ -187,6 +197,20 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     yield replace(difference, chance=min(chance, 1.0), score=score)
 
 
+def _compare_zeros(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
+    """Compare p_A - p_B of connected chambers with that of healthy recordings; None if it is missing in too many."""
+    if not set(ZERO_KEYS) <= set(judged):
+        return None
+    judged_zero, *healthy_zeros = (
+        Estimate(*(float(summary[key]) for key in ZERO_KEYS))
+        for summary in (judged, *healthy)
+        if set(ZERO_KEYS) <= set(summary)
+    )
+    prior = CHANGES.healthy
+    scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
+    return compare_estimates(ZEROS, DRIFT, judged_zero, healthy_zeros, scatter)
+
+
 @np.errstate(all="ignore")
 def _estimate_levels(recording: Recording) -> Summary | None:
     """Estimate friction, drifts and spectra of a recording (`HealthyLevels.learn`); None if none can be estimated."""
@@ -204,6 +228,11 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         if np.isfinite([*drifts.values()]).all():
             levels |= _list_drifts(drifts, MOTION)
     levels |= _list_drifts(estimate_low_drifts(recording), LOW)
+    flow_channel = flow_source(recording.channels)
+    if flow_channel in PUMP and {"x", *CHAMBERS} <= set(recording.channels):
+        difference = estimate_connected_difference(recording, turned_angle(recording, flow_channel))
+        if difference is not None and np.isfinite(difference).all():
+            levels |= dict(zip(ZERO_KEYS, difference, strict=True))
     spectra = {
         name: np.stack(octaves)
         for name, pair in PAIRS.items()

@@ -249,14 +249,14 @@ class RecordedBalance:
     def _pumped(self) -> Array:
         """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,).
 
-        It is NaN while a valve lowers the load past the pump (`flag_lowering`).
+        It is NaN while the piston moves past the resting pump (`flag_lowering`).
         """
         channels, rate = dict(self.recording.channels), self.recording.rate
         if self.equations[0].by_command:
             channels = derive_drive_signals(channels, self.rig, rate)
         signals = Signals(channels, rate)
         pumped = self.equations[0].left(signals)
-        return np.where(flag_lowering(pumped, signals.step("x"), rate), np.nan, pumped)
+        return np.where(flag_lowering(pumped, signals), np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the pump's flow [m^3/s] beyond the one that moves the piston, shape (n - 1,), at least 0.
