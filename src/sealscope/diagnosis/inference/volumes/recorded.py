@@ -431,7 +431,9 @@ class RecordedBalance:
         roles, area = self.columns[0], self._loaded_area
         if LAG not in roles.names or area is None:
             return None
-        value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
+        value, deviation = estimate_weighted_mean(
+            self.blocks, roles, {roles.names.index(LAG): 1.0}, self.total_history
+        )
         return Estimate(area.sign * value / area.measured.value, deviation / area.measured.value)
 
     def mean_pressure(self) -> float:
@@ -515,7 +517,8 @@ class RecordedBalance:
             return None
         squares = np.einsum("kii->i", self.blocks.gram[:, 0])[motion]  # sums over all blocks
         weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
-        value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
+        shares = dict(zip(motion, weights, strict=True))
+        value, deviation = estimate_weighted_mean(self.blocks, roles, shares, self.total_history)
         if not abs(value) > 0.0:
             return None
         motions_of_A = motions_of_side(self.equations[0], "A")
