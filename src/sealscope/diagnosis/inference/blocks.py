@@ -701,7 +701,7 @@ def estimate_weighted_mean(
     factors = solve(normal.gram + np.diag(fit.prior_precision), contrast)
     by_leak = normal.coupling @ factors
     value = factors @ (normal.moment + fit.prior_moment) - by_leak @ leak.mean
-    variance = contrast @ factors * fit.variance + by_leak @ leak.covariance @ by_leak
+    variance = float(contrast @ factors * fit.variance + by_leak @ leak.covariance @ by_leak)
     return float(value), float(np.sqrt(max(variance, 0.0)))
 
 
