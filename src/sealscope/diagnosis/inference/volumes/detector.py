@@ -225,8 +225,7 @@ class VolumeBalance:
         `rest.valves` (`priors.toml`). The right assumption on the valves also makes the estimated leakage scatter less:
         n recordings (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if open / scatter if shut).
         """
-        # odds of exactly 0 tell nothing of the valves: the pump, or the piston, never rests for a whole block
-        with_rests = [summary for summary in summaries if summary.get("shut_odds", 0.0) != 0.0]
+        with_rests = [summary for summary in summaries if "shut_sums" in summary]
         odds = float(INFERENCE.rest.valves + _sum_log_odds(with_rests, "shut_odds"))
         if len(with_rests) < MIN_FOR_SCATTER:
             return odds
