@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.circuit.open_circuit import shows_open_circuit
+from sealscope.diagnosis.inference.circuit.recognition import recognise_circuit
 from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.diagnosis.verdict.machine import DEFAULT, UNSTATED, AssumedMachine, StatedBy, measures_flow, states_rig
 from sealscope.parameters import Rig, load_rig, rig_names
@@ -56,15 +56,15 @@ def assumed_rig(rig: Rig | str | os.PathLike[str] | None, recording: Recording) 
 def infer_rig(rig: Rig | None, recordings: Sequence[Recording]) -> Rig | None:
     """Replace a rig that nobody stated as a whole, if recordings of the machine show its circuit.
 
-    With stated areas, the circuit of a pump is that of `shows_open_circuit`; the rig notes it, so that these recordings
+    With stated areas, the circuit of a pump is that of `recognise_circuit`; the rig notes it, so that these recordings
     decide for all later ones of a machine. The first recording with the supply's pressure may also show a servo valve
     (`_shows_valve_supply`). Stated sizes are kept.
     """
     circuit = OPEN_CIRCUIT.parameter
     if rig is not None and (states_rig(rig) or rig.entry(circuit).source == _SHOWN):
         return rig
-    if rig is not None and (is_open := shows_open_circuit(rig, recordings)) is not None:
-        return rig.with_overrides({circuit: OPEN_CIRCUIT.value if is_open else "closed"}, source=_SHOWN)
+    if rig is not None and (value := recognise_circuit(rig, recordings)) is not None:
+        return rig.with_overrides({circuit: value}, source=_SHOWN)
     is_valve = (shown for recording in recordings if (shown := _shows_valve_supply(rig, recording)) is not None)
     if not next(is_valve, False):
         return rig

@@ -32,6 +32,8 @@ class HydraulicCircuit(NamedTuple):
         the balance does not need the piston's position.
     feeds_one_chamber : bool
         The pump delivers into one chamber at a time, through directional valves, and the other drains to the tank.
+    has_asymmetric_pump : bool
+        The flows of the pump in the two lines have the ratio of the piston areas. The displacement is that of side A.
     pump_is_measured : bool
         An encoder on the pump's motor records its angle and speed.
     holds_load : bool
@@ -53,6 +55,7 @@ class HydraulicCircuit(NamedTuple):
     valve_controlled: bool
     pump_feeds_chambers: bool
     feeds_one_chamber: bool
+    has_asymmetric_pump: bool
     pump_is_measured: bool
     holds_load: bool
     flow_size: Literal["area", "displacement"]
@@ -83,6 +86,7 @@ PUMP_CIRCUIT = HydraulicCircuit(
     valve_controlled=False,
     pump_feeds_chambers=True,
     feeds_one_chamber=False,
+    has_asymmetric_pump=False,
     pump_is_measured=True,
     holds_load=False,
     flow_size="displacement",
@@ -100,6 +104,15 @@ OPEN_CIRCUIT = PUMP_CIRCUIT._replace(
     feeds_one_chamber=True,
     needed_channels="x, p_A, p_B and the pump's theta or omega, or a flow meter q_pump",
 )
+#: A pump with a displacement for each piston area, or two pumps on one shaft, in a closed circuit with the cylinder.
+ASYMMETRIC_CIRCUIT = PUMP_CIRCUIT._replace(
+    name="pump-controlled by an asymmetric pump",
+    parameter="pump.circuit",
+    value="asymmetric",
+    required={"valve.spool": "absent", "supply.drive": "absent"},
+    simulated=False,
+    has_asymmetric_pump=True,
+)
 #: A servo valve between a supply and the cylinder.
 VALVE_CIRCUIT = HydraulicCircuit(
     name="valve-controlled",
@@ -110,6 +123,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
     valve_controlled=True,
     pump_feeds_chambers=False,
     feeds_one_chamber=False,
+    has_asymmetric_pump=False,
     pump_is_measured=False,
     holds_load=True,
     flow_size="area",
@@ -118,7 +132,7 @@ VALVE_CIRCUIT = HydraulicCircuit(
 )
 #: All circuits. A rig has the first circuit whose `parameter` has its `value` in the rig. As the last two circuits
 #: cover all values of their parameter, a circuit that another parameter chooses must stand before them.
-CIRCUITS = (OPEN_CIRCUIT, PUMP_CIRCUIT, VALVE_CIRCUIT)
+CIRCUITS = (OPEN_CIRCUIT, ASYMMETRIC_CIRCUIT, PUMP_CIRCUIT, VALVE_CIRCUIT)
 
 
 def check_circuit_property(subject: str, rig: str, circuit: HydraulicCircuit, flag: str) -> None:

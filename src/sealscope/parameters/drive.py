@@ -30,7 +30,8 @@ class Pump(Part):
     """Bidirectional pump of fixed displacement, eq. (4.1) of the thesis, and its losses.
 
     In a closed circuit the pump moves oil between the chambers. In an open one it draws oil from a tank and feeds one
-    chamber at a time through valves, while the other drains. `G_pump` is the laminar slip. Viscous drag is part of
+    chamber at a time through valves, while the other drains. An asymmetric one moves more oil at side A, where `q_b` is
+    stated, than at side B, in the ratio of the piston areas. `G_pump` is the laminar slip. Viscous drag is part of
     `motor.B_M`, and constant friction of `motor.T_f`.
     """
 
@@ -43,7 +44,7 @@ class Pump(Part):
     C_f: float = quantity("friction torque over that of the pressure", "1", absent=0, ge=0, le=1)
     C_h: float = quantity("hydrodynamic torque coefficient", "1", absent=0, ge=0, le=1e6)
     omega_max: float = quantity("speed limit (informative)", "rad/s", gt=0, le=1e4)
-    circuit: Literal["closed", "open"] = choice("circuit of pump and chambers", absent="closed")
+    circuit: Literal["closed", "open", "asymmetric"] = choice("circuit of pump and chambers", absent="closed")
 
 
 class HydraulicLine(Part):

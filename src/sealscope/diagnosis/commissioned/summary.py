@@ -135,6 +135,8 @@ def _describe_rig(rig: Rig | None) -> str:
         parts.append(f"pump {1e6 * rig.pump.q_b:.3g} cm^3/rev")
     if rig.circuit.feeds_one_chamber:
         parts.append("pump in an open circuit, as a recording shows")
+    if rig.circuit.has_asymmetric_pump:
+        parts.append("asymmetric pump, as a recording shows")
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
 
 

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
-from sealscope.diagnosis.inference.onset import Information
+from sealscope.diagnosis.inference.onset import History, Information
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
     RIDGE,
@@ -676,20 +676,33 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     return 0.5 * (precision + precision.T) / fit.variance, vector / fit.variance, mean_pressure
 
 
-def estimate_weighted_mean(blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float]) -> tuple[float, float]:
+def estimate_weighted_mean(
+    blocks: Blocks, roles: ColumnRoles, weights: Mapping[int, float], leak: History
+) -> tuple[float, float]:
     """Estimate a weighted mean of several coefficients of the first volume balance, and its standard error.
 
-    `weights`: weight of each coefficient, without its drift, by the index of its nuisance column; the sum is 1.
+    `weights`: weight of each coefficient by the index of its nuisance column, with the sum 1; `leak`: the leak's
+    coefficient in each block. A coefficient is averaged, with its drift, over the rows by the squares of its column:
+    its level over the whole recording is extrapolated if the piston moves in a few blocks only. With mean m and
+    covariance V of the leak, and C, G, b, P and s^2 as in `information`, the coefficients are
+
+        (G + P)^-1 (b + P mu - C' m),    covariance = (G + P)^-1 s^2 + (G + P)^-1 C' V C (G + P)^-1.
+
+    A leak that is free in each block would take the place of a steady motion.
     """
     fit = _fit_equation(blocks, 0, roles)
+    normal, n_polynomials = fit.normal, fit.polynomials.shape[1]
     contrast = np.zeros(len(fit.coefficients))  # weights of all coefficients of the fit
     for column, weight in weights.items():
-        constant = fit.nuisance.index(column) * fit.polynomials.shape[1]  # index of the column's first coefficient
-        contrast[constant] = weight
-    gram, _, _ = fit.normal.eliminate_tested()
-    precision = gram + np.diag(fit.prior_precision)
-    variance = float(contrast @ solve(precision, contrast)) * fit.variance
-    return float(contrast @ fit.coefficients), float(np.sqrt(max(variance, 0.0)))
+        squares = blocks.gram[:, 0, column, column]
+        first = fit.nuisance.index(column) * n_polynomials  # index of the column's first coefficient
+        mean_polynomials = squares @ fit.polynomials / max(float(squares.sum()), np.finfo(float).tiny)
+        contrast[first : first + n_polynomials] = weight * mean_polynomials
+    factors = solve(normal.gram + np.diag(fit.prior_precision), contrast)
+    by_leak = normal.coupling @ factors
+    value = factors @ (normal.moment + fit.prior_moment) - by_leak @ leak.mean
+    variance = float(contrast @ factors * fit.variance + by_leak @ leak.covariance @ by_leak)
+    return float(value), float(np.sqrt(max(variance, 0.0)))
 
 
 def scale_grams(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Array:

@@ -224,6 +224,8 @@ class FeedPriors(PriorTable):
     """Chambers that a pump feeds."""
 
     one: float  # log odds, before any recording, that the pump feeds one chamber at a time
+    asymmetric: float  # the same, that the flows of an asymmetric pump have the ratio of the piston areas
+    sided: float  # [Pa] magnitude of p_A - p_B from which it tells the side whose area the pump's flow moves
     scatter: float  # relative scatter of the ratio of flow to speed in either direction, a standard deviation
     # of a pump that turns while the piston rests
     circulates: float  # log odds, before any recording, that its flow circulates to the tank

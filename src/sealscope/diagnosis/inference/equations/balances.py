@@ -19,6 +19,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     CYLINDER,
     HOLDING,
     LAG_TERM,
+    LEAK,
     LEAKS,
     LINES_TERM,
     LOADED_NULL_FLOW,
@@ -71,7 +72,7 @@ _CYLINDER = (
 
 
 def _mask_term(term: Term, mask: Callable[[Signals], Array]) -> Term:
-    """Multiply the increments of a term by the zeros and ones (n - 1,) that `mask` computes from the signals."""
+    """Multiply the increments of a term by the factors (n - 1,) that `mask` computes from the signals."""
     return term._replace(increments=lambda s: np.asarray(mask(s) * term.increments(s)))
 
 
@@ -98,6 +99,22 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
 def is_separate_at_rest(equation: Equation) -> bool:
     """Return True if a balance has terms of its own while the piston rests (`_separate_at_rest`)."""
     return any(term.name == NULL_FLOW for term in equation.terms)
+
+
+def _scale_to_side_A(equation: Equation) -> Equation:
+    """Adapt the balance of a cylinder to an asymmetric pump, whose displacement on the left side is that of side A.
+
+    While B carries the load, the pump moves less oil, in the ratio of the areas, so that all terms but the offset of
+    the flow sensor take a larger part of the left side.
+    """
+
+    def factor(s: Signals) -> Array:
+        """Compute the displacement of side A over that of the side that carries the load, in each interval."""
+        by_A = interval_means(s.carried_by_A)
+        return by_A + (1.0 - by_A) / equation.area_ratio
+
+    terms = tuple(term if term.name == BIAS else _mask_term(term, factor) for term in equation.terms)
+    return equation._replace(terms=terms)
 
 
 def _supply_volume(s: Signals) -> Array:
@@ -214,6 +231,8 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
     equation = Equation(CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio)
     balance = _insert_before_leaks(equation, air)
+    if rig.circuit.has_asymmetric_pump:
+        balance = _scale_to_side_A(balance)
     return (_select_recorded_terms(balance, channels | {START}),)  # START is derived from the command
 
 
@@ -291,7 +310,7 @@ def with_rests(equation: Equation) -> Equation:
     """
     left = equation.left
     in_motion = Term(MOVING_BIAS, "m^3/s", lambda s: s.moving(left) * s.dt, "pump leak")
-    return _insert_before_leaks(equation, *_pump_leakage_terms(left), in_motion)
+    return _insert_before_leaks(equation, *_pump_leakage_terms(equation), in_motion)
 
 
 def shut_at_rest(equation: Equation) -> Equation:
@@ -301,7 +320,7 @@ def shut_at_rest(equation: Equation) -> Equation:
     piston move.
     """
     left = equation.left
-    shut = _insert_before_leaks(equation, *_pump_leakage_terms(left, drift="pump"))
+    shut = _insert_before_leaks(equation, *_pump_leakage_terms(equation, drift="pump"))
     return shut._replace(
         terms=tuple(
             term._replace(increments=lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
@@ -310,18 +329,17 @@ def shut_at_rest(equation: Equation) -> Equation:
     )
 
 
-def _pump_leakage_terms(
-    pump_volume: Callable[[Signals], Array], drift: Coefficient | Literal[""] = ""
-) -> tuple[Term, Term]:
+def _pump_leakage_terms(equation: Equation, drift: Coefficient | Literal[""] = "") -> tuple[Term, Term]:
     """Make two terms of a pump's leakage: while it moves the piston, and while it turns to hold the load.
 
-    `pump_volume` computes the volume [m^3] that the pump delivers in each interval; `drift`: that of `Term`.
+    Their increments are those of the leak in `equation`, whose left side is the pump's flow; `drift`: that of `Term`.
     """
+    pump_volume, leak = equation.left, next(term for term in equation.terms if term.name == LEAK)
     # no further channels are needed: the balance requires both pressures anyway
     make_term = partial(conductance_term, cause="pump leak", needs=(), drift=drift)
     return (
-        make_term(TURNING, lambda s: s.moving(pump_volume) * s.pressure_difference * s.dt),
-        make_term(HOLDING, lambda s: s.holding(pump_volume) * s.pressure_difference * s.dt),
+        make_term(TURNING, lambda s: s.moving(pump_volume) * leak.increments(s)),
+        make_term(HOLDING, lambda s: s.holding(pump_volume) * leak.increments(s)),
     )
 
 

@@ -431,7 +431,7 @@ class RecordedBalance:
         roles, area = self.columns[0], self._loaded_area
         if LAG not in roles.names or area is None:
             return None
-        value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0})
+        value, deviation = estimate_weighted_mean(self.blocks, roles, {roles.names.index(LAG): 1.0}, self.total_history)
         return Estimate(area.sign * value / area.measured.value, deviation / area.measured.value)
 
     def mean_pressure(self) -> float:
@@ -467,7 +467,8 @@ class RecordedBalance:
         - Behind a servo valve, and for a load that shut valves hold, the areas give the flow, and the factor is 1.
           While a held load creeps, its oil also expands, which adds to the uncertainty.
         - A flow meter or a stated displacement gives the factor 1. If a stated area disagrees with the displacement,
-          the difference is the uncertainty.
+          the difference is the uncertainty. Of an asymmetric pump, the displacement of side B may be stated; the factor
+          is then the ratio of the areas.
         - If only the area is stated, the factor follows from the measured ratio of displacement to area. If neither is
           stated, or no area is measured, it is 1.
         """
@@ -491,13 +492,15 @@ class RecordedBalance:
         value, low, high = area.measured
         # the ratio is inverse to the measured area, so that its lower end follows from the largest area
         ratio = Interval(area.assumed / value, area.assumed / high, area.assumed / max(low, 1e-12))
-        disagreement = abs(1.0 / ratio.value - 1.0)
+        sides = (1.0, rig.cylinder.A_A / rig.cylinder.A_B) if rig.circuit.has_asymmetric_pump else (1.0,)
+        scale = min(sides, key=lambda side: abs(float(np.log(ratio.value / side))))  # by the side that is stated
+        disagreement = abs(scale / ratio.value - 1.0)
         both_deviation = float(np.hypot(prior.displacement, prior.area))
         size = Size(1.0, both_deviation, stated=False, ratio=ratio, area=value)
         if states_displacement:
             disagrees = states_areas and disagreement > WITHIN_95 * both_deviation
             deviation = disagreement if disagrees else prior.displacement
-            return size._replace(deviation=deviation, stated=has_pressure_unit, disagrees=disagrees)
+            return size._replace(scale=scale, deviation=deviation, stated=has_pressure_unit, disagrees=disagrees)
         if states_areas:
             return size._replace(scale=ratio.value, deviation=prior.area, stated=has_pressure_unit)
         return size
@@ -515,7 +518,8 @@ class RecordedBalance:
             return None
         squares = np.einsum("kii->i", self.blocks.gram[:, 0])[motion]  # sums over all blocks
         weights = squares / max(float(squares.sum()), np.finfo(float).tiny)
-        value, deviation = estimate_weighted_mean(self.blocks, roles, dict(zip(motion, weights, strict=True)))
+        shares = dict(zip(motion, weights, strict=True))
+        value, deviation = estimate_weighted_mean(self.blocks, roles, shares, self.total_history)
         if not abs(value) > 0.0:
             return None
         motions_of_A = motions_of_side(self.equations[0], "A")
