@@ -16,6 +16,7 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, Request
+from sealscope.recordings.formats.headings.dates import find_order
 from sealscope.recordings.formats.structured.archives import is_workbook, unpack
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
@@ -149,7 +150,7 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name)
+    request = Request(map or {}, rate, file.name, find_order(file))
     with _unpacked_file(file) as (inner, kind):
         return _read_unpacked(inner, kind, request)
 
@@ -195,7 +196,7 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name)
+    request = Request(map or {}, rate, file.name, find_order(file))
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
     return _iter_parts(file, every, request)

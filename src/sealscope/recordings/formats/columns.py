@@ -48,6 +48,7 @@ class Request:
     map: ChannelMap  # channel -> column, or "auto" to choose by the columns' names
     rate: float | None = None  # sampling rate [Hz] in place of a time column
     file: str = ""  # name of the file for the provenance
+    name_order: str | None = None  # order of the date in this name, if the names beside it tell (`dates.find_order`)
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
