@@ -16,11 +16,11 @@ from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
 from sealscope.recordings.formats.columns import ChannelMap, Request
-from sealscope.recordings.formats.headings.dates import find_order
 from sealscope.recordings.formats.structured.archives import is_workbook, unpack
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
+from sealscope.recordings.formats.times.dates import find_order
 from sealscope.recordings.recording import Recording, make_recording
 from sealscope.recordings.subprocesses import run_on_file
 from sealscope.storage.atomic import atomic_write

@@ -167,7 +167,7 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     - `oil_degC`: oil temperature [deg C].
     - `noise`: standard deviation of the noise of each channel, in the channel's unit.
     - `log_units`: unit of each channel in the log.
-    - `wrong`: list of problems as texts.
+    - `wrong`: list of problems as texts; `defects`: share of the samples with each defect, by its name.
     """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
@@ -181,7 +181,7 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     log_units = {name: unit for name, log_name in logged.items() if (unit := recording.unit_in_log(log_name))}
     if log_units:
         description["log_units"] = log_units
-    findings = inspection.findings
+    findings, description["defects"] = inspection.findings, inspection.defect_shares
     problems = [finding.text for finding in findings if finding.severity != "note" or finding.code in _LOGGER_HABITS]
     problems += [
         f"{name} is not read: if it is the oil's temperature, then --map 'T_oil={name}', as warm oil leaks more"

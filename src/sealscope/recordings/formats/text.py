@@ -60,7 +60,7 @@ from sealscope.recordings.formats.text_layout import (
     detect_layout,
     split_at_blanks,
 )
-from sealscope.recordings.formats.timebase import (
+from sealscope.recordings.formats.times.timebase import (
     TimeState,
     ambiguous_dates,
     explicit_order,

@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import iso_moment, parse_epoch, parse_stamps
+from sealscope.recordings.formats.times.timebase import iso_moment, parse_epoch, parse_stamps
 
 _TIME = (
     r"(?:[-_ T.]?(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?P<half>)(?!\d)"
