@@ -176,9 +176,9 @@ class Recording:
     def duration(self) -> float:
         """Duration [s]: from the first sample to one interval after the last, or by the rate if the time steps back."""
         span = float(self.t[-1] - self.t[0]) + 1.0 / self.rate if self.t.size else 0.0
-        # `span` counts as the number of samples over the rate up to rounding, and is not finite if a time is missing
-        is_longer = math.isfinite(span) and span * self.rate > self.t.size + 0.5 and np.all(np.diff(self.t) >= 0.0)
-        return span if is_longer else self.t.size / self.rate
+        # `span` is that of the number of samples up to rounding, and is not finite if a time is missing
+        differs = math.isfinite(span) and abs(span * self.rate - self.t.size) > 0.5 and np.all(np.diff(self.t) >= 0.0)
+        return span if differs else self.t.size / self.rate
 
     @property
     def unused(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.balances import circulation, equations
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
@@ -89,9 +89,12 @@ class MachineSummary:
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
         n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
-        # each of n + 1 healthy recordings is equally likely to have the highest score
-        rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
-        needed = (rig or unstated_rig()).circuit.needed_channels
+        # by ranks, each of n + 1 healthy recordings is equally likely to have the highest score
+        rate = (
+            f"{100.0 * FALSE_ALARM_PROBABILITY:g} % of healthy recordings, by the law that their scatter is assumed to "
+        )
+        rate += f"follow; ranks of {len(healthy)} alone could not show fewer than 1 in {len(healthy) + 1}"
+        needed = _describe_needs(rig or unstated_rig(), frozenset(units))
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in display_units.items())),
@@ -107,7 +110,7 @@ class MachineSummary:
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool, needed: str) -> list[tuple[str, str]]:
         """Build the rows (heading, text) on the smallest detectable leak and on the recordings needed to halve it.
 
-        `needed` names the channels of a volume balance.
+        `needed` describes what a volume balance lacks.
         """
         if self.smallest is None:
             text = f"not known, that needs {needed}, in two recordings; the ringing alone judges"
@@ -119,6 +122,15 @@ class MachineSummary:
         power = f"{100.0 * _PRIORS.power:g} % of the time"
         smallest = f"the next recording with such oil, loads and speeds shows {self.smallest} ({power})"
         return [("smallest leak", smallest), ("half of that", half)]
+
+
+def _describe_needs(rig: Rig, channels: frozenset[str]) -> str:
+    """Describe what a volume balance needs that the healthy recordings, with these `channels`, may lack."""
+    if equations(rig, channels):
+        return "more motion"
+    if circulation(rig, channels):
+        return "the position x, or strokes that bring the piston back to where it was, or hold it under a load"
+    return rig.circuit.needed_channels
 
 
 def _describe_rig(rig: Rig | None) -> str:
