@@ -113,3 +113,19 @@ def test_a_preamble_states_the_start(tmp_path: Path, preamble: str, name: str, s
 def test_a_preambles_date_completes_times_of_the_day(tmp_path: Path) -> None:
     stamps = "Time\n23:59:58\n23:59:59\n00:00:00\n00:00:01"
     assert iso_start(write_log(tmp_path / "rig.csv", "Date:,2026-03-04\n", stamps)) == "2026-03-04T23:59:58"
+
+
+@pytest.mark.parametrize(
+    "form", ["Start: {}/03/2026 07:28:00\n|t [s]\n0\n1\n2\n3", "|Time\n" + "{}/03/2026 07:28:00\n" * 4]
+)
+def test_logs_beside_a_log_tell_whether_its_dates_begin_with_the_day(tmp_path: Path, form: str) -> None:
+    def write(day: int) -> Path:
+        preamble, times = form.format(*[f"{day:02d}"] * form.count("{}")).split("|")
+        return write_log(tmp_path / f"rig_{day}.csv", preamble, times.replace(":00\n", ":0{}\n").format(*range(4)))
+
+    log = write(4)
+    assert iso_start(log) != "2026-03-04T07:28:00"
+    write(13)
+    assert iso_start(log) == "2026-03-04T07:28:00"
+    log.rename(log.with_name("2026-03-04 rig.csv"))  # no log beside it has such a name, which tells as much
+    assert iso_start(log.with_name("2026-03-04 rig.csv")) == "2026-03-04T07:28:00"

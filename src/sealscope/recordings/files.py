@@ -20,7 +20,6 @@ from sealscope.recordings.formats.structured.archives import is_workbook, unpack
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
-from sealscope.recordings.formats.times.dates import find_order
 from sealscope.recordings.recording import Recording, make_recording
 from sealscope.recordings.subprocesses import run_on_file
 from sealscope.storage.atomic import atomic_write
@@ -150,7 +149,7 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name, find_order(file))
+    request = Request(map or {}, rate, file.name, file)
     with _unpacked_file(file) as (inner, kind):
         return _read_unpacked(inner, kind, request)
 
@@ -196,7 +195,7 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name, find_order(file))
+    request = Request(map or {}, rate, file.name, file)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
     return _iter_parts(file, every, request)

@@ -7,6 +7,7 @@ from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import isfinite
+from pathlib import Path
 from typing import Literal
 
 from sealscope.calls import nearest
@@ -48,7 +49,7 @@ class Request:
     map: ChannelMap  # channel -> column, or "auto" to choose by the columns' names
     rate: float | None = None  # sampling rate [Hz] in place of a time column
     file: str = ""  # name of the file for the provenance
-    name_order: str | None = None  # order of the date in this name, if the names beside it tell (`dates.find_order`)
+    path: Path | None = None  # the file, if others beside it may tell whether dates begin with the day
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)

@@ -15,6 +15,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +30,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.times.dates import stated_start
+from sealscope.recordings.formats.times.dates import find_order, stated_start
 from sealscope.recordings.formats.times.timebase import (
     TimeState,
     interpolate_samples,
@@ -221,10 +222,12 @@ def convert_columns(
         return RecordingFields(
             t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
         )
+    path = request.path or Path(request.file)
+    order = find_order(path)
     if not start:
-        start, start_notes = stated_start(remarks, request.file, request.name_order, _find_time_of_day(time, t))
+        start, start_notes = stated_start(remarks, path, order, _find_time_of_day(time, t))
         notes += start_notes
-    details = {"file": request.file, "name_order": request.name_order, "format": kind, **start, "about": dict(remarks)}
+    details = {"file": request.file, "name_order": order, "format": kind, **start, "about": dict(remarks)}
     details |= {"columns": choice.names}
     details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
     details["log_units"] = log_units

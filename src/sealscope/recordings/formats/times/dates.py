@@ -6,16 +6,19 @@ Of a date such as 04-03-2026, the order of day and month is taken from what dete
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sealscope.errors import InputError
 from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.times.timebase import iso_moment, parse_epoch, parse_stamps
+from sealscope.recordings.formats.times.timebase import explicit_order, iso_moment, parse_epoch, parse_stamps
+from sealscope.storage.opening import open_regular
 
 _TIME = (
     r"(?:[-_ T.]?(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?P<half>)(?!\d)"
@@ -36,6 +39,10 @@ _START, _DAY_FIRST_START, _CLOCK = (
     re.compile(WORDS["stated"][name], re.IGNORECASE) for name in ("start", "day_first_start", "clock")
 )
 _DAY = np.timedelta64(1, "D")
+_NUMBER = re.compile(r"\d+")
+_EITHER_DATE = re.compile(r"(?<![\d/-])\d{1,2}([/-])\d{1,2}\1(?:\d{4}|\d{2})(?![\d/-])")
+#: Most logs beside a log of which the beginnings are read, and bytes of each.
+_MAX_FILES, _MAX_BYTES = 64, 2**16
 
 
 def dates_in_name(name: str) -> dict[str, float]:
@@ -89,43 +96,65 @@ def find_order(path: Path) -> str | None:
     starts = dates_in_name(path.name)
     if len({*starts.values()}) < 2:
         return None
-    orders, pattern = {*starts}, _without_numbers(path.name)
-    with suppress(OSError):
-        for other in path.parent.iterdir():
-            if len(orders) > 1 and _without_numbers(other.name) == pattern:
-                orders &= {*dates_in_name(other.name)}
+    orders = {*starts}
+    for other in _iter_files_beside(path):
+        if len(orders) > 1:
+            orders &= {*dates_in_name(other.name)}
     return orders.pop() if len(orders) == 1 else None
 
 
-def _without_numbers(name: str) -> str:
-    """Replace each number in a name by the same mark."""
-    return re.sub(r"\d+", "#", name)
+def _iter_files_beside(path: Path) -> Iterator[Path]:
+    """Yield the files in the folder of a file whose names differ from its name by their numbers alone."""
+    name = _NUMBER.sub("#", path.name)
+    with suppress(OSError):
+        yield from (other for other in path.parent.iterdir() if _NUMBER.sub("#", other.name) == name)
+
+
+def is_day_first_beside(path: Path, date: str) -> bool | None:
+    """Find if the day comes first in dates such as 05/06/2024 of a log, by its file's name or the logs beside it.
+
+    The `date` is one of the log, which may be that in the file's name; the logs beside it, of which the beginnings of
+    the first `_MAX_FILES` are read, may have dates with a number over 12. None if neither tells.
+    """
+    if (named_start := parse_name(path.name, find_order(path))) is not None:
+        day = np.datetime64(int(named_start), "s").astype("datetime64[D]")
+        moments = {order: _possible_moments(date, "", (order,)) for order in (True, False)}
+        orders = [
+            order for order, of_order in moments.items() if [m.astype("datetime64[D]") for m in of_order] == [day]
+        ]
+        if len(orders) == 1:
+            return orders[0]
+    for other in islice(_iter_files_beside(path), _MAX_FILES):
+        with suppress(OSError, InputError), open_regular(other, "a recording") as file:
+            text = file.read(_MAX_BYTES).decode("latin-1")
+            if (order := explicit_order(match[0] for match in _EITHER_DATE.finditer(text))) is not None:
+                return order
+    return None
 
 
 def stated_start(
-    remarks: Mapping[str, str], file: str, order: str | None, time_of_day: np.timedelta64 | None
+    remarks: Mapping[str, str], path: Path, order: str | None, time_of_day: np.timedelta64 | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Find the start of a recording in the remarks of its file: entry `start` of its provenance, lines for its history.
 
-    The start is a moment in ISO form, or a date alone if no time of day is known. Of the dates that an ambiguous one
-    may mean, it is that in the file's name; otherwise there is no start.
+    The start is a moment in ISO form, or a date alone if no time of day is known. Whether an ambiguous date begins with
+    the day is found by `is_day_first_beside`; otherwise there is no start.
 
-    - `file`, `order`: the file's name, and the order of its date, as for `parse_name`.
+    - `path`, `order`: the file, and the order of the date in its name, as from `find_order`.
     - `time_of_day`: that of 0 s, None if the time column does not tell.
     """
     if (scope_begin := scope_start(remarks)) is not None:
         return {"start": iso_moment(scope_begin)}, []
-    named_start = parse_name(file, order)
     clock = next((text for name, text in remarks.items() if _CLOCK.fullmatch(name.strip())), "")
-    ambiguous = f"name {file}" if named_start is None and dates_in_name(file) else None
+    is_unnamed = parse_name(path.name, order) is None
+    ambiguous = f"name {path.name}" if is_unnamed and dates_in_name(path.name) else None
     for name, text in remarks.items():
         is_day_first = _DAY_FIRST_START.fullmatch(name.strip()) is not None
         if not (is_day_first or _START.fullmatch(name.strip())):
             continue
         moments = _possible_moments(text, clock, (True,) if is_day_first else (True, False))
-        if len(moments) > 1 and named_start is not None:
-            day = np.datetime64(int(named_start), "s").astype("datetime64[D]")
-            moments = [moment for moment in moments if moment.astype("datetime64[D]") == day]
+        if len(moments) > 1 and (order_beside := is_day_first_beside(path, text)) is not None:
+            moments = _possible_moments(text, clock, (order_beside,))
         if len(moments) == 1:
             day = moments[0].astype("datetime64[D]")
             if time_of_day is not None:
