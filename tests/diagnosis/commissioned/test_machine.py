@@ -18,7 +18,7 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import parse_moment
-from sealscope.diagnosis.commissioned.summary import MachineSummary
+from sealscope.diagnosis.commissioned.summary import MachineSummary, summarise_machine
 from sealscope.diagnosis.detectors.observation import compare_healthy
 from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.errors import InputError
@@ -68,6 +68,16 @@ def test_a_summary_names_what_the_recordings_lack(channels, needed):
     units = {name: CHANNEL_UNITS[name] for name in channels}
     recordings = [SummarisedRecording(f"{k}.csv", str(k), units, 50.0, 60.0, None, {}) for k in range(6)]
     assert needed in " ".join(MachineSummary({}, {}, None).text(recordings, None).split())
+
+
+def test_a_summary_states_a_problem_of_many_recordings_once():
+    wrongs = [[f"1 gap, about {400 + k} samples lost", f"x: is stuck {k} times", "x: 3 missing"] for k in range(6)]
+    recordings = [
+        SummarisedRecording(f"{k}.csv", str(k), {"p_A": "Pa"}, 50.0, 60.0, None, {}, {"wrong": wrong})
+        for k, wrong in enumerate(wrongs)
+    ]
+    problems = summarise_machine(recordings, None).problems
+    assert problems == ["1 gap, about 405 samples lost (in 6 of 6)", "x: is stuck 5 times (in 6 of 6)"]
 
 
 @pytest.mark.slow

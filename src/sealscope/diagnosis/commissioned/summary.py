@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 #: Codes of findings of the severity "note" that are listed as problems of the machine: its logger causes them always.
 _LOGGER_HABITS = ("unsigned_speed",)
 _PRIORS = COMMISSIONED.smallest
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 class TermEstimate(NamedTuple):
@@ -293,18 +295,19 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind, i.e. each text before the first colon.
+    """List the problems of all healthy recordings, one line for each kind: the text before a colon, without numbers.
 
     A line shows the alphabetically last of the texts, and the recording's name or the number of recordings.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
         for text in recording.about.get("wrong", ()):
-            by_kind[text.partition(":")[0]].append((text, recording.file))
+            by_kind[_NUMBER.sub("", text.partition(":")[0])].append((text, recording.file))
     lines = []
     for problems in by_kind.values():
         text, file = max(problems)
-        lines.append(f"{text} ({file if len(problems) == 1 else f'in {len(problems)} of {len(healthy)}'})")
+        files = {file for _, file in problems}
+        lines.append(f"{text} ({file if len(files) == 1 else f'in {len(files)} of {len(healthy)}'})")
     return lines
 
 
