@@ -98,8 +98,9 @@ def find_order(path: Path) -> str | None:
         return None
     orders = {*starts}
     for other in _iter_files_beside(path):
-        if len(orders) > 1:
-            orders &= {*dates_in_name(other.name)}
+        orders &= {*dates_in_name(other.name)}
+        if len(orders) <= 1:
+            break
     return orders.pop() if len(orders) == 1 else None
 
 
@@ -148,7 +149,7 @@ def stated_start(
     clock = next((text for name, text in remarks.items() if _CLOCK.fullmatch(name.strip())), "")
     is_unnamed = parse_name(path.name, order) is None
     ambiguous = f"name {path.name}" if is_unnamed and dates_in_name(path.name) else None
-    for name, text in remarks.items():
+    for name, text in sorted(remarks.items(), key=lambda remark: ":" not in remark[1]):  # with a time of day first
         is_day_first = _DAY_FIRST_START.fullmatch(name.strip()) is not None
         if not (is_day_first or _START.fullmatch(name.strip())):
             continue
