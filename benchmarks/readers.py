@@ -28,7 +28,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import load_rig, parse_overrides
 from sealscope.recordings import read, split_map_option
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.timebase import is_stamp
+from sealscope.recordings.formats.times.timebase import is_stamp
 from sealscope.simulation.commands import parse_command
 from sealscope.simulation.faults import parse_fault
 from sealscope.simulation.leaks import parse_leak

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from collections import Counter
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
 from sealscope.cli.app import normalise_arguments
+from sealscope.cli.options import StatedMachine
+from sealscope.cli.recordings import _iter_dated_diagnoses
+from sealscope.reporting.messages import table_line
 
 KEYS = {
     "file": str,
@@ -358,3 +362,11 @@ def test_scripts_may_fail_on_a_level(call, recordings):
     assert (
         call("diagnose", files[0], "--quiet", "--rig", "thesis", "--limit", "1 L/min", "--fail-on", "plan").status == 0
     )
+
+
+def test_a_file_without_a_date_does_not_get_that_of_its_last_change(tmp_path: Path) -> None:
+    file = tmp_path / "log.csv"
+    file.write_text("t [s],p_A [bar],p_B [bar]\n" + "".join(f"{k / 50},{k % 7},{k % 5}\n" for k in range(400)))
+    ((start, diagnosis),) = _iter_dated_diagnoses([file], machine=StatedMachine.of(), joined=False)
+    assert start is None
+    assert str(datetime.now(UTC).year) not in table_line(diagnosis, start)

@@ -48,6 +48,23 @@ def test_a_baseline_equal_to_the_recording_is_refused(healthy: list[Recording]) 
     )
 
 
+def test_a_defect_that_all_healthy_recordings_have_is_a_note(healthy: list[Recording]) -> None:
+    def without_some(recording: Recording, share: float) -> Recording:
+        values = recording["p_B"].copy()
+        values[100 : 100 + int(share * values.size)] = np.nan
+        return replace(recording, channels={**recording.channels, "p_B": values})
+
+    def severity(share: float, *shares: float) -> str:
+        baseline = [without_some(recording, part) for recording, part in zip(healthy[1:], shares, strict=False)]
+        judged = inspect_recording(without_some(healthy[0], share))
+        (finding,) = [finding for finding in select_comparable(judged, baseline).findings if finding.code == "missing"]
+        return finding.severity
+
+    assert severity(0.03) == "warning"
+    assert severity(0.03, 0.03, 0.04) == severity(0.03, 0.002, 0.02) == "note"
+    assert severity(0.03, 0.03, 0.0) == severity(0.03, 0.005, 0.01) == "warning"
+
+
 @pytest.mark.slow
 def test_a_leak_within_the_recording_is_stated_whatever_the_baseline(leaky: Recording) -> None:
     result = diagnose(leaky, leaky)

@@ -12,6 +12,7 @@ from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import proposed_map, split_unit
+from sealscope.recordings.hydraulics import describe_missing_chambers
 
 from ..refusals import refusal
 
@@ -135,6 +136,26 @@ from ..refusals import refusal
                 "omega": "Pump speed [rpm]",
             },
         ),
+        (
+            "GMT;Opening side pressure [barg];Spring side pressure [barg];Stem travel [mm]",
+            {
+                "t": "GMT",
+                "p_A": "Opening side pressure [barg]",
+                "p_B": "Spring side pressure [barg]",
+                "x": "Stem travel [mm]",
+            },
+        ),
+        (
+            "stamp;Druck Schließseite [bar];Druck Öffnungsseite [bar]",
+            {"t": "stamp", "p_A": "Druck Öffnungsseite [bar]", "p_B": "Druck Schließseite [bar]"},
+        ),
+        # neither an opening pressure, nor a side without the other; letters come first
+        ("t [s];Opening pressure [bar];Closing pressure [bar]", {}),
+        ("t [s];Opening side pressure [bar];Supply side pressure [bar]", {}),
+        (
+            "t [s];Spring side pressure A [bar];Opening side pressure B [bar]",
+            {"t": "t [s]", "p_A": "Spring side pressure A [bar]", "p_B": "Opening side pressure B [bar]"},
+        ),
     ],
 )
 def test_names_of_loggers(heads: str, expected: dict[str, str]) -> None:
@@ -156,6 +177,15 @@ def test_the_error_prints_the_map_and_auto_takes_it(tmp_path: Path) -> None:
     assert "column PB_bar read as p_B in bar" in recording.history
     with refusal("map", "'guess'"):
         read(path, map="guess")  # type: ignore[arg-type]
+
+
+def test_errors_say_which_option_names_a_column(tmp_path: Path) -> None:
+    path = tmp_path / "log.csv"
+    path.write_text("Recorder,A side pressure [bar],B side pressure [bar]\n0,1,2\n1,2,3\n3,1,2\n")
+    with refusal("--map t=COLUMN", "p_A=A side pressure [bar]", error=UnreadableFile):
+        read(path, map="auto")
+    path.write_text("t [s],Left pressure [bar],Stroke [mm]\n" + "".join(f"{k},{k % 7},{k % 5}\n" for k in range(400)))
+    assert "--map 'p_A=Left pressure [bar]'" in str(describe_missing_chambers(read(path, map="auto")))
 
 
 @given(st.lists(st.text(max_size=100), max_size=8))

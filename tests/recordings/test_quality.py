@@ -112,7 +112,7 @@ def changed(change) -> np.ndarray:
         (changed(lambda t: t[2000:].__iadd__(1.0)), RATE, ("gap", "warning", 1, 1999 / RATE)),
         (changed(lambda t: t[1000:1001].__isub__(1 / RATE)), RATE, ("duplicated_time", "warning", 1, 999 / RATE)),
         (changed(lambda t: t[3000:].__isub__(2.0)), RATE, ("reversed_time", "warning", 1, 3000 / RATE - 2.0)),
-        (changed(lambda t: t[10:11].__imul__(np.nan)), RATE, ("missing_time", "warning", 1, None)),
+        (changed(lambda t: t[10:11].__imul__(np.nan)), RATE, ("missing_time", "note", 1, None)),
         (changed(lambda t: None), 1000.0, ("rate_mismatch", "fatal", 1, 0.0)),
         (changed(lambda t: None)[::-1], RATE, ("reversed_time", "warning", 4999, 4998 / RATE)),
     ],
@@ -274,3 +274,26 @@ def test_pressures_that_creep_as_in_no_sealed_circuit_are_remarked():
     assert codes(6e3 * t) == codes(-6e3 * t) == [("creeping_pressures", "note")]
     assert codes(0.0 * t) == codes(500.0 * t) == codes(np.where(t > 45, 6e5, 0.0)) == []
     assert codes(3e5 * (1 - np.exp(-t / 10))) == []
+
+
+@pytest.mark.parametrize(("intervals", "lost"), [((0.02, 0.03), 0), ((0.05, 0.06, 0.1), 0), ((0.02, 0.03), 200)])
+def test_polls_at_uneven_times_are_no_gaps(intervals: tuple[float, ...], lost: int) -> None:
+    steps = np.random.default_rng(0).choice(intervals, 5000)
+    if lost:
+        steps[2000] = lost * steps.mean()
+    t = np.cumsum(steps)
+    polled = replace(recording({"p_A": healthy()["p_A"][:5000]}, t), rate=1.0 / float(np.median(steps)))
+    gaps = [finding for finding in inspect(polled) if finding.code == "gap"]
+    assert [gap.count for gap in gaps] == ([1] if lost else [])
+    assert all(f"about {lost - 1} samples lost" in gap.text for gap in gaps)
+    assert polled.duration == pytest.approx(t[-1] - t[0], abs=0.1)
+
+
+@pytest.mark.parametrize(("lost", "severity"), [(1, "note"), (150, "note"), (300, "warning")])
+def test_a_defect_of_few_samples_is_a_note(lost: int, severity: str) -> None:
+    t = np.arange(20_000) / RATE
+    t[10_000:] += lost / RATE
+    p = healthy()["p_A"]
+    p[5000 : 5000 + lost] = np.nan
+    findings = inspect(recording({"p_A": p}, t))
+    assert {finding.code: finding.severity for finding in findings} == {"gap": severity, "missing": severity}

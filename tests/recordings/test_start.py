@@ -32,6 +32,12 @@ def named(name: str, t0: float = 0.0, start: str | None = None) -> Recording:
         ("20261301_140509.csv", None, None),
         ("strokes_2019.csv", None, None),
         ("plain.csv", "5 s", None),
+        ("rudder_14-03-2026_07-28.txt", None, "2026-03-14T07:28:00"),
+        ("rudder_04.03.2026_0728.txt", None, "2026-03-04T07:28:00"),
+        ("rudder_04-03-2026_07-28.txt", None, None),  # 4 March, 3 April, and no 28 July
+        ("rudder_03-03-2026_07-28.txt", None, "2026-03-03T07:28:00"),
+        ("rig-2026-07-01T14-05-09.csv", "2026-07-01", "2026-07-01T14:05:09"),
+        ("rig-2026-07-02T14-05-09.csv", "2026-07-01", "2026-07-01T00:00:00"),
     ],
 )
 def test_start_of_a_recording(name: str, start: str | None, stamp: str | None) -> None:
@@ -71,3 +77,68 @@ def test_what_is_no_time_since_1970_is_not_taken_for_a_start(epoch: object) -> N
         {"file": "20260701_140509.csv", "start_epoch_s": epoch},
     )  # fmt: skip
     assert start_seconds(recording) == start_seconds(named("20260701_140509.csv"))
+
+
+def write_log(file: Path, preamble: str = "", times: str = "t [s]\n0\n1\n2\n3") -> Path:
+    heading, *cells = times.splitlines()
+    rows = "".join(f"{cell},{k * k % 7}\n" for k, cell in enumerate(cells))
+    file.write_text(f"{preamble}{heading},p_A [bar]\n{rows}")
+    return file
+
+
+def iso_start(file: Path) -> str | None:
+    seconds = start_seconds(read(file))
+    return None if seconds is None else str(np.datetime64(int(seconds), "s"))
+
+
+def test_names_beside_a_file_tell_whether_its_date_begins_with_the_day(tmp_path: Path) -> None:
+    logs = [write_log(tmp_path / f"rig_{date}_07-28.csv") for date in ("04-03-2026", "05-03-2026")]
+    assert iso_start(logs[0]) is None
+    assert "rig_04-03-2026_07-28.csv" in read(logs[0]).history[-1]
+    write_log(tmp_path / "13-03-2026.csv")  # another name
+    assert iso_start(logs[0]) is None
+    write_log(tmp_path / "rig_13-03-2026_07-28.csv")
+    assert [iso_start(log) for log in logs] == ["2026-03-04T07:28:00", "2026-03-05T07:28:00"]
+    # every field joined by the same mark: 2026-07-28 is no date of the others
+    logs = [
+        write_log(tmp_path / f"all-{date}-07-{minute}.csv") for date, minute in (("04-03-2026", 28), ("13-03-2026", 41))
+    ]
+    assert iso_start(logs[0]) == "2026-03-04T07:28:00"
+
+
+@pytest.mark.parametrize(
+    ("preamble", "name", "start"),
+    [
+        ("Beginn: 04.03.2026 07:28:00\n", "rig_05-03-2026_09-00.csv", "2026-03-04T07:28:00"),
+        ("Datum: 04/03/2026\nUhrzeit: 07:28:00\n", "rig.csv", "2026-03-04T07:28:00"),
+        ("Date: 2026-03-04\n", "rig_20260304_0728.csv", "2026-03-04T07:28:00"),
+        ("Date: 2026-03-04\n", "rig.csv", "2026-03-04T00:00:00"),
+        ("Start time: 04/03/2026 07:28:00\n", "rig.csv", None),
+        ("Start time: 04/13/2026 07:28:00\n", "rig.csv", "2026-04-13T07:28:00"),
+        ("Start time: 04/03/2026 07:28:00\n", "rig_20260304.csv", "2026-03-04T07:28:00"),
+        ("Calibration date: 04.03.2020\nTime: 07:28\n", "rig.csv", None),
+    ],
+)
+def test_a_preamble_states_the_start(tmp_path: Path, preamble: str, name: str, start: str | None) -> None:
+    assert iso_start(write_log(tmp_path / name, preamble)) == start
+
+
+def test_a_preambles_date_completes_times_of_the_day(tmp_path: Path) -> None:
+    stamps = "Time\n23:59:58\n23:59:59\n00:00:00\n00:00:01"
+    assert iso_start(write_log(tmp_path / "rig.csv", "Date:,2026-03-04\n", stamps)) == "2026-03-04T23:59:58"
+
+
+@pytest.mark.parametrize(
+    "form", ["Start: {}/03/2026 07:28:00\n|t [s]\n0\n1\n2\n3", "|Time\n" + "{}/03/2026 07:28:00\n" * 4]
+)
+def test_logs_beside_a_log_tell_whether_its_dates_begin_with_the_day(tmp_path: Path, form: str) -> None:
+    def write(day: int) -> Path:
+        preamble, times = form.format(*[f"{day:02d}"] * form.count("{}")).split("|")
+        return write_log(tmp_path / f"rig_{day}.csv", preamble, times.replace(":00\n", ":0{}\n").format(*range(4)))
+
+    log = write(4)
+    assert iso_start(log) != "2026-03-04T07:28:00"
+    write(13)
+    assert iso_start(log) == "2026-03-04T07:28:00"
+    log.rename(log.with_name("2026-03-04 rig.csv"))  # no log beside it has such a name, which tells as much
+    assert iso_start(log.with_name("2026-03-04 rig.csv")) == "2026-03-04T07:28:00"

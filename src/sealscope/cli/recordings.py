@@ -205,11 +205,10 @@ def _iter_dated_diagnoses(files: Sequence[Path], **options: Any) -> Iterator[Dat
 
 
 def _start_seconds(result: DiagnosedRecording) -> float | None:
-    """Find the start of a recording [s since 1970] from its content, file name or last change; None if unknown."""
-    from sealscope.recordings.joining import file_seconds, start_seconds
+    """Find the start of a recording [s since 1970] from its content or the file's name; None if unknown."""
+    from sealscope.recordings.joining import start_seconds
 
-    path = Path(result.diagnosis.file)
-    return file_seconds(result.recording, path) if path.is_file() else start_seconds(result.recording, path.name)
+    return start_seconds(result.recording, Path(result.diagnosis.file).name)
 
 
 def _run_collecting_messages(

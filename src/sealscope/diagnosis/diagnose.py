@@ -214,7 +214,7 @@ def diagnose(
         recording,
         machine,
         file=os.fspath(file) if file else None,
-        quality=(*inspection.findings, *comparable.findings),
+        quality=comparable.findings,
         false_alarm_probability=false_alarm_probability,
         baselines=len(comparable.parts),
         limit=repair_limit,

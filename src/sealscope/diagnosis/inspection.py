@@ -7,7 +7,7 @@ another recording, are left out for all detectors.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import SLOW
 from sealscope.recordings.corrections.samples import correct_samples
 from sealscope.recordings.hydraulics import describe_missing_chambers, find_implausibility
+from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
 from sealscope.recordings.recording import Recording, compute_once
 
@@ -43,6 +44,11 @@ class Inspection:
         if len(self.part) < SHORTEST:
             return f"needs {SHORTEST} samples or more, got {len(self.part)}"
         return self.distrust
+
+    @property
+    def defect_shares(self) -> dict[str, float]:
+        """Share of the samples in which each defect was found, by its code and channel (`_defect_name`)."""
+        return {_defect_name(finding): finding.count / len(self.part) for finding in self.findings if len(self.part)}
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -89,12 +95,35 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     return Inspection(part, findings, distrust, share, float(judged_until))
 
 
+def _defect_name(finding: Finding) -> str:
+    """Name the kind of a defect by its code and, if it is one of a channel, the channel."""
+    return f"{finding.code} {finding.channel or ''}".strip()
+
+
+def _lower_usual(judged: Inspection, entries: Sequence[Inspection | SummarisedRecording]) -> tuple[Finding, ...]:
+    """Make those findings on a recording notes that all of its comparable healthy recordings (`entries`) have, too.
+
+    In one of them a usual defect has at least 1 / `gaps.usual` (`priors.toml`) of its share of the samples.
+    """
+    healthy = [
+        entry.defect_shares if isinstance(entry, Inspection) else entry.about.get("defects", {}) for entry in entries
+    ]
+    shares, findings = judged.defect_shares, list[Finding]()
+    for finding in judged.findings:
+        name = _defect_name(finding)
+        known = [share[name] for share in healthy if name in share]
+        is_known = finding.severity == "warning" and known and len(known) == len(healthy)
+        is_usual = is_known and shares[name] <= RECORDINGS.gaps.usual * max(known)
+        findings.append(replace(finding, severity="note") if is_usual else finding)
+    return tuple(findings)
+
+
 class Baselines(NamedTuple):
     """Leak-free recordings that can be compared with the judged one, and reasons for those that cannot."""
 
     judged: Recording  # the judged recording, without channels that none of the comparable ones has
     parts: tuple[Healthy, ...]  # the comparable recordings: samples that can be analysed, or stored summaries
-    findings: tuple[Finding, ...]  # baselines that were left out, with the reasons, and channels that were left out
+    findings: tuple[Finding, ...]  # defects of the judged one, baselines left out, with the reasons, channels left out
     refusal: str | None  # if all given baselines were left out, the most frequent reason
 
 
@@ -132,6 +161,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
         refusal = f"no baseline recording can be used: {most_frequent_reason}"
     entries = [healthy[k] for k in sorted(index_of_digest.values())]  # in the order of `baseline`
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
+    findings = [*_lower_usual(judged, entries), *findings]
     part = judged.part
     # without a comparable baseline no channel is left out
     known = SLOW.union(*(entry.units for entry in entries)) if entries else part.channels.keys()

@@ -149,7 +149,7 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name)
+    request = Request(map or {}, rate, file.name, file)
     with _unpacked_file(file) as (inner, kind):
         return _read_unpacked(inner, kind, request)
 
@@ -195,7 +195,7 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name)
+    request = Request(map or {}, rate, file.name, file)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
     return _iter_parts(file, every, request)

@@ -6,6 +6,8 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
 from sealscope.recordings.channels import COUNTS, UNUSED, Array
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import is_pressure
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
@@ -84,4 +86,7 @@ def describe_missing_chambers(recording: Recording) -> str | None:
     if chambers_of(recording):
         return None
     unused = [line for line in recording.history if line.startswith(UNUSED)]
-    return "; ".join(["needs the pressure of a chamber (p_A or p_B)", *unused])
+    pressures = [name for name in recording.unused if is_pressure(Label.parse(name))]
+    maps = [f"--map '{channel}={name}'" for channel, name in zip(("p_A", "p_B"), pressures, strict=False)]
+    hint = f", such as by {' '.join(maps)}" if maps else ""
+    return "; ".join([f"needs the pressure of a chamber (p_A or p_B){hint}", *unused])

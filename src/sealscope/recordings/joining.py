@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -13,33 +12,27 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.errors import InputError
-from sealscope.recordings.formats.timebase import counts_from_1970, parse_epoch
+from sealscope.recordings.formats.times.dates import parse_name
+from sealscope.recordings.formats.times.timebase import counts_from_1970, parse_epoch
 from sealscope.recordings.recording import Recording
 
+_DAY = 86400.0  # [s]
 _SAME_START = 1e-6  # starts that differ by less [s] are equal: the times then continue from file to file
 _MAX_SECONDS = 1e11  # start [s] beyond which times are in another unit than s: it would be in the year 5138
-_YEAR_FIRST = re.compile(
-    r"(?<!\d)(?P<year>(?:19|20)\d\d)[-_.]?(?P<month>\d\d)[-_.]?(?P<day>\d\d)[-_ T.]?"
-    r"(?:(?P<hour>[01]\d|2[0-3])[-_.h:]?(?P<minute>[0-5]\d)(?:[-_.m:]?(?P<second>[0-5]\d))?)?(?!\d)"
-)
-#: Stamps on a 12-hour clock, which loggers write with the month first.
-_TWELVE_HOURS = re.compile(
-    r"(?<!\d)(?P<month>\d{1,2})[-_.](?P<day>\d{1,2})[-_.](?P<year>(?:19|20)\d\d)[-_ .]"
-    r"(?P<hour>\d{1,2})[-_.:](?P<minute>[0-5]\d)[-_.:](?P<second>[0-5]\d)[-_ ]?(?P<half>[AP])M",
-    re.IGNORECASE,
-)
 
 
 def start_seconds(recording: Recording, file: str = "") -> float | None:
     """Find the time of a recording's first sample [s since 1970]; None if it is not known.
 
     The time of t = 0 is the entry `start_epoch_s` or `start` of the provenance. Without these entries it is the date in
-    the file's name: the entry `file` of the provenance, or the argument `file` if that entry is missing, too. Dates and
-    times are taken as UTC; a date without a time of day means midnight.
+    the file's name: the entry `file` of the provenance, or the argument `file` if that entry is missing, too; so it is
+    if the entry `start` is that day without a time. Dates and times are taken as UTC; a date alone means midnight.
     """
-    start = _time_zero(recording)
-    if start is None:
-        start = _parse_file_name(str(recording.provenance.get("file") or file))
+    start, provenance = _time_zero(recording), recording.provenance
+    named_start = parse_name(str(provenance.get("file") or file), provenance.get("name_order"))
+    has_time = "T" in str(provenance.get("start", "T"))
+    if start is None or (not has_time and named_start is not None and 0.0 <= named_start - start < _DAY):
+        start = named_start
     if start is None:
         return None
     known = np.flatnonzero(np.isfinite(recording.t))  # samples with a time, which the first may lack
@@ -57,22 +50,6 @@ def file_seconds(recording: Recording, path: Path) -> float:
         return start
     times = recording.t[np.isfinite(recording.t)]
     return path.stat().st_mtime - (float(times[-1] - times[0]) if times.size else 0.0)
-
-
-def _parse_file_name(name: str) -> float | None:
-    """Parse the date and time in a file's name to seconds since 1970, as if in UTC; None if it contains no date."""
-    # in `3-14-2024_10-05-30_PM` the other pattern would find 2024-10-05
-    match = _TWELVE_HOURS.search(name) or _YEAR_FIRST.search(name)
-    if match is None:
-        return None
-    fields = match.groupdict()
-    hour = int(fields["hour"] or 0)
-    if fields.get("half"):  # AM or PM: 12 AM is midnight, 12 PM is noon
-        hour = hour % 12 + (12 if fields["half"].upper() == "P" else 0)
-    return parse_epoch(
-        f"{fields['year']}-{int(fields['month']):02d}-{int(fields['day']):02d}"
-        f"T{hour:02d}:{fields['minute'] or '00'}:{fields['second'] or '00'}"
-    )
 
 
 def _time_zero(recording: Recording) -> float | None:

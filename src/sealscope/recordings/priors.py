@@ -127,6 +127,8 @@ class GapPriors(PriorTable):
 
     motion: float  # [s] longest gap that is interpolated by a line in positions, angles, speeds and flows
     hole: float  # [s] length above which a filled gap has less weight in the diagnosis
+    few: float  # largest fraction of defective samples that no verdict depends on
+    usual: float  # largest ratio of a logger's usual defects to those in the healthy recordings
     live_zero: float  # smallest distance below zero, over its range, of a 4 to 20 mA sensor's reading without a supply
     dead: float  # largest variation of such a reading, over its distance from all other readings
 

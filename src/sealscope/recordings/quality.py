@@ -24,10 +24,10 @@ from sealscope.recordings.recording import Recording
 Severity = Literal["note", "warning", "fatal"]
 
 SHORTEST = 226  # fewest samples of a recording, the length of db8's level-4 filter: (16 - 1)(2^4 - 1) + 1
-_CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS = (
-    RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible
+_CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS, _GAPS = (
+    RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible, RECORDINGS.gaps
 )  # fmt: skip
-#: Intervals between these numbers of sampling steps are regular; a longer one is a gap.
+#: Intervals between these numbers of sampling steps are regular; a longer one is a gap, unless a logger polls.
 _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
 
@@ -82,6 +82,11 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
+def weigh_defects(count: float, total: int) -> Severity:
+    """Return "note" for so few defective samples of `total` that no verdict depends on them, else "warning"."""
+    return "note" if count <= _GAPS.few * total else "warning"
+
+
 def _make_finding(
     recording: Recording, code: str, channel: str | None, count: int, first: int, text: str, severity: Severity
 ) -> Finding:
@@ -103,7 +108,8 @@ def _time_findings(recording: Recording) -> list[Finding]:
     steps = np.diff(t[timed])
     reversed_steps, equal_steps = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0)
     positive_steps = steps[steps > 0]
-    add("missing_time", untimed, f"{format_count(untimed.size, 'sample')} without a time")
+    severity = weigh_defects(untimed.size, len(recording))
+    add("missing_time", untimed, f"{format_count(untimed.size, 'sample')} without a time", severity)
     largest_step_back = float(-steps[reversed_steps].min(initial=0.0))
     text = f"time goes back {_format_repetitions(reversed_steps.size)}, by up to {largest_step_back:g} s"
     add("reversed_time", timed[reversed_steps + 1], text)
@@ -120,21 +126,37 @@ def _time_findings(recording: Recording) -> list[Finding]:
                 add("rate_mismatch", timed[:1], text, "fatal")
                 sampling_step = median_step
             step = median_step  # gaps and scatter are those of the real clock
-        gaps = np.flatnonzero(steps > _MAX_STEP * step)
+        max_step = _longest_regular_step(positive_steps / step)  # [step]
+        if max_step > _MAX_STEP:  # a logger that polls: from sample to sample it takes the mean of its intervals
+            sampling_step = float(positive_steps[positive_steps <= max_step * step].mean())
+        gaps = np.flatnonzero(steps > max_step * step)
         n_lost = np.round((steps[gaps] - step) / sampling_step).sum()  # infinite if a time is absurd
         samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
         longest = float(steps[gaps].max(initial=0.0))
-        add("gap", timed[gaps], f"{format_count(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s")
-        regular_steps = positive_steps[positive_steps <= _MAX_STEP * step] / step
+        text = f"{format_count(gaps.size, 'gap')}, about {samples} lost, the longest {longest:g} s"
+        add("gap", timed[gaps], text, weigh_defects(float(n_lost), len(recording)))
+        regular_steps = positive_steps[positive_steps <= max_step * step] / step
         scatter = float(regular_steps.std()) if regular_steps.size else 0.0
         if scatter > _CLOCK.scatter:
-            is_irregular = (steps > 0) & (steps <= _MAX_STEP * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
+            is_irregular = (steps > 0) & (steps <= max_step * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
             add("irregular_sampling", timed[np.flatnonzero(is_irregular)], text)
     if len(recording) < SHORTEST:
         text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
         findings.append(Finding("too_short", "warning", None, len(recording), None, text))
     return findings
+
+
+def _longest_regular_step(steps: Array) -> float:
+    """Find the longest interval that is no gap, of positive `steps` (n,), all in sampling steps.
+
+    A converter loses whole samples, so that its intervals are whole numbers of sampling steps, to within
+    `clock.scatter` of `priors.toml` (rms). Those of a logger that polls are not, and are no gap up to `clock.near`.
+    """
+    near_steps = steps[steps <= _CLOCK.near]
+    deviations = near_steps - np.round(near_steps)
+    is_polled = near_steps.size and math.sqrt(float(np.mean(deviations**2))) > _CLOCK.scatter
+    return float(_CLOCK.near if is_polled else _MAX_STEP)
 
 
 def _format_repetitions(count: int) -> str:
@@ -183,7 +205,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         text = f"is in raw counts: state the unit (--map '{name}=COLUMN bar'), or a leak's size stays relative"
         add("raw_counts", values.size, 0, text, "note")
     if missing := _describe_missing(values, recording.rate):
-        add(*missing)
+        add(*missing, weigh_defects(missing[1], values.size))
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
         add("infinite", infinite.size, int(infinite[0]), f"{format_count(infinite.size, 'infinite sample')}")
@@ -216,7 +238,8 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
         text = f"is stuck {times} while it should move, first for {length / recording.rate:g} s"
-        add("stuck", int(stuck[:, 1].sum()), int(present[start]), text)
+        n_stuck = int(stuck[:, 1].sum())
+        add("stuck", n_stuck, int(present[start]), text, weigh_defects(n_stuck, values.size))
     # the spectrum of a channel with many missing samples would be wrong
     for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
         text = f"mains hum of {line.frequency:g} Hz, amplitude {format_value(line.amplitude, 3, is_span=True)}"

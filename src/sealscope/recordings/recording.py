@@ -6,6 +6,7 @@ a file, a stream); the truth of a simulation is never part of it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from html import escape
@@ -173,8 +174,11 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Duration [s], the number of samples over the nominal rate."""
-        return self.t.size / self.rate
+        """Duration [s]: from the first sample to one interval after the last, or by the rate if the time steps back."""
+        span = float(self.t[-1] - self.t[0]) + 1.0 / self.rate if self.t.size else 0.0
+        # `span` is that of the number of samples up to rounding, and is not finite if a time is missing
+        differs = math.isfinite(span) and abs(span * self.rate - self.t.size) > 0.5 and np.all(np.diff(self.t) >= 0.0)
+        return span if differs else self.t.size / self.rate
 
     @property
     def unused(self) -> tuple[str, ...]:

@@ -51,8 +51,7 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     provenance = recording.provenance
     start = f", from {provenance['start']}" if "start" in provenance else ""
     kind = f"{provenance['format']}; " if "format" in provenance else ""
-    seconds = len(recording) / recording.rate
-    clock = f"{len(recording)} samples at {recording.rate:g} Hz, {seconds:g} s{start}"
+    clock = f"{len(recording)} samples at {recording.rate:g} Hz, {recording.duration:.7g} s{start}"
     lines = [paragraph(f"{name}: {kind}{clock}", indent=2)]
     for channel, values in recording.channels.items():
         unit, display_samples = display_values(recording, channel, recording.pressure_unit)

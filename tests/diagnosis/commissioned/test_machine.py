@@ -18,8 +18,11 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import JudgedAlarm
 from sealscope.diagnosis.commissioned.machine_file import parse_moment
+from sealscope.diagnosis.commissioned.summary import MachineSummary, summarise_machine
 from sealscope.diagnosis.detectors.observation import compare_healthy
+from sealscope.diagnosis.healthy import SummarisedRecording
 from sealscope.errors import InputError
+from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.storage.atomic import remove_temporaries
 
 from ...refusals import refusal
@@ -54,6 +57,27 @@ def test_the_file_judges_as_the_recordings_do(healthy, file, leak, channels, see
 
 def figures_of(part) -> tuple:
     return part.detector, part.verdict, part.score, part.threshold
+
+
+@pytest.mark.parametrize(
+    ("channels", "needed"),
+    [(("p_A", "p_B", "omega"), "needs the position x, or strokes"), (("p_A", "p_B"), "theta or omega")],
+)
+def test_a_summary_names_what_the_recordings_lack(channels, needed):
+    """Not the speed, where it is recorded."""
+    units = {name: CHANNEL_UNITS[name] for name in channels}
+    recordings = [SummarisedRecording(f"{k}.csv", str(k), units, 50.0, 60.0, None, {}) for k in range(6)]
+    assert needed in " ".join(MachineSummary({}, {}, None).text(recordings, None).split())
+
+
+def test_a_summary_states_a_problem_of_many_recordings_once():
+    wrongs = [[f"1 gap, about {400 + k} samples lost", f"x: is stuck {k} times", "x: 3 missing"] for k in range(6)]
+    recordings = [
+        SummarisedRecording(f"{k}.csv", str(k), {"p_A": "Pa"}, 50.0, 60.0, None, {}, {"wrong": wrong})
+        for k, wrong in enumerate(wrongs)
+    ]
+    problems = summarise_machine(recordings, None).problems
+    assert problems == ["1 gap, about 405 samples lost (in 6 of 6)", "x: is stuck 5 times (in 6 of 6)"]
 
 
 @pytest.mark.slow

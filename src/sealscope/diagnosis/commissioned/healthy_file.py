@@ -228,6 +228,7 @@ _ABOUT = {
     "noise": uniform_table_type(_Magnitude),
     "log_units": uniform_table_type(str),
     "wrong": list_type(str),
+    "defects": uniform_table_type(_Number),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,7 +14,7 @@ import numpy as np
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
-from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.balances import circulation, equations
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
 #: Codes of findings of the severity "note" that are listed as problems of the machine: its logger causes them always.
 _LOGGER_HABITS = ("unsigned_speed",)
 _PRIORS = COMMISSIONED.smallest
+_NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
 class TermEstimate(NamedTuple):
@@ -89,9 +91,12 @@ class MachineSummary:
             noise.append(f"{name} {deviation:.2g} {display_unit}")
         seconds = sum(recording.seconds for recording in healthy)
         n_alarms = sum(BY_OTHERS in problem for problem in self.problems)  # recordings unlike the others
-        # each of n + 1 healthy recordings is equally likely to have the highest score
-        rate = f"1 in {len(healthy) + 1} by the ranks of {len(healthy)} healthy recordings alone, whatever their law"
-        needed = (rig or unstated_rig()).circuit.needed_channels
+        # by ranks, each of n + 1 healthy recordings is equally likely to have the highest score
+        rate = (
+            f"{100.0 * FALSE_ALARM_PROBABILITY:g} % of healthy recordings, by the law that their scatter is assumed to "
+        )
+        rate += f"follow; ranks of {len(healthy)} alone could not show fewer than 1 in {len(healthy) + 1}"
+        needed = _describe_needs(rig or unstated_rig(), frozenset(units))
         rows = [
             ("recordings", f"{len(healthy)} healthy, {seconds:.4g} s in all{span}"),
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in display_units.items())),
@@ -107,7 +112,7 @@ class MachineSummary:
     def _smallest_leak_rows(self, n_healthy: int, are_dated: bool, needed: str) -> list[tuple[str, str]]:
         """Build the rows (heading, text) on the smallest detectable leak and on the recordings needed to halve it.
 
-        `needed` names the channels of a volume balance.
+        `needed` describes what a volume balance lacks.
         """
         if self.smallest is None:
             text = f"not known, that needs {needed}, in two recordings; the ringing alone judges"
@@ -119,6 +124,15 @@ class MachineSummary:
         power = f"{100.0 * _PRIORS.power:g} % of the time"
         smallest = f"the next recording with such oil, loads and speeds shows {self.smallest} ({power})"
         return [("smallest leak", smallest), ("half of that", half)]
+
+
+def _describe_needs(rig: Rig, channels: frozenset[str]) -> str:
+    """Describe what a volume balance needs that the healthy recordings, with these `channels`, may lack."""
+    if equations(rig, channels):
+        return "more motion"
+    if circulation(rig, channels):
+        return "the position x, or strokes that bring the piston back to where it was, or hold it under a load"
+    return rig.circuit.needed_channels
 
 
 def _describe_rig(rig: Rig | None) -> str:
@@ -169,7 +183,7 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     - `oil_degC`: oil temperature [deg C].
     - `noise`: standard deviation of the noise of each channel, in the channel's unit.
     - `log_units`: unit of each channel in the log.
-    - `wrong`: list of problems as texts.
+    - `wrong`: list of problems as texts; `defects`: share of the samples with each defect, by its name.
     """
     part, description = inspection.part, dict[str, Any]()
     if {"p_A", "p_B"} <= set(part.channels) and part.units["p_A"] == "Pa":
@@ -183,7 +197,7 @@ def describe_recording(recording: Recording, inspection: Inspection) -> dict[str
     log_units = {name: unit for name, log_name in logged.items() if (unit := recording.unit_in_log(log_name))}
     if log_units:
         description["log_units"] = log_units
-    findings = inspection.findings
+    findings, description["defects"] = inspection.findings, inspection.defect_shares
     problems = [finding.text for finding in findings if finding.severity != "note" or finding.code in _LOGGER_HABITS]
     problems += [
         f"{name} is not read: if it is the oil's temperature, then --map 'T_oil={name}', as warm oil leaks more"
@@ -283,18 +297,19 @@ def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channel
 
 
 def _collect_problems(healthy: Sequence[SummarisedRecording]) -> list[str]:
-    """List the problems of all healthy recordings, one line for each kind, i.e. each text before the first colon.
+    """List the problems of all healthy recordings, one line for each kind: the text before a colon, without numbers.
 
     A line shows the alphabetically last of the texts, and the recording's name or the number of recordings.
     """
     by_kind = defaultdict[str, list[tuple[str, str]]](list)
     for recording in healthy:
         for text in recording.about.get("wrong", ()):
-            by_kind[text.partition(":")[0]].append((text, recording.file))
+            by_kind[_NUMBER.sub("", text.partition(":")[0])].append((text, recording.file))
     lines = []
     for problems in by_kind.values():
         text, file = max(problems)
-        lines.append(f"{text} ({file if len(problems) == 1 else f'in {len(problems)} of {len(healthy)}'})")
+        files = {file for _, file in problems}
+        lines.append(f"{text} ({file if len(files) == 1 else f'in {len(files)} of {len(healthy)}'})")
     return lines
 
 

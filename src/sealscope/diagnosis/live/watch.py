@@ -43,7 +43,7 @@ from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
-from sealscope.recordings.formats.timebase import clock_text, counts_from_1970
+from sealscope.recordings.formats.times.timebase import clock_text, counts_from_1970
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
 from sealscope.units import LITRE_PER_MINUTE

@@ -12,7 +12,7 @@ from sealscope.diagnosis.commissioned.machine import JUDGEMENTS, CommissionedMac
 from sealscope.diagnosis.commissioned.machine_file import update_machine
 from sealscope.errors import SealscopeError, printable
 from sealscope.monitor.alarms import Alarm
-from sealscope.recordings.formats.timebase import counts_from_1970
+from sealscope.recordings.formats.times.timebase import counts_from_1970
 from sealscope.recordings.joining import join
 from sealscope.recordings.recording import Recording
 from sealscope.storage.toml_file import read_toml

@@ -21,7 +21,7 @@ from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import latest_alarms
 from sealscope.monitor.mqtt_client import MqttLink
 from sealscope.monitor.settings import BrokerSettings, SparkplugSettings, read_secret, topic_level
-from sealscope.recordings.formats.timebase import counts_from_1970
+from sealscope.recordings.formats.times.timebase import counts_from_1970
 
 _log = logging.getLogger(__name__)
 #: Names under which the database stores the numbers of the last sent event, and of the last birth message.

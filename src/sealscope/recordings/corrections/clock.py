@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.formats.timebase import interpolate_samples
+from sealscope.recordings.formats.times.timebase import interpolate_samples
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 

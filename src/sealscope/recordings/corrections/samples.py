@@ -29,7 +29,7 @@ from sealscope.recordings.corrections.stale import (
 )
 from sealscope.recordings.corrections.unsigned import restore_signs
 from sealscope.recordings.motion import find_runs
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import Finding, weigh_defects
 from sealscope.recordings.recording import Recording
 
 
@@ -81,7 +81,9 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     if len(part) and n_within < len(recording):
         text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {n_within} of {len(recording)} samples"
         first = float(part.t[0])
-        findings.append(Finding("part_analysed", "warning", None, len(recording) - n_within, first, text))
+        n_outside = len(recording) - n_within
+        severity = weigh_defects(n_outside, len(recording))
+        findings.append(Finding("part_analysed", severity, None, n_outside, first, text))
     return CorrectedSamples(part, tuple(findings), unusable, n_within / max(len(recording), 1))
 
 

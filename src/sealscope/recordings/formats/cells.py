@@ -18,7 +18,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.labels import Label, is_unit
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import is_stamp
+from sealscope.recordings.formats.times.timebase import is_stamp
 from sealscope.units import parse_unit
 
 #: Texts that loggers write for a missing sample, in lower case.

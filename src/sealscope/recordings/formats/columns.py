@@ -7,6 +7,7 @@ from collections.abc import Container, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from math import isfinite
+from pathlib import Path
 from typing import Literal
 
 from sealscope.calls import nearest
@@ -48,6 +49,7 @@ class Request:
     map: ChannelMap  # channel -> column, or "auto" to choose by the columns' names
     rate: float | None = None  # sampling rate [Hz] in place of a time column
     file: str = ""  # name of the file for the provenance
+    path: Path | None = None  # the file, if others beside it may tell whether dates begin with the day
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
@@ -397,9 +399,10 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
             choice.notes.append(f"time column {choice.time_label.whole} not used: the rate was given as {rate:g} Hz")
     elif choice.time is None:
         if stated_rate is None:
+            proposal = format_map({channel: labels[column].whole for column, channel in choice.channel_of.items()})
             raise InputError(
                 "a recording must have a time column such as t [s] or be given a rate, "
-                f"got columns {_format_columns(labels)}"
+                f"got columns {_format_columns(labels)}; name it by --map t=COLUMN; channels would be {proposal}"
             )
         choice.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
     if choice.time is not None:  # a column of dates completes a time column that has only times of day

@@ -15,6 +15,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,15 +27,14 @@ from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, Array
 from sealscope.recordings.formats.cells import MAX_WORD_FRACTION, parse_numbers
 from sealscope.recordings.formats.columns import CLOCK_LABEL, ColumnMap, Request, choose_columns
 from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
-from sealscope.recordings.formats.timebase import (
+from sealscope.recordings.formats.times.dates import find_order, stated_start
+from sealscope.recordings.formats.times.timebase import (
     TimeState,
     interpolate_samples,
     is_falling,
-    iso_moment,
     nominal_rate,
     parse_stamps,
     time_base,
@@ -216,15 +216,19 @@ def convert_columns(
     else:
         t, rate, start, time_notes = time_base(time, label.unit, label.whole, choice.rate, state)
         notes += time_notes
-        if not start and (scope_begin := scope_start(remarks)) is not None:
-            start = {"start": iso_moment(scope_begin)}
         if description is not None and abs(rate / description["rate"] - 1.0) <= _SAME_RATE:
             rate = description["rate"]
     if description is not None:  # a recording that Sealscope has written states its provenance itself
         return RecordingFields(
             t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
         )
-    details = {"file": request.file, "format": kind, **start, "about": dict(remarks), "columns": choice.names}
+    path = request.path or Path(request.file)
+    order = find_order(path)
+    if not start:
+        start, start_notes = stated_start(remarks, path, order, _find_time_of_day(time, t))
+        notes += start_notes
+    details = {"file": request.file, "name_order": order, "format": kind, **start, "about": dict(remarks)}
+    details |= {"columns": choice.names}
     details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
     details["log_units"] = log_units
     # no empty ones, but a start of 0
@@ -270,6 +274,15 @@ def _join_time(choice: ColumnMap, columns: Mapping[int, NDArray[Any]], label: La
         )
     notes.append(f"{', '.join(parts)} not used: not parts of the seconds in column {label.whole}")
     return columns[choice.time]
+
+
+def _find_time_of_day(time: NDArray[Any], t: Array) -> np.timedelta64 | None:
+    """Find the time of the day at 0 s from time stamps (n,) and the times `t` (n,) [s]; None without stamps."""
+    if time.dtype.kind != "M" or not (known := np.flatnonzero(~np.isnat(time))).size:
+        return None
+    stamp = time[known[0]].astype("datetime64[ns]")
+    zero = stamp - np.timedelta64(round(float(t[known[0]]) * 1e9), "ns")
+    return np.timedelta64(zero - zero.astype("datetime64[D]").astype("datetime64[ns]"), "ns")
 
 
 def _has_time_of_day(time: NDArray[Any]) -> bool:

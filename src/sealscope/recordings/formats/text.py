@@ -60,7 +60,8 @@ from sealscope.recordings.formats.text_layout import (
     detect_layout,
     split_at_blanks,
 )
-from sealscope.recordings.formats.timebase import (
+from sealscope.recordings.formats.times.dates import is_day_first_beside
+from sealscope.recordings.formats.times.timebase import (
     TimeState,
     ambiguous_dates,
     explicit_order,
@@ -542,7 +543,8 @@ class _Log:
     def _detect_day_first(self) -> bool:
         """Detect if the day precedes the month, from the log's beginning to the first date with a number over 12.
 
-        Without such a date, the order is guessed (`is_day_first`), and `order_note` says so.
+        Without such a date, the file's name or the logs beside it decide (`is_day_first_beside`), or else the order is
+        guessed (`is_day_first`), and `order_note` says so.
         """
         log = _Log(self.path, self.layout, self.kinds, self.date)  # reads ahead without changing this reader
         columns = [column for column, kind in self.kinds.items() if kind == "time"]
@@ -554,10 +556,14 @@ class _Log:
                     column_dates.update(ambiguous_dates(self._join_dates(rows, column)))
                 if any(explicit_order(date) is not None for date in dates):
                     break
-        order = is_day_first(dates)
+        first_date = next((date for column_dates in dates for date in column_dates), "")
         if all(explicit_order(date) is None for date in dates):
+            if (order_beside := is_day_first_beside(self.path, first_date)) is not None:
+                return order_beside
+            order = is_day_first(dates)
             self.order_note = f"dates read as {'day, month' if order else 'month, day'}: none has a number over 12"
-        return order
+            return order
+        return is_day_first(dates)
 
     def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
         """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.

@@ -45,8 +45,8 @@ if TYPE_CHECKING:
 #: Reason for having no balance; the key is True if the position is recorded.
 _NO_BALANCE = {
     True: "finds no time in which the piston is held under a constant command u, for long enough, in {:.3g} s",
-    False: "needs the position x: no loop brings the piston back or holds it under a pressure difference, for long "
-    "enough in {:.3g} s",
+    False: "needs the position x, or a piston that returns to where it was, or is held under a pressure difference, "
+    "for longer than in these {:.3g} s",
 }
 #: Reason for having no balance if a channel is missing and the healthy recordings show no creep of a held load.
 _NO_CREEP = "needs {}; without them it judges a held load that creeps in the healthy recordings"

@@ -26,6 +26,8 @@ _UNSPACED = frozenset(
 _CHANNELS: dict[str, str] = WORDS["channel"]
 _UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANNELS.items() if kind != "spool"}
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
+#: Kinds of opposite words of sides: that of chamber A, and that of chamber B. A spring is opposite to the pressure.
+_OPPOSITE = (("opening", "closing"), ("opening", "spring"), ("closing", "spring"), ("push", "pull"))
 _PRESSURES = {"A": "p_A", "B": "p_B", "1": "p_1", "2": "p_2", "pump 1": "p_1", "pump 2": "p_2"}
 _TOKEN = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+|[^\W\d_a-zA-Z]+")
 #: The last capitalised word of a name: `Bar` of `MainPaBar`; two letters are not a unit, as `MainPa` is pressure A.
@@ -60,10 +62,10 @@ def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
     A unit at the end of a name (``PA_bar``) becomes the unit of the column. A map of the time alone is left out, too.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    head_side = _find_head_side(labels)  # the chamber that the word "head" means in these names
+    sides = _find_sides(labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
-        guess = None if label.name.casefold() in channel_names else _guess_meaning(label, head_side)
+        guess = None if label.name.casefold() in channel_names else _guess_meaning(label, sides)
         if guess is None or (_is_named_time(label) and guess.kind != "time"):  # X_Value is a time, not a position
             continue
         if guess.channel is not None:
@@ -186,6 +188,12 @@ def is_temperature(label: Label) -> bool:
     return unit is not None and same_dimension(unit, "K")
 
 
+def is_pressure(label: Label) -> bool:
+    """Test whether a column has a unit of pressure, in its heading or at the end of its name."""
+    _name, unit = find_name_and_unit(label)
+    return unit is not None and same_dimension(unit, "Pa")
+
+
 def is_measured(label: Label) -> bool:
     """Test whether a column is a measured pressure, position, speed or flow, and neither a set point nor computed."""
     if len(label.name) > _MAX_NAME:
@@ -224,25 +232,44 @@ def _split_words(name: str) -> set[str]:
     return words
 
 
-def _find_head_side(labels: Sequence[Label]) -> str:
-    """Find the chamber that the word "head" means in the headings of a log, "A" or "B"; "" if unknown or not used."""
-    words = {word for label in labels if len(label.name) <= _MAX_NAME for word in _split_words(label.name)}
-    if not words & _SIDE["head"]:
-        return ""
-    # if a column is named after the rod (side B) or the cap (side A), not just by a letter, the head is opposite
-    return "A" if words & (_SIDE["B"] - {"b"}) else "B" if words & (_SIDE["A"] - {"a"}) else ""
+def _find_sides(labels: Sequence[Label]) -> dict[str, str]:
+    """Find the chamber, "A" or "B", of words that mean one only in the company of others: word -> chamber.
+
+    - "head" is the chamber opposite to that of the rod (B) or the cap (A), if a heading names these by a word.
+    - A word of `_OPPOSITE`, such as "opening", counts if one pressure of a side has it, and one the opposite word. A
+      pressure that a word of `side` assigns to a chamber does not count.
+    """
+    names = [(label, _split_words(label.name)) for label in labels if len(label.name) <= _MAX_NAME]
+    words = set[str]().union(*(words for _, words in names))
+    sides = {}
+    if words & (_SIDE["B"] - {"b"}):
+        sides = dict.fromkeys(_SIDE["head"], "A")
+    elif words & (_SIDE["A"] - {"a"}):
+        sides = dict.fromkeys(_SIDE["head"], "B")
+    pressures = [
+        words
+        for label, words in names
+        if words & _SIDE["place"] and not words & (_SIDE["A"] | _SIDE["B"]) and is_pressure(label)
+    ]
+    for pair in _OPPOSITE:
+        if all(sum(bool(words & _SIDE[kind]) for words in pressures) == 1 for kind in pair):
+            for kind, side in zip(pair, "AB", strict=True):
+                sides |= dict.fromkeys(_SIDE[kind], side)
+            break
+    return sides
 
 
-def _guess_meaning(label: Label, head_side: str = "") -> _Guess | None:
+def _guess_meaning(label: Label, sides: Mapping[str, str] | None = None) -> _Guess | None:
     """Guess the meaning of a column from its name and unit; None if they do not tell.
 
-    `head_side`: the chamber that the word "head" means, "A", "B" or "" if unknown.
+    `sides`: chamber of the words that mean one only in the company of others, as from `_find_sides`.
     """
     if len(label.name) > _MAX_NAME:
         return None
     name, unit = find_name_and_unit(label)
     words = _split_words(name)
-    side = head_side if words & _SIDE["head"] and head_side else _find_side(words)
+    found_sides = {side for word, side in (sides or {}).items() if word in words}
+    side = found_sides.pop() if len(found_sides) == 1 else _find_side(words)
     if unit is not None and same_dimension(unit, "Pa"):
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil

@@ -18,7 +18,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import collect_remarks
 from sealscope.recordings.formats.table import Clock, RecordingFields, Series, build_fields, check_size
 from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
-from sealscope.recordings.formats.timebase import ambiguous_dates, is_day_first, parse_stamps, timedelta_seconds
+from sealscope.recordings.formats.times.timebase import ambiguous_dates, is_day_first, parse_stamps, timedelta_seconds
 
 #: Line that ends each header.
 _END_MARK = "***End_of_Header***"

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.table import MAX_VALUES, Clock, Series, uniform_clock
-from sealscope.recordings.formats.timebase import timedelta_seconds
+from sealscope.recordings.formats.times.timebase import timedelta_seconds
 
 #: Deepest nesting that is read, and most columns of a matrix that are series.
 _MAX_DEPTH, _MAX_COLUMNS = 8, 256

@@ -1,0 +1,1 @@
+"""Times: those of the samples, and when a recording was made."""
