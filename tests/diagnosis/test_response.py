@@ -74,9 +74,30 @@ def test_a_path_that_made_the_record_is_followed() -> None:
     own = fit_response(recording, THESIS)
     assert own is not None
     assert np.sqrt(own.variance) == pytest.approx(4e3, rel=0.03)
-    followed = own.theta + own.mean.reshape(blocks, -1) * own.priors.unit
+    followed = own.fitted
     assert np.diff(followed[:, G].reshape(2, -1).mean(axis=1))[0] == pytest.approx(step, rel=0.4)
     np.testing.assert_allclose(followed[:, K_OIL], BELIEFS.centre[K_OIL], rtol=0.02)
+
+
+@pytest.mark.parametrize("seed", [102, 104, 107])
+def test_a_short_fast_record_does_not_end_in_a_minimum_of_a_faster_leaking_pump(seed: int) -> None:
+    recording = ss.simulate(command="5 sin(2t)", duration=20.0, set={"pump.G_pump": "4e-13 m^3/(s Pa)"}, seed=seed)
+    level = measure_leak(recording, THESIS).level
+    assert abs(level.value - 4e-13) < 3.0 * level.deviation
+    assert level.deviation < 3e-13
+
+
+def test_conditioned_parameters_have_the_stated_mean_and_cost_what_the_posterior_says(
+    leaking: tuple[ss.Recording, float],
+) -> None:
+    joint = fit_response(leaking[0], THESIS)
+    assert joint is not None
+    mean = joint.fitted[:, G].mean()
+    conditioned, loss = joint.condition(G, mean + 1e-12)
+    assert conditioned[:, G].mean() == pytest.approx(mean + 1e-12)
+    change = ((conditioned - joint.fitted) / joint.priors.unit).ravel()
+    assert loss == pytest.approx(float(change @ np.linalg.solve(joint.covariance, change)), rel=1e-3)
+    np.testing.assert_allclose(joint.condition(G, mean)[0], joint.fitted)
 
 
 @pytest.fixture(scope="module")

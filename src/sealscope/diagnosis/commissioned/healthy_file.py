@@ -210,7 +210,18 @@ _SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *ZERO_KEYS
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
-    PRESSURE_RESPONSE: (table_type("allow", level=_Number), None),
+    PRESSURE_RESPONSE: (
+        table_type(
+            "allow",
+            level=_Number,
+            error=(_Magnitude, None),
+            flow=(_Magnitude, None),
+            pressure=(_Magnitude, None),
+            start_s=(_Time, None),
+            oil_degC=(_Number, None),
+        ),
+        None,
+    ),
     RMS_CHANGE: (Annotated[_RMS, AfterValidator(_check_levels)], None),
     SIGNALS: (
         table_type(

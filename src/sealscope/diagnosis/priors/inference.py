@@ -52,7 +52,6 @@ class ScatterPriors(PriorTable):
     """Scatter of the leakage between recordings of one machine; leakages are divided by the pump's mean flow."""
 
     between: float  # factor by which all standard deviations of `DifferencePriors` together may be wrong
-    freedom: float  # degrees of freedom of the prior on the scatter of conductances (`student_rise`)
     estimate: float  # smallest scatter, over the standard error that a recording states for its leakage
     finest: float  # smallest scatter of the leakage
     largest: float  # largest scatter of the leakage

@@ -17,8 +17,8 @@ each width all z are normal about an unknown mean. These effects contribute to t
   standard error to a tenth of the flow, so five recordings that agree allow a smaller sigma than two do.
 - Sessions: recordings of one session share oil and set-up. The deviation tau of a session has a half-normal prior.
   Sessions are separated by date; undated recordings form one session.
-- Oil (`oil`): z has a slope in the temperature or in the viscous drop, and a recording with oil outside of the known
-  range is less certain; unknown oil is covered by tau.
+- Oil (`oil`): z has an uncertain slope in the temperature or in the viscous drop, so that a recording is the less
+  certain the further its oil is from the mean; unknown oil is covered by tau.
 - Conditions (`conditions`): load and speed outside of the known range make a recording less certain.
 
 The rise follows the mixture over all of these. The priors are in `priors.toml`.
@@ -135,24 +135,45 @@ def _compare_held(
     if getattr(judged, name) is None or len(baseline) < MIN_WITH_HOLDS:
         return None
     leaks = np.array([getattr(recording, name)[:2] for recording in (*baseline, judged)])
+    session_deviation = None if session_share is None else session_share * abs(float(leaks[:-1, 0].mean()))
+    return leak_rise(
+        [*baseline, judged], leaks, part=1.0, min_crossover=min_crossover, session_deviation=session_deviation
+    )
+
+
+def leak_rise(
+    recordings: Sequence[RecordingSums],
+    leaks: Array,
+    *,
+    part: float,
+    min_crossover: float = 0.0,
+    session_deviation: float | None = None,
+) -> Rise:
+    """Estimate by how much the leak of a recording, measured in each by itself, exceeds that of healthy recordings.
+
+    `recordings` (n + 1): the healthy ones, then the judged one; `leaks` (n + 1, 2): conductance and standard deviation
+    [m^3/(s Pa)] of each; `part`: smallest plausible scatter of the healthy leaks, over their median standard deviation;
+    `min_crossover`, `session_deviation`: as in `_compare_levels`.
+    """
+    *baseline, judged = recordings
     *healthy_leaks, leak = leaks[:, 0]
     level = float(np.mean(healthy_leaks))
     # smallest scatter of a healthy leak: the fraction `finest` of the pump's mean flow, as a conductance, and never 0
     min_error = max(INFERENCE.scatter.finest * judged.conductance_of_flow, 1.0 / MAX_READING)
-    error = np.maximum(np.median(leaks[:, 1]), min_error)  # median over all leaks, the judged one included
+    error = max(float(np.median(leaks[:, 1])), min_error)  # median over all leaks, the judged one included
     rise = _compare_levels(
         judged,
         baseline,
         values=np.array([leak - level]),
         rises=(np.array(healthy_leaks) - level)[None],
-        errors=error[None],
+        errors=np.array([max(part * error, min_error)]),
         level=max(level, 0.0),  # a mean below 0 is an error of the estimates
         level_error=error / np.sqrt(len(baseline)),
         min_crossover=min_crossover,
-        session_deviation=None if session_share is None else session_share * abs(level),
+        session_deviation=session_deviation,
     )
     # the median `error` is included already; a less precise judged recording adds the difference
-    return rise.widen(float(leaks[-1, 1]) ** 2 - float(error) ** 2)
+    return rise.widen(float(leaks[-1, 1]) ** 2 - error**2)
 
 
 def _compare_levels(

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
-from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
@@ -202,20 +200,3 @@ def rise_of_mixture(predicted: Mixture, values: Array) -> Rise:
     low, median, high = (mixture.quantile(probability) for probability in (0.16, 0.5, 0.84))
     errors = mixture._replace(centres=mixture.centres - median)
     return Rise(value=-median, deviation=0.5 * (high - low), degrees_of_freedom=np.inf, mixture=errors)
-
-
-def student_rise(value: float, deviations: Sequence[float] | Array, prior_scatter: float) -> Rise:
-    """Make a rise by `value` whose error follows Student's t, with the scatter of n healthy recordings as its scale.
-
-    `deviations` (n,): deviation d_j of each healthy recording from the mean of the others; `prior_scatter`: prior
-    standard deviation s of a recording, which counts as much as m recordings (`scatter.freedom` of `priors.toml`). With
-    m + n - 1 degrees of freedom,
-
-        deviation^2 = (m s^2 + ((n - 1)/n)^2 sum d_j^2) / (m + n - 1) (1 + 1/n).
-    """
-    prior, count = INFERENCE.scatter, len(deviations)
-    freedom = prior.freedom + count - 1
-    sum_of_squares = prior.freedom * prior_scatter**2
-    sum_of_squares += float(np.sum(np.square(deviations))) * ((count - 1) / count) ** 2
-    deviation = max(float(np.sqrt(sum_of_squares / freedom * (1.0 + 1.0 / count))), np.finfo(float).tiny)
-    return Rise(value, deviation, degrees_of_freedom=freedom)

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.inference.comparison.recording_sums import NO_SUMS, RecordingSums
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Information, step_tests
+from sealscope.diagnosis.inference.onset import Estimate, Information, step_tests
 from sealscope.diagnosis.inference.pressures.leak import ResponseLeak
 from sealscope.diagnosis.inference.pressures.response import measure_leak
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
@@ -40,9 +41,17 @@ class PressureResponse:
         return measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording by its mean conductance past the piston [m^3/(s Pa)]; None if that fails."""
+        """Summarise a healthy recording by its leakage and conditions; None if the leakage cannot be measured.
+
+        - `level`, `error`: mean conductance past the piston and its standard error [m^3/(s Pa)];
+        - the fields of `recording_sums.RecordingSums` that are known but the sums.
+        """
         leak = self.reading(recording)
-        return None if leak is None else {"level": leak.level[0]}
+        if leak is None:
+            return None
+        summary = {"level": leak.level.value, "error": leak.level.deviation, **leak.conditions._asdict()}
+        del summary["sums"]
+        return {name: value for name, value in summary.items() if value is not None}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test each parameter of a recording's pressure response for a step, measure the leakage, and report both.
@@ -55,13 +64,20 @@ class PressureResponse:
             return Observed(
                 self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
             )
-        leak.healthy = [summary["level"] for summary in healthy_summaries(self, baseline)]
+        leak.healthy = [_restore_level(summary) for summary in healthy_summaries(self, baseline)]
         if leak.step is None and leak.rise is None:
             return Observed(self.name, lack="too little motion: no leak would show")
         is_known = np.ones(len(recording), bool) if recording.bridged is None else ~recording.bridged
         judged_until = (np.flatnonzero(is_known)[-1] + 1.0) / len(is_known) if is_known.any() else 0.0
         observables = score_response_steps(leak.parameters)
         return Observed(self.name, observables, leak, share=float(is_known.mean()), judged_until=float(judged_until))
+
+
+def _restore_level(summary: Summary) -> tuple[Estimate, RecordingSums]:
+    """Return the leakage and the conditions of a healthy recording from its summary; those of old files are unknown."""
+    level = Estimate(summary["level"], summary.get("error", 0.0))
+    flow, pressure = summary.get("flow", 0.0), summary.get("pressure", 0.0)
+    return level, RecordingSums(NO_SUMS, flow, pressure, summary.get("start_s"), summary.get("oil_degC"))
 
 
 def score_response_steps(information: Mapping[str, Information]) -> tuple[Observable, ...]:

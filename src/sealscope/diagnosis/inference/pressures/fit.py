@@ -119,7 +119,8 @@ class Joint:
 
     `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p): fitted
     deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): prior precision
-    of the same deviations; `variance`: variance of the residual [Pa^2].
+    of the same deviations; `variance`: variance of the residual [Pa^2]; `squares`: sum of squares of the residual at
+    `theta` [Pa^2].
     """
 
     priors: Priors
@@ -128,6 +129,29 @@ class Joint:
     covariance: Array
     prior_precision: Array
     variance: float
+    squares: float
+
+    @property
+    def fitted(self) -> Array:
+        """Fitted parameters in all blocks, (K, p)."""
+        return self.theta + self.mean.reshape(self.theta.shape) * self.priors.unit
+
+    def condition(self, parameter: int, mean: float) -> tuple[Array, float]:
+        """Fit the parameters (K, p) if that with the index `parameter` has a given `mean` over all blocks.
+
+        Also returns the increase of -2 log posterior by this condition. The model is the linearised one.
+        """
+        indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
+        change = (mean - self.fitted[:, parameter].mean()) / self.priors.unit[parameter]
+        covariances = self.covariance[:, indices].mean(axis=1)  # of all parameters with that mean
+        variance = float(covariances[indices].mean())
+        changes = (covariances * (change / variance)).reshape(self.theta.shape)
+        return self.fitted + changes * self.priors.unit, float(change**2 / variance)
+
+    def cost(self, variance: float) -> float:
+        """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise `variance` [Pa^2]."""
+        deviations = ((self.theta - self.priors.centre) / self.priors.unit).ravel()
+        return self.squares / variance + float(deviations @ self.prior_precision @ deviations)
 
     @staticmethod
     def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
@@ -149,7 +173,8 @@ class Joint:
             mean = cho_solve(factor, gradient / (variance * inflation) - prior_gradient, check_finite=False)
             variance, inflation = _estimate_noise(blocks, mean, parameter)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
-        return Joint(priors, theta, mean, covariance, prior_precision, variance)
+        squares = sum(float(block.gram[0, 0]) for block in blocks)
+        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
         """Compute the likelihood of the parameter with the index `parameter` in K blocks, all others eliminated.

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.comparison.rise import Rise, student_rise
+from sealscope.diagnosis.inference.comparison.levels import leak_rise
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
 from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_test
+from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, TotalLeakage
 from sealscope.recordings.recording import Array
@@ -43,9 +46,9 @@ class ResponseLeak(LeakMeasure):
     - `parameters`: likelihood in K blocks of each parameter of the response, by the parameter's name; "G" is the
       conductance past the piston [m^3/(s Pa)].
     - `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa].
-    - `mean_flow`: mean flow of the pump [m^3/s] over the recording.
+    - `conditions`: mean flow of the pump and mean of abs(p_A - p_B), date and oil of the recording, without sums.
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
-    - `healthy`: mean conductance of each healthy recording of the machine [m^3/(s Pa)].
+    - `healthy`: `level` and `conditions` of each healthy recording of the machine.
 
     There is no `rise_flow`, since the level of the conductance depends on the assumed friction, and no leak's share of
     the pump's flow (`relative`), which is only assumed from the command.
@@ -60,12 +63,12 @@ class ResponseLeak(LeakMeasure):
         self,
         parameters: Mapping[str, Information],
         pressure: Array,
-        mean_flow: float,
+        conditions: RecordingSums,
         *,
         stated: bool,
-        healthy: Sequence[float] = (),
+        healthy: Sequence[tuple[Estimate, RecordingSums]] = (),
     ) -> None:
-        self.parameters, self.pressure, self.mean_flow = parameters, pressure, mean_flow
+        self.parameters, self.pressure, self.conditions = parameters, pressure, conditions
         self.stated, self.healthy = stated, healthy
 
     @property
@@ -74,10 +77,10 @@ class ResponseLeak(LeakMeasure):
         return self.parameters["G"]
 
     @property
-    def level(self) -> tuple[float, float]:
-        """Conductance over the recording [m^3/(s Pa)], as if it were constant, and its standard error."""
+    def level(self) -> Estimate:
+        """Conductance over the recording [m^3/(s Pa)], as if it were constant."""
         precision = max(float(self.information.precision.sum()), np.finfo(float).tiny)
-        return float(self.information.vector.sum()) / precision, precision**-0.5
+        return Estimate(float(self.information.vector.sum()) / precision, precision**-0.5)
 
     @cached_property
     def step(self) -> StepTest | None:
@@ -108,15 +111,17 @@ class ResponseLeak(LeakMeasure):
     @cached_property
     def rise(self) -> Rise | None:
         """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings; None without these."""
-        count = len(self.healthy)
-        if not count:
+        if not self.healthy:
             return None
-        total = sum(self.healthy)
-        # each healthy level minus the mean of the others: the judged level is compared with a mean in the same way; a
-        # single healthy level has no others, and counts by its number only
-        differences = [level - (total - level) / (count - 1) for level in self.healthy] if count > 1 else [0.0]
-        judged_level, _ = self.level
-        return student_rise(judged_level - total / count, differences, PRESSURE.conductance.level)
+        levels, conditions = zip(*self.healthy, (self.level, self.conditions), strict=True)
+        return leak_rise(
+            conditions,
+            np.array(levels),
+            part=INFERENCE.scatter.estimate,
+            # levels are compared by their differences, as they are uncertain by the assumed friction
+            min_crossover=INFERENCE.scatter.largest * self.conditions.conductance_of_flow,
+            session_deviation=PRESSURE.conductance.level,
+        )
 
     @property
     def bound_flow(self) -> float:
@@ -147,7 +152,7 @@ class ResponseLeak(LeakMeasure):
     @property
     def pump_flow(self) -> tuple[float, float]:
         """Mean flow of the pump [m^3/s] over the recording, which also stands for the flow while it delivers."""
-        return self.mean_flow, self.mean_flow
+        return self.conditions.flow, self.conditions.flow
 
     @property
     def lpm_per_flow(self) -> float | None:
@@ -156,7 +161,7 @@ class ResponseLeak(LeakMeasure):
 
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return a `TotalLeakage` that states only the smallest detectable leak, as the pressures show only changes."""
-        pump_flow, lpm_per_flow = self.mean_flow, self.lpm_per_flow
+        pump_flow, lpm_per_flow = self.conditions.flow, self.lpm_per_flow
         return TotalLeakage(
             lpm=None,
             interval_lpm=None,

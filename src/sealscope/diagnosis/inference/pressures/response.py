@@ -22,7 +22,8 @@ import numpy as np
 from scipy.linalg.lapack import dtbtrs
 from scipy.ndimage import gaussian_filter1d
 
-from sealscope.diagnosis.inference.onset import Information
+from sealscope.diagnosis.inference.comparison.recording_sums import NO_SUMS, RecordingSums
+from sealscope.diagnosis.inference.onset import WITHIN_95, Information
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint, Linearisation, Normal, Priors
 from sealscope.diagnosis.inference.pressures.leak import ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
@@ -48,6 +49,8 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
 from sealscope.diagnosis.inference.pressures.samples import block_edges, find_unmet_requirement, mains_waves
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.physics.lanes import SINGLE_WIDTH
+from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording, compute_once
 
 if TYPE_CHECKING:
@@ -60,11 +63,25 @@ _POSITIVE, _MIN = [GAIN, K_OIL, F_C, K_BRK, C_C], 1e-9
 _N_STEPS, _MIN_GAIN = 12, 5.0
 #: Fractions of a Gauss-Newton step that are tried together.
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
+#: Joint fit of all blocks: maximum number of Gauss-Newton steps; fraction of a step that follows a failed one; largest
+#: predicted increase of -2 log posterior at a second start.
+_N_JOINT_STEPS, _PART, _MAX_LOSS = 10, 0.3, 100.0
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
     """Return `count` values that are spaced geometrically from `middle` / `factor` to `middle` * `factor`."""
     return np.asarray(middle * np.geomspace(1.0 / factor, factor, count))
+
+
+def limit_step(stepped: Array, theta: Array) -> Array:
+    """Limit parameters (..., p) after one step from `theta` (..., p).
+
+    Parameters that must be positive can at most halve or double. Lag and compliance have lower limits.
+    """
+    limited = stepped.copy()
+    limited[..., _POSITIVE] = np.clip(stepped[..., _POSITIVE], 0.5 * theta[..., _POSITIVE], 2.0 * theta[..., _POSITIVE])
+    limited[..., [LAG, COMPLIANCE]] = np.maximum(stepped[..., [LAG, COMPLIANCE]], [0.0, _MIN])
+    return limited
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,7 +193,7 @@ class Segment:
             step = np.linalg.solve(hessian + damping * np.diag(np.diag(hessian)), gradient)
             if not float(gradient @ step) >= _MIN_GAIN:
                 break
-            sets = np.clip(fit.theta + _FRACTIONS[:, None] * step * prior.unit, *self.bounds(fit.theta))
+            sets = limit_step(fit.theta + _FRACTIONS[:, None] * step * prior.unit, fit.theta)
             full_step, deviations = self.linearise(sets), prior.deviations(sets)
             # -2 log posterior after each fraction of the step, (5,)
             costs = full_step.squares / variance + np.sum(deviations @ prior.precision * deviations, axis=1)
@@ -188,16 +205,6 @@ class Segment:
             damping = 0.1 * damping if damping > 1e-3 else 0.0
             fit = full_step if best == 0 else self.linearise(sets[best : best + 1])
         return fit
-
-    def bounds(self, theta: Array) -> tuple[Array, Array]:
-        """Return lower and upper limits (p,) of the parameters after one step from `theta` (p,).
-
-        Parameters that must be positive can at most halve or double. Lag and compliance have lower limits.
-        """
-        low, high = np.full(theta.size, -np.inf), np.full(theta.size, np.inf)
-        low[_POSITIVE], high[_POSITIVE] = 0.5 * theta[_POSITIVE], 2.0 * theta[_POSITIVE]
-        low[LAG], low[COMPLIANCE] = 0.0, _MIN
-        return low, high
 
     def residual_variance(self, squares: float) -> float:
         """Compute the variance of a residual [Pa^2] from its sum of squares and the number of independent samples.
@@ -257,7 +264,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     variants = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)}
     # one group for each stiffness of the oil: its best and its second-best breakaway force, (4, p) each
     best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
-    fit = fit_from_starts(segment, best_starts, noise, n_best=2)
+    fit = fit_from_starts(segment, [priors.centre, *best_starts], noise, n_best=2)
     if not segment.is_explained(fit.cost(noise, priors.normal)):
         fit = fit_from_starts(segment, [fit.theta, *second_best_starts], noise, n_best=2)
     return fit
@@ -303,9 +310,11 @@ class Follower:
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
         total = beginning["p_A"] + beginning["p_B"]
-        # p_A + p_B has the noise of p_A - p_B but does not ring; the squares of the coefficients (1, -3, 3, -1) of a
-        # third difference have the sum 20; at least 1 Pa^2, as a divisor
-        noise_variance = max(float(np.var(np.diff(total, 3))) / 20.0, 1.0)
+        # both have the noise of p_A - p_B; p_A - p_B also rings, and p_A + p_B has the noise that both readings share;
+        # the squares of the coefficients (1, -3, 3, -1) of a third difference have the sum 20; at least 1 Pa^2, as a
+        # divisor
+        rough = np.diff([total, beginning["p_A"] - beginning["p_B"]], 3)
+        noise_variance = max(float(rough.var(axis=1).min()) / 20.0, 1.0)
         follower = Follower(rig, recording.rate, sense)
         segment = follower.next_segment(beginning)
         fit = fit_from_priors(segment, total, noise_variance)
@@ -420,9 +429,56 @@ class Follower:
         hessian, gradient = fit.newton_terms(self.variance, prior)
         self.covariance = np.asarray(np.linalg.inv(hessian))
         # one more Gauss-Newton step, which needs no simulation
-        self.theta = np.clip(fit.theta + self.covariance @ gradient * prior.unit, *segment.bounds(fit.theta))
+        self.theta = limit_step(fit.theta + self.covariance @ gradient * prior.unit, fit.theta)
         self.states, self.last = fit.ends, float(block["u"][-1])
         return segment.block_sums(fit)
+
+    def linearise(self, block: Recording, theta: Array) -> Block:
+        """Linearise the model of the next block of samples about parameters `theta` (p,), without a fit."""
+        self.theta = theta
+        segment = self.next_segment(block)
+        fit = segment.linearise(theta[None])
+        self.states, self.last = fit.ends, float(block["u"][-1])
+        return segment.block_sums(fit)
+
+
+def fit_jointly(follower: Follower, blocks: Sequence[Recording], block_s: float) -> Joint:
+    """Fit the parameters in all K consecutive blocks of a recording, each `block_s` [s] long, together.
+
+    `follower`: filter at the first sample. It tracks the parameters through the blocks; about these the model is
+    linearised first, then anew about the fitted parameters (Gauss-Newton steps). Conductance and gain may lie in a
+    wrong minimum, as a faster pump feeds a leak: if the mean conductance is improbable by its prior, a second start
+    has the conductance of a healthy machine, unless the linearised fit excludes it.
+    """
+    states = follower.states
+
+    def linearise(theta: Array) -> Joint:
+        """Simulate all blocks with the parameters `theta` (K, p) and fit them together."""
+        follower.states, follower.last = states, math.nan
+        sums = [follower.linearise(block, row) for block, row in zip(blocks, theta, strict=True)]
+        return Joint.fit(sums, follower.priors, block_s, G)
+
+    def converge(joint: Joint) -> Joint:
+        """Take Gauss-Newton steps as long as each improves the fit clearly."""
+        part = 1.0  # fraction of the next step
+        for _ in range(_N_JOINT_STEPS):
+            step = part * (joint.fitted - joint.theta)
+            stepped = linearise(limit_step(joint.theta + step, joint.theta))
+            if joint.cost(joint.variance) - stepped.cost(joint.variance) >= _MIN_GAIN:
+                joint, part = stepped, 1.0
+            elif part == 1.0:
+                part = _PART
+            else:
+                break
+        return joint
+
+    joint = converge(Joint.fit([follower.update(block) for block in blocks], follower.priors, block_s, G))
+    centre, width = follower.priors.centre[G], follower.priors.width[G]
+    healthy, loss = joint.condition(G, centre)
+    if joint.fitted[:, G].mean() > centre + WITHIN_95 * width and loss < _MAX_LOSS:
+        other = converge(linearise(limit_step(healthy, joint.theta)))
+        joint = min(joint, other, key=lambda fit: fit.cost(joint.variance))
+    return joint
 
 
 def fit_response(recording: Recording, rig: Rig) -> Joint | None:
@@ -437,8 +493,8 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 follower = Follower.fit_start(recording, rig)
-                blocks = [follower.update(recording.samples(slice(first, end))) for first, end in pairwise(edges)]
-                joint = Joint.fit(blocks, follower.priors, recording.duration / len(blocks), G)
+                blocks = [recording.samples(slice(first, end)) for first, end in pairwise(edges)]
+                joint = fit_jointly(follower, blocks, recording.duration / len(blocks))
             except np.linalg.LinAlgError:
                 return None
         is_finite = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
@@ -461,8 +517,14 @@ def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
     parameters = parameter_information(joint, middles, recording.duration)
     pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
     mean_speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
-    mean_flow = mean_speed * rig.pump.q_b / (2.0 * np.pi)
-    return ResponseLeak(parameters, pressure, mean_flow, stated=states_flow(rig))
+    conditions = RecordingSums(
+        NO_SUMS,
+        flow=mean_speed * rig.pump.q_b / (2.0 * np.pi),
+        pressure=float(pressure.mean()),
+        start_s=start_seconds(recording),
+        oil_degC=oil_temperature(recording),
+    )
+    return ResponseLeak(parameters, pressure, conditions, stated=states_flow(rig))
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
