@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.balance import find_rest_limits
 from sealscope.diagnosis.inference.equations.balances import equations
-from sealscope.diagnosis.inference.equations.feed import feed_one_chamber, motions_of_side
+from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, motions_of_side
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOTIONS, Equation
 from sealscope.diagnosis.inspection import inspect_recording
@@ -61,7 +61,8 @@ def open_circuit_evidence(rig: Rig, recording: Recording) -> float | None:
         return None
     limits = find_rest_limits(samples.channels, samples.rate, balances[0])
     signals = Signals(samples.channels, samples.rate, rest_limits=limits)
-    return open_circuit_log_factor(feed_one_chamber(balances[0], signals), signals)
+    feed = FeedSums.measure(balances[0], signals).find_feed(balances[0].area_ratio)
+    return open_circuit_log_factor(feed_one_chamber(balances[0], feed), signals)
 
 
 def open_circuit_log_factor(equation: Equation, signals: Signals) -> float:
