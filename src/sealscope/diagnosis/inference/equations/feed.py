@@ -124,7 +124,7 @@ class FeedSums(NamedTuple):
 
 
 class Feed(NamedTuple):
-    """How the pump of an open circuit feeds the chambers.
+    """Order in which the pump of an open circuit feeds the chambers.
 
     `outward`: chamber that it feeds while x grows; `sign_A`: sign of its flow while it feeds A, 0 if it never moves;
     `farthest`: for either direction the name of the term of motion (`MOTIONS`) with the larger distance.
