@@ -244,7 +244,7 @@ class BlockStream(SavedAttributes):
         feed = self._feed_sums.find_feed(balance.area_ratio)
         if self._feeds_one_chamber:
             self._used_balances = (feed_one_chamber(balance, feed),)
-        feeds_as_before = not self._feeds_one_chamber or feed[:2] == feed_before[:2]
+        feeds_as_before = not self._feeds_one_chamber or feed == feed_before
         self.n_meanings += self._is_unsigned != was_unsigned or not feeds_as_before
 
     @property

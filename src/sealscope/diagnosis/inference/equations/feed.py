@@ -115,32 +115,24 @@ class FeedSums(NamedTuple):
         else:
             feeds_A = self.work >= 0.0
         sense = float(np.sign(self.work))  # of the flow while x grows
-        distance_of = dict(zip(MOTIONS, self.distances, strict=True))
-        farthest = [
-            max((name for name, motion in MOTIONS.items() if motion[0] == outward), key=distance_of.__getitem__)
-            for outward in (True, False)
-        ]
-        return Feed("A" if feeds_A else "B", sense if feeds_A else -sense, tuple(farthest))
+        return Feed("A" if feeds_A else "B", sense if feeds_A else -sense)
 
 
 class Feed(NamedTuple):
     """Order in which the pump of an open circuit feeds the chambers.
 
-    `outward`: chamber that it feeds while x grows; `sign_A`: sign of its flow while it feeds A, 0 if it never moves;
-    `farthest`: for either direction the name of the term of motion (`MOTIONS`) with the larger distance.
+    `outward`: chamber that it feeds while x grows; `sign_A`: sign of its flow while it feeds A, 0 if it never moves.
     """
 
     outward: Literal["A", "B"]
     sign_A: float
-    farthest: tuple[str, ...]
 
 
 def feed_one_chamber(equation: Equation, feed: Feed) -> Equation:
     """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
 
-    The creep of a piston at rest counts with the area of the side that carries the load, in the term of its direction
-    that motion determines best (`Feed.farthest`): the pump feeds the same side under either load. A leak to the outside
-    counts while its chamber is fed or, while the pump rests, carries the load. The signals from which the
+    The terms of motion count the creep of a piston at rest with the area of the side that carries the load. A leak to
+    the outside counts while its chamber is fed or, while the pump rests, carries the load. The signals from which the
     terms are computed must have limits of rest.
     """
     adapted = equation._replace(fed_outward=feed.outward)
@@ -148,9 +140,7 @@ def feed_one_chamber(equation: Equation, feed: Feed) -> Equation:
     def adapt(term: Term) -> Term:
         """Adapt one term."""
         if term.name in MOTIONS:
-            counts_creep = term.name in feed.farthest
-            increments = partial(_carried_increments, term=term, equation=adapted, counts_creep=counts_creep)
-            return term._replace(increments=increments)
+            return term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
         if term.name in _SIDES:
             counted = partial(_counted_increments, term=term, left=equation.left, sign_A=feed.sign_A)
             return term._replace(increments=counted)
@@ -207,18 +197,15 @@ def _counted_increments(signals: Signals, *, term: Term, left: Callable[[Signals
     return np.asarray(term.increments(signals) * (counts_A if _SIDES[term.name] == "A" else 1.0 - counts_A))
 
 
-def _carried_increments(signals: Signals, *, term: Term, equation: Equation, counts_creep: bool) -> Array:
-    """Compute the increments (n - 1,) of a term of motion, to which the creep at rest in its direction may be added.
+def _carried_increments(signals: Signals, *, term: Term, equation: Equation) -> Array:
+    """Compute the increments (n - 1,) of a term of motion whose creep at rest moves the area that carries the load.
 
-    The creep is multiplied by the area of the side that carries the load, over that of the side that the pump feeds in
-    this direction. `counts_creep`: False to leave it out.
+    While pump or piston rests, the increments are multiplied by the area of the side that carries the load, over that
+    of the side that the pump feeds in this direction.
     """
+    _, by_A = MOTIONS[term.name]
+    feeds_A = term.name in motions_of_side(equation, "A")
+    area_B = equation.area_ratio  # over the area of A
+    factor = (1.0 if by_A else area_B) / (1.0 if feeds_A else area_B)
     is_moving = signals.moving(equation.left)
-    increments = term.increments(signals) * is_moving
-    if counts_creep:
-        outward, _ = MOTIONS[term.name]
-        feeds_A = term.name in motions_of_side(equation, "A")
-        area_A, area_B = 1.0, equation.area_ratio  # over the area of A
-        carried = signals.direction_weights(outward, True) * area_A + signals.direction_weights(outward, False) * area_B
-        increments += (1.0 - is_moving) * carried / (area_A if feeds_A else area_B) * signals.step("x")
-    return np.asarray(increments)
+    return np.asarray(term.increments(signals) * np.where(is_moving > 0.0, 1.0, factor))
