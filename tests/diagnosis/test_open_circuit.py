@@ -6,13 +6,20 @@ conductance G, so that the expected numbers do not come from a simulator or from
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
 
-from sealscope import diagnose, load_rig, simulate
+from sealscope import diagnose, load_rig, simulate, watch
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
+from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inspection import inspect_recording
+from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance
+from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
@@ -31,14 +38,14 @@ CYCLE = (
 )
 
 
-def press(conductance: float, seed: int, idle: float = 0.0) -> Recording:
-    """Record six cycles of a press whose piston leaks with `conductance` [m^3/(s Pa)], areas as above.
+def press(conductance: float, seed: int, idle: float = 0.0, cycles: int = 6) -> Recording:
+    """Record cycles of a press whose piston leaks with `conductance` [m^3/(s Pa)], areas as above.
 
     For the last `idle` seconds of its rests the pump turns already, and its flow returns to the tank.
     """
     rng = np.random.default_rng(seed)
     speeds, ends_A, ends_B, times = [], [2.0], [60.0], [0.0]
-    for _ in range(6):
+    for _ in range(cycles):
         for duration, speed, p_A, p_B in CYCLE:
             spread = duration * (1.0 + 0.1 * rng.standard_normal()) if speed == 0.0 else duration
             speeds.append((len(times) - 1, speed))
@@ -128,3 +135,87 @@ def test_a_leak_is_sized_by_the_creep_of_the_side_that_carries_the_load(flow: fl
     low, high = diagnosis.leak_interval_lpm
     assert low < flow < high
     assert diagnose(press(2e-14, seed=7, idle=idle), rig=stated_areas(), baseline=healthy).verdict == "no leak"
+
+
+@cache
+def open_rig() -> Rig:
+    rig, _ = assumed_rig(stated_areas(), press(0.0, seed=1))
+    return rig.with_overrides({"pump.q_b": DISPLACEMENT * 2.0 * np.pi})
+
+
+def take(live: LiveBalance, recording: Recording, size: int) -> list[BlockConductance]:
+    """Estimate a stream in pieces of `size` samples."""
+    blocks = []
+    for first in range(0, len(recording), size):
+        piece = recording.samples(slice(first, first + size))
+        results = live.take(SampleRun(piece.t, piece.channels, piece.rate, follows=first > 0))
+        blocks += [block for result in results if isinstance(result, list) for block in result]
+    return blocks
+
+
+def without_sign(recording: Recording) -> Recording:
+    return replace(recording, channels={**recording.channels, "omega": np.abs(recording["omega"])})
+
+
+@pytest.mark.parametrize(
+    ("conductance", "is_signed", "tolerance"), [(2e-13, True, 0.1), (1e-12, True, 0.1), (2e-13, False, 0.3)]
+)
+def test_a_stream_estimates_the_leakage_of_its_recording(conductance: float, is_signed: bool, tolerance: float) -> None:
+    """The sign of the flow is that of all blocks, not of each; noise of the creep makes the leak look smaller."""
+    recording = press(conductance, seed=3, cycles=12)
+    recording = recording if is_signed else without_sign(recording)
+    balance = VolumeBalance(open_rig()).balance(inspect_recording(recording).part)
+    assert balance is not None and balance.conductance.value == pytest.approx(conductance, rel=tolerance)
+    blocks = take(LiveBalance(open_rig(), tuple(recording.channels)), recording, len(recording))
+    weights = np.array([block.sd**-2 for block in blocks])
+    total = weights @ [block.total for block in blocks] / weights.sum()
+    assert total == pytest.approx(balance.conductance.value, rel=0.15)
+    assert np.std([block.total for block in blocks]) < 0.2 * conductance + 3e-14
+
+
+@pytest.mark.parametrize("size", [50, 777])
+@pytest.mark.parametrize("is_signed", [True, False])
+def test_blocks_depend_neither_on_the_pieces_of_a_stream_nor_on_a_restart(size: int, is_signed: bool) -> None:
+    recording = press(5e-13, seed=4, idle=1.0)
+    recording = recording if is_signed else without_sign(recording)
+    names = tuple(recording.channels)
+    whole = take(LiveBalance(open_rig(), names), recording, len(recording))
+    live, stop = LiveBalance(open_rig(), names), 4000 // size * size
+    before = take(live, recording.samples(slice(0, stop)), size)
+    again = LiveBalance(open_rig(), names)
+    again.load_state(json.loads(json.dumps(live.state(), allow_nan=False)))
+    rest = recording.samples(slice(stop, len(recording)))
+    results = again.take(SampleRun(rest.t, rest.channels, rest.rate, follows=True))
+    assert len(whole) > 20
+    assert before + [block for result in results if isinstance(result, list) for block in result] == whole
+
+
+@pytest.mark.parametrize("idle", [0.0, 1.0])
+def test_a_leak_of_a_running_press_is_stated_soon(idle: float) -> None:
+    conductance = 2e-13
+    healthy, leaking = press(2e-14, seed=3, idle=idle, cycles=18), press(conductance, seed=53, idle=idle, cycles=18)
+    # one stream, whose position goes on where the healthy recording ends
+    moved = leaking["x"] + healthy["x"][-1] - leaking["x"][0]
+    channels = {name: np.r_[values, leaking[name]] for name, values in healthy.channels.items()}
+    channels["x"] = np.r_[healthy["x"], moved]
+    onset, t = len(healthy) / RATE, np.arange(len(healthy) + len(leaking)) / RATE
+    watched = watch(open_rig(), false_alarms_per_1000_h=100.0, learn_hours=0.05)
+    stream = replace(healthy, t=t, channels=channels)
+    watched.update(stream.samples(slice(0, len(healthy))))
+    again = Watch.from_state(json.loads(json.dumps(watched.state(), allow_nan=False)))
+    *_, last = again.update(stream.samples(slice(len(healthy), len(stream))))
+    assert watched.leak is None and again.leak is not None
+    assert onset < again.leak.raised_s < onset + 15.0
+    flow = (conductance - 2e-14) * float(np.mean(np.abs(leaking["p_A"] - leaking["p_B"]))) / LPM
+    low, high = last.leak_interval_lpm
+    assert low < flow < high < 1.1 * flow
+
+
+def test_a_stream_that_begins_with_a_rest_learns_again_what_its_pump_feeds() -> None:
+    recording = press(2e-13, seed=5)
+    n_rest = 3000
+    channels = {name: np.r_[np.full(n_rest, values[0]), values] for name, values in recording.channels.items()}
+    channels["omega"][:n_rest] = 0.02 * np.random.default_rng(6).standard_normal(n_rest)
+    late = replace(recording, t=np.arange(n_rest + len(recording)) / RATE, channels=channels)
+    blocks = take(LiveBalance(open_rig(), tuple(channels)), late, 500)
+    assert np.median([block.total for block in blocks]) == pytest.approx(2e-13, rel=0.15)

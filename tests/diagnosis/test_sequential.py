@@ -243,3 +243,14 @@ def test_first_blocks_that_cannot_be_estimated_are_counted():
     watch = Watch(RIG, 1000.0, 1000.0)
     watch.update(replace(WORN, channels={**WORN.channels, "p_A": 1e90 * WORN["p_A"]}))
     assert watch.counters == {"blocks: at standstill": 2}
+
+
+def test_a_stream_restores_the_sign_of_a_speed_as_its_recording_does():
+    """A pump's speed without a sign hid its leakage while the piston moves in."""
+    recording = machine(1, G=3e-13, duration=120.0, rate=100.0)  # the pump leaks 2.4e-13
+    speed = 12.0 * np.sin(4.0 * recording.t) + 0.02 * np.random.default_rng(1).standard_normal(len(recording))
+    channels = {"omega": np.abs(speed), **{name: recording[name] for name in ("x", "p_A", "p_B")}}
+    live = LiveBalance(RIG, tuple(channels))
+    results = list(live.take(SampleRun(recording.t, channels, recording.rate, follows=False)))
+    totals = [block.total for blocks in results if isinstance(blocks, list) for block in blocks]
+    assert np.mean(totals) == pytest.approx(5.4e-13, rel=0.1)

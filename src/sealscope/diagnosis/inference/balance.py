@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest, shut_at_rest, with_rests
-from sealscope.diagnosis.inference.equations.feed import feed_one_chamber, flag_circulation
+from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import (
     AVERAGING_TIME,
     HALF_DIFFERENCE,
@@ -47,6 +47,7 @@ from sealscope.diagnosis.inference.rows.weak_form import (
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.corrections.gaps import flag_holes
+from sealscope.recordings.corrections.unsigned import UNSIGNED, is_one_sided, is_two_way, restore_flow
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.quality import find_rails
 from sealscope.recordings.recording import Array, Recording
@@ -86,11 +87,19 @@ class BlockStream(SavedAttributes):
     - `n_first`: number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
     - `start`: time of the first sample [s]; `offset`: sensor offset [Pa] that is subtracted from p_A - p_B.
     - `left_signs`: factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty
-      to estimate the factors from the first blocks or, of a stream, from the first ones with motion.
+      to estimate the factors from the first blocks or, of a stream, from all up to the first that surely move.
     - `on_samples`: called with the start time [s] and the samples of each block.
+    - `flow_channel`: channel of the pump's flow if the samples come as recorded: a flow without a sign gets one
+      (`corrections.unsigned`).
+    - `feeds_one_chamber`: with `flow_channel`, the circuit is open; the only balance is adapted to what the blocks so
+      far show of it, and a flow that circulates is left out (`equations.feed`). `n_meanings` counts how often its terms
+      or the sign have changed their meaning.
     """
 
-    SAVED = ("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits", "_weighting")
+    SAVED = (
+        *("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits"),
+        *("_weighting", "_sign_evidence", "_feed_sums", "_flow_range", "n_meanings"),
+    )
     SAVED_TYPES: ClassVar = {
         "_absolute_offsets": dict[str, float],
         "left_signs": tuple[float, ...],
@@ -107,22 +116,29 @@ class BlockStream(SavedAttributes):
         offset: float = 0.0,
         left_signs: tuple[float, ...] = (),
         on_samples: Callable[[float, Mapping[str, Array]], None] | None = None,
+        flow_channel: str = "",
+        feeds_one_chamber: bool = False,
     ) -> None:
-        self._on_samples = on_samples
+        self._on_samples, self._flow_channel, self._feeds_one_chamber = on_samples, flow_channel, feeds_one_chamber
         self.columns = tuple(ColumnRoles(balance) for balance in balances)
         self._balances, self._rate, self._offset = balances, rate, offset
+        self._used_balances = tuple(balances)  # adapted to an open circuit, if it is one
         self._stride = stride_samples(rate)
         self._strides_per_block = strides_in(block_s, rate)
         self._length = self._strides_per_block * self._stride  # samples in a block
         # samples on either side of a block on which its speeds and rests depend; 2 for differences of neighbours
         self._margin = max(1, round(HALF_DIFFERENCE * rate)) + 2
         self._drops_rests = is_separate_at_rest(balances[0])
-        self._finds_rests = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
-        if self._finds_rests:  # some terms are 0 at rest
+        has_rest_terms = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
+        self._finds_rests = has_rest_terms or bool(flow_channel)
+        if has_rest_terms or feeds_one_chamber:  # some terms differ at rest
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
-        self._rest_limits: RestLimits | None = None  # known after the first samples
+        self._rest_limits: RestLimits | None = None  # known after the first motion
+        self._sign_evidence = SignEvidence(balances, self.columns)
+        self._feed_sums, self.n_meanings = FeedSums(), 0
+        self._flow_range = (0.0, 0.0)  # lowest and highest value of the flow's channel
         self._weighting, self._n_first = Weighting(self.columns), n_first
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
         self.left_signs = left_signs  # sign of each balance's left side, known after the first motion
@@ -194,66 +210,81 @@ class BlockStream(SavedAttributes):
         # the shortest array, should the lengths in a saved state differ
         self._end = self._first + min((len(values) for piece in self._pieces for values in piece.values()), default=0)
 
-    def _flow_sign_log_odds(self, rows: Sequence[Array]) -> tuple[float, ...]:
-        """Compute for each volume balance the log odds that the recorded flow has the right sign.
+    def _signals(self, samples: Mapping[str, Array]) -> Signals:
+        """Make the signals of samples, arrays by channel name, with what earlier samples told of the machine."""
+        return Signals(
+            samples, self._rate, to_absolute=self._absolute_offsets, offset=self._offset, rest_limits=self._rest_limits
+        )
 
-        The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1).
-        `rows`: for each balance the rows (r, m) of its regression. Three symptoms of correct wiring are tested, and
-        their log odds (`_sign_log_odds`) are added:
+    def _learn_limits(self, samples: Mapping[str, Array]) -> None:
+        """Find the speeds at which the machine rests, or raise those of earlier samples, which may be all at rest."""
+        if self._finds_rests:
+            limits = find_rest_limits(samples, self._rate, self._balances[0])
+            self._rest_limits = _raise_limits(limits, self._rest_limits)
 
-        - Oil leaks from high to low pressure: the leak's coefficient is positive with either `flow_sign`.
-        - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy.
-          The mean force, weighted by abs(flow), is subtracted first, since a constant load also correlates with a
-          motion in one direction. The same test is made with p_A - p_B instead of the force, and the two log odds are
-          averaged: a load disturbs p_A - p_B less than the force, throttling on the rod side disturbs it more.
-        - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
+    def _learn_flow(self, samples: Mapping[str, Array], first: int, end: int) -> None:
+        """Add the blocks `first` to `end` - 1 to what is known of the pump's flow: its sign, and an open circuit.
+
+        A flow without a sign counts with one from the first blocks on that show the piston moving both ways.
         """
-        odds_by_balance = []
-        for balance, columns, values in zip(self._balances, self.columns, rows, strict=True):
-            left = balance.flow_sign * values[:, columns.left]  # flow into A
-            motion = values[:, list(columns.piston)].sum(axis=1)
-            leak_z = _leak_z_score(values.T @ values, columns, len(values))
-            log_odds = _sign_log_odds(leak_z, other_cause=INFERENCE.sense.leak)
-            if (flow := np.abs(left)).any():  # else there is no mean weighted by the flow
-                loads = [_load_pressure(values, columns, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
-                work_z = [_z_score((load - np.average(load, weights=flow)) * left) for load in loads]
-                log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.work) for z in work_z]))
-            motion_z = _z_score(motion * left)
-            if motion_z > 0.0:  # else either x or the flow may be reversed
-                log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
-            odds_by_balance.append(log_odds)
-        return tuple(odds_by_balance)
+        (balance,) = self._balances
+        was_unsigned, feed_before = self._is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
+        piece, begin = self._with_margins(samples, first, end)
+        signals = self._signals(piece)
+        span = slice(first * self._length - begin, end * self._length - begin)
+        self._feed_sums = self._feed_sums.add(FeedSums.measure(balance, signals, span))
+        recorded = samples[self._flow_channel][first * self._length - self._first : end * self._length - self._first]
+        self._flow_range = (
+            min(self._flow_range[0], float(np.nanmin(recorded, initial=0.0))),
+            max(self._flow_range[1], float(np.nanmax(recorded, initial=0.0))),
+        )
+        if self._is_unsigned != was_unsigned:
+            # what earlier blocks told of the sign is of no use
+            self._feed_sums = self._feed_sums._replace(work=abs(self._feed_sums.work))
+            self._sign_evidence, self.left_signs = SignEvidence(self._balances, self.columns), ()
+        feed = self._feed_sums.find_feed(balance.area_ratio)
+        if self._feeds_one_chamber:
+            self._used_balances = (feed_one_chamber(balance, feed),)
+        feeds_as_before = not self._feeds_one_chamber or feed == feed_before
+        self.n_meanings += self._is_unsigned != was_unsigned or not feeds_as_before
 
-    def _shows_motion(self, rows: Sequence[Array]) -> bool:
-        """Return True if flow and motion correlate by `sense.moves` (`priors.toml`) standard errors, in either sense.
+    @property
+    def _is_unsigned(self) -> bool:
+        """True if the pump's flow stays on one side of zero while the piston moves both ways."""
+        has_one_sign = self._flow_channel in UNSIGNED and is_one_sided(*self._flow_range)
+        return has_one_sign and is_two_way(*self._feed_sums.ways)
 
-        `rows`: for each balance the rows (r, m) of its regression. Also True if no balance has a term of the piston's
-        motion: then the first blocks determine the signs.
-        """
-        z_scores = [
-            _z_score(values[:, list(columns.piston)].sum(axis=1) * values[:, columns.left])
-            for columns, values in zip(self.columns, rows, strict=True)
-            if columns.piston
-        ]
-        return not z_scores or max(map(abs, z_scores)) > INFERENCE.sense.moves
+    def _restore_sign(self, samples: Mapping[str, Array]) -> dict[str, Array]:
+        """Restore the sign of the pump's flow, if it has none; each block by its samples with margins."""
+        if not self._is_unsigned:
+            return dict(samples)
+        # flow [m^3/s] of one unit of the channel
+        unit = float(self._balances[0].left(Signals({self._flow_channel: np.ones(2)}, self._rate))[0]) * self._rate
+        out, inward = self._feed_sums.flow_per_speed
+        difference = samples["p_A"] - samples["p_B"]
+        values = samples[self._flow_channel]
+        signed = restore_flow(values, samples["x"], difference, self._rate, (out / unit, inward / unit))
+        return {**samples, self._flow_channel: signed}
 
     def _build_blocks(self, samples: Mapping[str, Array], first: int, end: int) -> Blocks:
         """Compute the blocks with the indices `first` to `end` - 1 from `samples`, arrays by channel name.
 
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
-        weights. The first call also determines absolute minus gauge pressures, and the speeds below which the machine
-        rests. The first call with motion determines the signs of the left sides, for a whole recording its only call.
-        Later blocks keep all of these.
+        weights. The first call also determines absolute minus gauge pressures. All calls up to the first that surely
+        moves determine the signs of the left sides, and the speeds below which the machine rests; for a whole recording
+        that is its only call. Later blocks keep all of these.
         """
         length = self._length
-        n_first_samples = (self._n_first or end) * length  # samples in the first blocks; in all without `_n_first`
+        group = {
+            name: values[first * length - self._first : end * length - self._first] for name, values in samples.items()
+        }
         if self._absolute_offsets is None:
-            first_samples = {name: values[:n_first_samples] for name, values in samples.items()}
-            self._absolute_offsets = {
-                name: _absolute_offset(first_samples[name]) for name in ("p_A", "p_B") if name in samples
-            }
-            if self._finds_rests:
-                self._rest_limits = find_rest_limits(first_samples, self._rate, self._balances[0])
+            self._absolute_offsets = {name: _absolute_offset(group[name]) for name in ("p_A", "p_B") if name in group}
+            self._learn_limits(group)
+        elif not self.left_signs:
+            self._learn_limits(group)
+        if self._flow_channel:
+            self._learn_flow(samples, first, end)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
@@ -266,10 +297,11 @@ class BlockStream(SavedAttributes):
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
         left_signs = self.left_signs
         if not left_signs:
-            self.sign_log_odds = self._flow_sign_log_odds(rows)
+            self._sign_evidence.add(rows)
+            self.sign_log_odds = self._sign_evidence.log_odds
             left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
-            # a stream may begin at rest, which tells no sign; the block in which it starts already has one of its own
-            if self._n_first is None or self._shows_motion(rows):
+            # a stream may begin at rest, which tells no sign
+            if self._n_first is None or self._sign_evidence.shows_motion:
                 self.left_signs = left_signs
         for equation_rows, columns, sign in zip(rows, self.columns, left_signs, strict=True):
             equation_rows[:, columns.left] *= sign
@@ -288,6 +320,16 @@ class BlockStream(SavedAttributes):
             zero=np.full(end - first, self._offset),
         )
 
+    def _with_margins(self, samples: Mapping[str, Array], first: int, end: int) -> tuple[dict[str, Array], int]:
+        """Select the samples on which the blocks `first` to `end` - 1 depend; also return the index of the first one.
+
+        The test functions of the last rows extend beyond the last block, and speeds and rests beyond these.
+        """
+        stop = end * self._length + (SPAN - 1) * self._stride + 1
+        begin = max(self._first, first * self._length - self._margin)
+        selected = slice(begin - self._first, stop + self._margin - self._first)
+        return self._restore_sign({name: values[selected] for name, values in samples.items()}), begin
+
     def _compute_rows(
         self, samples: Mapping[str, Array], first: int, end: int
     ) -> tuple[list[Array], Array, NDArray[np.bool_], Array, Array]:
@@ -303,19 +345,18 @@ class BlockStream(SavedAttributes):
         - `Blocks.flow` (K,) and `Blocks.pressures` (K, p).
         """
         length = self._length
-        # range of the samples of the blocks; the test functions of the last rows extend beyond the last block
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
-        begin = max(self._first, start - self._margin)
-        with_margins = slice(begin - self._first, stop + self._margin - self._first)
-        piece = {name: values[with_margins] for name, values in samples.items()}
-        signals = Signals(
-            piece, self._rate, to_absolute=self._absolute_offsets, offset=self._offset, rest_limits=self._rest_limits
-        )
+        piece, begin = self._with_margins(samples, first, end)
+        signals = self._signals(piece)
+        if self._feeds_one_chamber:
+            circulates = flag_circulation(self._balances[0], signals, self._feed_sums.mean_flow)
+            if circulates.any():
+                signals = self._signals(_without_flow(piece, circulates))
         without_margins = slice(start - begin, stop - 1 - begin)  # selects increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
-        lefts = [balance.left(signals) for balance in self._balances]
+        lefts = [balance.left(signals) for balance in self._used_balances]
         rows = []
-        for balance, left in zip(self._balances, lefts, strict=True):
+        for balance, left in zip(self._used_balances, lefts, strict=True):
             columns = [*(term.increments(signals) for term in balance.terms), left]
             weak_rows = weak_form_rows([column[without_margins] for column in columns], self._rate)
             is_whole &= weak_rows.whole
@@ -344,10 +385,112 @@ class BlockStream(SavedAttributes):
         return rows, row_weights, is_counted, mean_flow, pressures
 
 
-def _z_score(products: Array) -> float:
-    """Compute the z score of the sum of `products` (r,), each of the flow and another quantity in one row."""
-    standard_deviation = float(np.linalg.norm(products) * np.sqrt(OVERLAP))  # of overlapping rows
-    return float(products.sum()) / max(standard_deviation, float(np.finfo(float).tiny))
+class SignEvidence(SavedAttributes):
+    """Evidence on the sign of the recorded flow of each volume balance, from sums over the rows of all blocks so far.
+
+    The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1). Three
+    symptoms of correct wiring are tested, and their log odds (`_sign_log_odds`) are added:
+
+    - Oil leaks from high to low pressure: the leak's coefficient is positive with either `flow_sign`.
+    - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. The
+      mean force, weighted by abs(flow), is subtracted first, since a constant load also correlates with a motion in one
+      direction. The same test is made with p_A - p_B instead of the force, and the two log odds are averaged: a load
+      disturbs p_A - p_B less than the force, throttling on the rod side disturbs it more.
+    - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
+    """
+
+    SAVED = ("_grams", "_counts", "_motions", "_loads")
+
+    def __init__(self, balances: Sequence[Equation], columns: Sequence[ColumnRoles]) -> None:
+        self._balances, self._columns = balances, columns
+        # for each balance: Gram matrix and number of the rows; sums of the products of flow and motion, and of their
+        # squares, by the columns of `_motion_columns`; sums of `_load_sums` by p_A - p_B and the force
+        self._grams = [np.zeros((roles.left + 1, roles.left + 1)) for roles in columns]
+        self._counts = np.zeros(len(balances))
+        self._motions = [np.zeros((len(_motion_columns(roles)), 2)) for roles in columns]
+        self._loads = np.zeros((len(balances), 2, _N_LOAD_SUMS))
+
+    def add(self, rows: Sequence[Array]) -> None:
+        """Add the rows (r, m) of the regression of each balance."""
+        for e, (balance, roles, values) in enumerate(zip(self._balances, self._columns, rows, strict=True)):
+            left = balance.flow_sign * values[:, roles.left]  # flow into A
+            self._grams[e] += values.T @ values
+            self._counts[e] += len(values)
+            for k, indices in enumerate(_motion_columns(roles)):
+                products = values[:, indices].sum(axis=1) * left
+                self._motions[e][k] += products.sum(), products @ products
+            for k, area_ratio in enumerate((1.0, balance.area_ratio)):
+                self._loads[e, k] += _load_sums(_load_pressure(values, roles, area_ratio), left)
+
+    @property
+    def log_odds(self) -> tuple[float, ...]:
+        """Log odds, for each balance, that the recorded flow has the right sign."""
+        odds_by_balance = []
+        for roles, gram, count, motions, loads in zip(
+            self._columns, self._grams, self._counts, self._motions, self._loads, strict=True
+        ):
+            log_odds = _sign_log_odds(_leak_z_score(gram, roles, int(count)), other_cause=INFERENCE.sense.leak)
+            work_z = [_work_z_score(sums) for sums in loads]
+            log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.work) for z in work_z]))
+            motion_z = _z_score(*motions[0]) if roles.piston else 0.0
+            if motion_z > 0.0:  # else either x or the flow may be reversed
+                log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
+            odds_by_balance.append(log_odds)
+        return tuple(odds_by_balance)
+
+    @property
+    def shows_motion(self) -> bool:
+        """True if flow and motion correlate by `sense.moves` (`priors.toml`) standard errors, in either sense."""
+        z_scores = [abs(_z_score(*sums)) for motions in self._motions for sums in motions]
+        return not z_scores or max(z_scores) > INFERENCE.sense.moves
+
+
+#: Number of the sums of `_load_sums`.
+_N_LOAD_SUMS = 7
+
+
+def _motion_columns(roles: ColumnRoles) -> list[list[int]]:
+    """List the groups of columns whose sums are the piston's motion or, in a valve's chamber, the flow of an edge."""
+    return [list(roles.piston)] if roles.piston else [[k] for k in roles.motion]
+
+
+def _z_score(total: float, square: float) -> float:
+    """Compute the z score of a sum of products, each of the flow and another quantity in one row.
+
+    `total`, `square`: sums of the products, and of their squares.
+    """
+    standard_deviation = float(np.sqrt(max(square, 0.0) * OVERLAP))  # of overlapping rows
+    return float(total) / max(standard_deviation, float(np.finfo(float).tiny))
+
+
+def _load_sums(load: Array, left: Array) -> Array:
+    """Sum l, |l|, l^2, p l, p |l|, p l^2 and p^2 l^2 over rows with the loads p = `load` and the flows l = `left`."""
+    flow = np.abs(left)
+    return np.array(
+        [
+            *(left.sum(), flow.sum(), left @ left),
+            *(load @ left, load @ flow, load @ left**2, (load * left) @ (load * left)),
+        ]
+    )
+
+
+def _work_z_score(sums: Array) -> float:
+    """Compute the z score of the products (p - c) l of load and flow, with the mean load c weighted by the flow.
+
+    `sums` (7,): those of `_load_sums`.
+    """
+    flow, magnitude, square, work, magnitude_work, load_square, work_square = sums.tolist()
+    if not magnitude > 0.0:
+        return 0.0
+    mean = magnitude_work / magnitude
+    return _z_score(work - mean * flow, work_square - 2.0 * mean * load_square + mean**2 * square)
+
+
+def _raise_limits(limits: RestLimits, earlier: RestLimits | None) -> RestLimits:
+    """Return the larger of two limits of pump and piston; `earlier` is None for the first samples."""
+    if earlier is None:
+        return limits
+    return limits._replace(pump=max(limits.pump, earlier.pump), piston=max(limits.piston, earlier.piston))
 
 
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
@@ -596,8 +739,9 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         if rig.circuit.feeds_one_chamber:
             limits = find_rest_limits(samples, recording.rate, balances[0])
             signals = Signals(samples, recording.rate, rest_limits=limits)
-            balances = (feed_one_chamber(balances[0], signals),)
-            samples = _without_flow(samples, flag_circulation(balances[0], signals))
+            sums = FeedSums.measure(balances[0], signals)
+            balances = (feed_one_chamber(balances[0], sums.find_feed(balances[0].area_ratio)),)
+            samples = _without_flow(samples, flag_circulation(balances[0], signals, sums.mean_flow))
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block

@@ -39,6 +39,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
+from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import (
     SavedAttributes,
@@ -140,7 +141,7 @@ class LiveBalance(SavedAttributes):
     min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, and its flow measured, whatever its law
     block_seconds = BLOCK_SECONDS
     has_begun = True
-    SAVED = ("_precision", "_moving", "_waiting", "_rate", "_signals")
+    SAVED = ("_precision", "_moving", "_waiting", "_n_meanings", "_rate", "_signals")
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self._balances = live_equations(rig, names, with_tested_terms=True)
@@ -164,8 +165,10 @@ class LiveBalance(SavedAttributes):
         self._moving = 0  # number of successive blocks that move far more than the usual ones
         self._stored: Blocks | None = None  # the last blocks, packed
         self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
+        self._circuit, self._n_meanings = rig.circuit, 0
         self._signals = SignalWindow()
-        self._closed_samples: list[tuple[float, Mapping[str, Array], float]] = []  # begin, channels, rate of each block
+        # begin, channels, rate and `BlockStream.n_meanings` of each block
+        self._closed_samples: list[tuple[float, Mapping[str, Array], float, int]] = []
         self._stream: BlockStream | None = None
         self._rate = 0.0
 
@@ -200,26 +203,43 @@ class LiveBalance(SavedAttributes):
             self._balances,
             self._rate,
             BLOCK_SECONDS,
-            on_samples=lambda begin, samples: self._closed_samples.append((begin, samples, self._rate)),
+            on_samples=self._take_samples,
+            flow_channel=str(flow_source(self.names)) if self._circuit.pump_moves_piston else "",
+            feeds_one_chamber=self._circuit.feeds_one_chamber,
         )
+
+    def _take_samples(self, begin: float, samples: Mapping[str, Array]) -> None:
+        """Store the samples of a block that begins at `begin` [s], and the meaning of its terms."""
+        assert self._stream is not None
+        self._closed_samples.append((begin, samples, self._rate, self._stream.n_meanings))
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
         """Yield the result of each complete block, if any, and store the features of its samples in `_signals`."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
-            self._signals.take(*samples)
-            yield self._take_block(block)
+            begin, channels, rate, n_meanings = samples
+            self._signals.take(begin, channels, rate)
+            is_complete = all(np.isfinite(values).all() for values in channels.values())
+            yield self._take_block(block, n_meanings, is_complete)
 
-    def _take_block(self, block: Blocks) -> BlockResult:
+    def _take_block(self, block: Blocks, n_meanings: int, is_complete: bool) -> BlockResult:
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
         Learning begins with the first block that moves: `LEARNED` - 1 blocks give a `NotJudged`, and the next one the
         conductances of all `LEARNED`. After `N_WAKING` successive blocks that move far more than usual, learning begins
-        again. The last `WINDOW` blocks with at least one complete equation are stored.
+        again; so it does when the terms or the sign of the flow change their meaning. The last `WINDOW` blocks with at
+        least one complete equation are stored. `n_meanings`: `BlockStream.n_meanings` of the block; `is_complete`: no
+        sample is missing.
         """
         _, end = self._sample_times(block)
+        if n_meanings != self._n_meanings:
+            self._n_meanings = n_meanings
+            if self._stored is not None:
+                self._stored = None
+                self.relearn()
+                return NotJudged(end, "learning", counter="blocks: the pump's flow counts otherwise", restarts=True)
         if not block.rows[0]:  # number of complete equations
-            return NotJudged.with_count(end, "missing values")
+            return NotJudged.with_count(end, "at standstill" if is_complete else "missing values")
         packed = block.pack()
         self._stored = packed if self._stored is None else Blocks.join([self._stored, packed])[-WINDOW:]
         if self._precision > 0.0:  # the coefficients are known

@@ -30,7 +30,7 @@ _MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the p
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 #: Channel -> its quantity, for messages.
-_NAMES = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
+UNSIGNED = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 
 
 def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
@@ -42,7 +42,7 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     each channel that was changed.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
-    for name, quantity in _NAMES.items():
+    for name, quantity in UNSIGNED.items():
         if name not in recording or not _has_one_sign(recording[name]):
             continue
         values = recording[name]
@@ -87,13 +87,34 @@ def _is_in_supply_line(recording: Recording, sign: Array) -> bool:
     return flow_at_rest > _PRIORS.passes * float(magnitude[is_moving].mean())
 
 
-def _has_one_sign(values: Array) -> bool:
-    """Test whether a channel (n,) stays on one side of zero, except for noise (`unsigned.noise` of `priors.toml`)."""
-    finite = values[np.isfinite(values)]
-    if not finite.size:
-        return False
-    smaller, larger = sorted((max(0.0, -float(finite.min())), max(0.0, float(finite.max()))))
+def is_one_sided(lowest: float, highest: float) -> bool:
+    """Test whether a channel with this range is on one side of zero, except for noise (`unsigned.noise`)."""
+    smaller, larger = sorted((max(0.0, -lowest), max(0.0, highest)))
     return larger > 0.0 and smaller <= _PRIORS.noise * larger
+
+
+def is_two_way(outward: float, inward: float) -> bool:
+    """Test whether the smaller of two distances is more than the fraction `unsigned.least` of the larger one."""
+    smaller, larger = sorted((outward, inward))
+    return smaller > _PRIORS.least * larger > 0.0
+
+
+def restore_flow(values: Array, x: Array, difference: Array, rate: float, flow_per_speed: tuple[float, float]) -> Array:
+    """Restore the sign of a speed or flow (n,) that has none, in a part of a stream.
+
+    `x`, `difference` (n,): position [m] and p_A - p_B [Pa]; `rate`: sampling rate [Hz]; `flow_per_speed`: magnitude
+    over the piston's speed while x grows and while it falls, known from earlier parts.
+    """
+    main_side = 1.0 if np.nansum(values) >= 0.0 else -1.0
+    speed = _piston_speed(x, rate)
+    sign = _fit_signs(difference, speed, np.abs(values), rate, np.array(flow_per_speed))
+    return _draw_noise_signs(main_side * values, rate) * sign
+
+
+def _has_one_sign(values: Array) -> bool:
+    """Test whether a channel (n,) stays on one side of zero (`is_one_sided`)."""
+    finite = values[np.isfinite(values)]
+    return bool(finite.size) and is_one_sided(float(finite.min()), float(finite.max()))
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
@@ -109,7 +130,10 @@ def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, st
     if not _moves_both_ways(motion) or _correlation(np.abs(motion), magnitude) < _PRIORS.correlation:
         return None, ""
     if has_position:
-        return _fit_signs(recording, motion, magnitude), "the position's rate and the pressures"
+        has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
+        difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
+        signs = _fit_signs(difference, motion, magnitude, recording.rate)
+        return signs, "the position's rate and the pressures"
     return np.where(motion < 0.0, -1.0, 1.0), "the command"
 
 
@@ -135,8 +159,7 @@ def _moves_both_ways(values: Array) -> bool:
 
     Of the sums of its positive and of its negative values, the smaller must exceed `unsigned.least` times the larger.
     """
-    smaller, larger = sorted(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values))
-    return smaller > _PRIORS.least * larger > 0.0
+    return is_two_way(*(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values)))
 
 
 def _correlation(first: Array, second: Array) -> float:
@@ -147,38 +170,42 @@ def _correlation(first: Array, second: Array) -> float:
     return float(np.corrcoef(first[known], second[known])[0, 1])
 
 
-def _fit_signs(recording: Recording, speed: Array, magnitude: Array) -> Array:
+def _fit_signs(
+    difference: Array, speed: Array, magnitude: Array, rate: float, known_areas: Array | None = None
+) -> Array:
     """Estimate the signs (n,) of the flow into chamber A from the piston speed and the chamber pressures.
 
     The model is sign x `magnitude` = a v + c (p_A - p_B), with the piston speed v = `speed` [m/s], a coefficient a for
-    each direction and the leakage conductance c. Without both pressures the last term is omitted. Fits alternate with
-    searches for the signs, at first those of the speed, until no sign changes or `_MAX_ITERATIONS` are reached.
+    each direction, `known_areas` (2,) if these are known, and the leakage conductance c. The last term is 0 without
+    pressures, a `difference` (n,) [Pa] of zeros. Fits alternate with searches for the signs, at first those of the
+    speed, until no sign changes or `_MAX_ITERATIONS` are reached. `rate`: sampling rate [Hz].
     """
-    has_pressures = {"p_A", "p_B"} <= recording.channels.keys()
-    difference = recording["p_A"] - recording["p_B"] if has_pressures else np.zeros(len(recording))
     known = np.isfinite(speed) & np.isfinite(difference) & np.isfinite(magnitude)
     speed, difference = (np.where(known, values, 0.0) for values in (speed, difference))  # evidence for neither sign
     magnitude = _interpolate_missing(magnitude)  # with 0, a change of sign beside a gap would cost nothing
     motion = np.column_stack([np.maximum(speed, 0.0), np.minimum(speed, 0.0)])
-    step_scale = _average_nearby(np.abs(np.diff(magnitude)), recording.rate)  # of the Laplace density below
+    step_scale = _average_nearby(np.abs(np.diff(magnitude)), rate)  # of the Laplace density below
     step_scale = np.maximum(step_scale, np.finfo(float).eps * magnitude.max() + np.finfo(float).tiny)
     # log odds against a change of sign after a sample: a change makes the step of the signed values larger by twice the
     # smaller magnitude, such steps have a Laplace density, and changes are rare
     cost_of_change = 2.0 * np.minimum(magnitude[1:], magnitude[:-1]) / step_scale
-    cost_of_change += max(0.0, np.log(recording.rate / _PRIORS.changes))
-    speed_variance = _noise_variance(speed, recording.rate)
+    cost_of_change += max(0.0, np.log(rate / _PRIORS.changes))
+    speed_variance = _noise_variance(speed, rate)
     sign = np.where(speed < 0.0, -1.0, 1.0)
     # at first all flow replaces leakage; in motion, where this is wrong, the variance is large
     leak_flow = magnitude * np.sign(difference)
     for _ in range(_MAX_ITERATIONS):
         # the pump moves the piston and replaces leakage, so that no coefficient is negative
-        areas = np.maximum(np.linalg.lstsq(motion, sign * magnitude, rcond=None)[0], 0.0)
+        areas = known_areas
+        if areas is None:
+            areas = np.maximum(np.linalg.lstsq(motion, sign * magnitude, rcond=None)[0], 0.0)
         motion_flow = motion @ areas
         # the variance is due to noise of the position, and to errors in proportion to the flow, such as by delays
         variance = areas.max() ** 2 * speed_variance + (_PRIORS.error * magnitude) ** 2 + np.finfo(float).tiny
         # weighted least squares; 0 without a pressure difference
-        information = max(float(np.sum(difference**2 / variance)), np.finfo(float).tiny)
-        conductance = max(float(np.sum(difference * leak_flow / variance)) / information, 0.0)
+        weights = variance.min() / variance
+        information = max(float(np.sum(difference**2 * weights)), np.finfo(float).tiny)
+        conductance = max(float(np.sum(difference * leak_flow * weights)) / information, 0.0)
         predicted = motion_flow + conductance * difference
         # log of the ratio of two normal densities, that for a positive sign over that for a negative one
         log_odds = 2.0 * magnitude * predicted / variance

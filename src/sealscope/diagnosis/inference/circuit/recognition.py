@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.balance import find_rest_limits
 from sealscope.diagnosis.inference.equations.balances import equations
-from sealscope.diagnosis.inference.equations.feed import feed_one_chamber, motions_of_side
+from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, motions_of_side
 from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import BIAS, CYLINDER, LAG, LEAK, MOTIONS, Equation
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows
@@ -92,7 +92,7 @@ def open_circuit_log_factor(equation: Equation, signals: Signals) -> float:
     (`zero.pressure`) does not tell which side carries the load. `equation`: volume balance of a closed circuit.
     """
     log_factor = 0.0
-    equation = feed_one_chamber(equation, signals)
+    equation = feed_one_chamber(equation, FeedSums.measure(equation, signals).find_feed(equation.area_ratio))
     volume, step = equation.left(signals), signals.step("x")
     certainty = -np.expm1(-0.5 * (signals.pressure_difference / INFERENCE.zero.pressure) ** 2)
     is_counted = np.isfinite(volume * step * certainty) & (signals.moving(equation.left) > 0.0)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,45 +31,122 @@ from sealscope.recordings.recording import Array
 _SIDES = {term.name: side for side in "AB" for term in (external_leak_term(side), compensated_leak_term(side))}
 
 
-def feed_one_chamber(equation: Equation, signals: Signals) -> Equation:
+class FeedSums(NamedTuple):
+    """Sums over the time in which pump and piston move, which show how an open circuit's pump feeds the chambers.
+
+    They add up over the parts of a recording, so that a stream learns them block by block.
+
+    Parameters
+    ----------
+    volumes : pair of floats
+        Volume of the pump [m^3], > 0, while x grows and while it falls.
+    distances : tuple of 4 floats
+        Distance of the piston [m], > 0, in each of `MOTIONS`.
+    work : float
+        Sum of the products of the increments of volume and distance [m^4]: > 0 if flow and position have one sense.
+    delivered, time : float, float
+        Volume that the pump delivers either way [m^3], and the time [s] over which its flow is known.
+    """
+
+    volumes: tuple[float, ...] = (0.0, 0.0)
+    distances: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    work: float = 0.0
+    delivered: float = 0.0
+    time: float = 0.0
+
+    @classmethod
+    def measure(cls, equation: Equation, signals: Signals, span: slice = slice(None)) -> FeedSums:
+        """Sum over the sampling intervals `span` of the signals, which have limits of rest."""
+        volume, step = equation.left(signals)[span], signals.step("x")[span]
+        is_known = (signals.moving(equation.left)[span] > 0.0) & np.isfinite(volume)
+        is_counted = is_known & np.isfinite(step)
+        # of a coarse encoder most increments are 0, so that its averaged speed tells the direction
+        weights = {motion: signals.direction_weights(*motion)[span][is_counted] for motion in MOTIONS.values()}
+        counted_volume, counted_step = volume[is_counted], step[is_counted]
+        volumes = [
+            abs(float((weights[outward, True] + weights[outward, False]) @ counted_volume)) for outward in (True, False)
+        ]
+        return cls(
+            volumes=tuple(volumes),
+            distances=tuple(abs(float(weight @ counted_step)) for weight in weights.values()),
+            work=float(counted_volume @ counted_step),
+            delivered=float(np.abs(volume[is_known]).sum()),
+            time=float(np.count_nonzero(is_known) * signals.dt),
+        )
+
+    def add(self, other: FeedSums) -> FeedSums:
+        """Return the sums over two parts of a recording."""
+        return FeedSums(
+            volumes=tuple(map(sum, zip(self.volumes, other.volumes, strict=True))),
+            distances=tuple(map(sum, zip(self.distances, other.distances, strict=True))),
+            work=self.work + other.work,
+            delivered=self.delivered + other.delivered,
+            time=self.time + other.time,
+        )
+
+    @property
+    def ways(self) -> tuple[float, float]:
+        """Distance [m] while x grows, and while it falls."""
+        out_A, out_B, in_A, in_B = self.distances
+        return out_A + out_B, in_A + in_B
+
+    @property
+    def flow_per_speed(self) -> tuple[float, float]:
+        """Volume over distance [m^2] while x grows, and while it falls, both of which must have been recorded."""
+        (volume_out, volume_in), (way_out, way_in) = self.volumes, self.ways
+        return volume_out / way_out, volume_in / way_in
+
+    @property
+    def mean_flow(self) -> float | None:
+        """Mean flow in motion [m^3/s], None without motion."""
+        return self.delivered / self.time if self.time > 0.0 else None
+
+    def find_feed(self, area_ratio: float) -> Feed:
+        """Find the chamber that the pump feeds while x grows: that of the larger area if more flow moves the piston.
+
+        Flows are compared per distance, whatever the signs of flow and position. If the areas differ by less than these
+        ratios scatter (`feed.scatter` of `priors.toml`), it is A if the flow is positive while x grows. `area_ratio`:
+        that of `Equation`.
+        """
+        areas_tell = abs(float(np.log(area_ratio))) > INFERENCE.feed.scatter
+        if areas_tell and min(self.ways) > 0.0:
+            flow_out, flow_in = self.flow_per_speed
+            feeds_A = (flow_out > flow_in) == (area_ratio < 1.0)
+        else:
+            feeds_A = self.work >= 0.0
+        sense = float(np.sign(self.work))  # of the flow while x grows
+        return Feed("A" if feeds_A else "B", sense if feeds_A else -sense)
+
+
+class Feed(NamedTuple):
+    """Order in which the pump of an open circuit feeds the chambers.
+
+    `outward`: chamber that it feeds while x grows; `sign_A`: sign of its flow while it feeds A, 0 if it never moves.
+    """
+
+    outward: Literal["A", "B"]
+    sign_A: float
+
+
+def feed_one_chamber(equation: Equation, feed: Feed) -> Equation:
     """Adapt the volume balance of a cylinder to a pump that feeds one chamber at a time.
 
-    `fed_outward` of the result names the chamber that the pump feeds while x grows (`_find_fed_outward`). The terms of
-    motion count the creep of a piston at rest with the area of the side that carries the load. A leak to the outside
-    counts while its chamber is fed or, while the pump rests, carries the load. `signals`: the recording, with limits of
-    rest.
+    The terms of motion count the creep of a piston at rest with the area of the side that carries the load. A leak to
+    the outside counts while its chamber is fed or, while the pump rests, carries the load. The signals from which the
+    terms are computed must have limits of rest.
     """
-    adapted = equation._replace(fed_outward=_find_fed_outward(equation, signals))
-    volumes = equation.left(signals) * signals.step("x")  # > 0 if flow and position have one sense
-    sign_A = float(np.sign(np.nansum(volumes))) * (1.0 if adapted.fed_outward == "A" else -1.0)  # of the flow into A
+    adapted = equation._replace(fed_outward=feed.outward)
 
     def adapt(term: Term) -> Term:
         """Adapt one term."""
         if term.name in MOTIONS:
             return term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
         if term.name in _SIDES:
-            return term._replace(increments=partial(_counted_increments, term=term, left=equation.left, sign_A=sign_A))
+            counted = partial(_counted_increments, term=term, left=equation.left, sign_A=feed.sign_A)
+            return term._replace(increments=counted)
         return term
 
     return adapted._replace(terms=tuple(map(adapt, equation.terms)))
-
-
-def _find_fed_outward(equation: Equation, signals: Signals) -> Literal["A", "B"]:
-    """Find the chamber that the pump feeds while x grows: that of the larger area if more flow moves the piston then.
-
-    Flows are compared per distance, whatever the signs of flow and position. If the areas differ by less than these
-    ratios scatter (`feed.scatter` of `priors.toml`), it is A if the flow is positive while x grows.
-    """
-    volume, step = equation.left(signals), signals.step("x")
-    is_moving = np.isfinite(volume * step) & (signals.moving(equation.left) > 0.0)
-    outward, inward = is_moving & (step > 0.0), is_moving & (step < 0.0)
-    areas_tell = abs(float(np.log(equation.area_ratio))) > INFERENCE.feed.scatter
-    if not (areas_tell and outward.any() and inward.any()):
-        feeds_A = float(volume[is_moving] @ step[is_moving]) >= 0.0
-    else:
-        flow_out, flow_in = (abs(float(volume[flags].sum() / step[flags].sum())) for flags in (outward, inward))
-        feeds_A = (flow_out > flow_in) == (equation.area_ratio < 1.0)
-    return "A" if feeds_A else "B"
 
 
 def motions_of_side(equation: Equation, side: str) -> list[str]:
@@ -82,25 +159,27 @@ def motions_of_side(equation: Equation, side: str) -> list[str]:
     return [name for name, (outward, _) in MOTIONS.items() if outward == (equation.fed_outward == side)]
 
 
-def flag_circulation(equation: Equation, signals: Signals) -> NDArray[np.bool_]:
+def flag_circulation(equation: Equation, signals: Signals, mean_flow: float | None) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n - 1,) in which the pump's flow probably circulates to the tank, past the cylinder.
 
     Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
     load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as a
     fraction f of that in motion: a flow that circulates has any fraction up to 1, that of a pump that holds the load a
     log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`). `feed.circulates`: log
-    odds, before any recording, of a flow that circulates. Nothing is flagged if f is unknown.
+    odds, before any recording, of a flow that circulates. Nothing is flagged if f is unknown. Each block of a stream
+    judges a hold by the part of it that the block's samples contain. `mean_flow`: `FeedSums.mean_flow`.
     """
     prior = INFERENCE.feed
     flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
-    is_moving = signals.moving(equation.left) > 0.0
     circulates = np.zeros(len(flow), dtype=bool)
-    if not (is_moving.any() and is_held.any()):
+    if not (mean_flow and is_held.any()):
         return circulates
-    flow_in_motion = float(np.nanmean(flow[is_moving]))
     for first, length in find_runs(is_held).tolist():
         hold = slice(first, first + length)
-        fraction = float(np.nanmean(flow[hold])) / flow_in_motion
+        flow_held = flow[hold][np.isfinite(flow[hold])] * signals.rate
+        if not flow_held.any():
+            continue
+        fraction = float(flow_held.mean()) / mean_flow
         deviation = np.log(fraction / prior.held) / prior.spread
         log_density_if_held = -0.5 * deviation**2 - np.log(fraction * prior.spread * np.sqrt(2.0 * np.pi))
         # the density of f is 1 if the flow circulates, also for a few f above 1
