@@ -73,6 +73,8 @@ HOLE = "hole"
 CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
 #: Limit of a rest for a pump or piston that never counts as resting: no speed is below it.
 NEVER = -1.0
+#: Quantile of the magnitudes of speeds up to which they count in a mean: glitches are rarer than motion.
+TOP_SPEED = 0.999
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
 
@@ -541,10 +543,12 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
     It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
     deviations of the noise of a mean of v over `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or
-    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz].
+    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above the quantile `TOP_SPEED`, as of
+    a glitch, count as that quantile.
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
+    speed = np.minimum(speed, np.quantile(speed, TOP_SPEED)) if speed.size else speed
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
@@ -560,14 +564,14 @@ def flag_lowering(pump_volume: Array, signals: Signals) -> NDArray[np.bool_]:
     A valve then lowers a load past the pump, or connects the chambers of an actuator that is moved from outside. A leak
     is slower: it passes little of the pump's flow, and less at a smaller load. The piston must therefore be faster than
     the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, reduced in the ratio of abs(p_A - p_B) to
-    its mean while the pump turns, on average over `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The
+    its median while the pump turns, on average over `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The
     flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end. `pump_volume` (n,): increments of
     the pump's volume [m^3], NaN where missing.
     """
     rate, x_step, load = signals.rate, signals.step("x"), np.abs(signals.pressure_difference)
     rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
-    mean_load = max(float(np.nan_to_num(load[~rests]).mean()) if not rests.all() else 0.0, np.finfo(float).tiny)
-    relative_load = np.where(np.isfinite(load), np.minimum(load / mean_load, 1.0), 1.0)
+    usual_load = max(float(np.median(np.nan_to_num(load[~rests]))) if not rests.all() else 0.0, np.finfo(float).tiny)
+    relative_load = np.where(np.isfinite(load), np.minimum(load / usual_load, 1.0), 1.0)
     max_creep = max_rest_rate(x_step, rate, INFERENCE.rest.lowers) * relative_load
     limit = np.maximum(max_creep, max_rest_rate(x_step, rate, fraction=0.0))
     excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
