@@ -264,10 +264,10 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     variants = {K_OIL: np.repeat(stiffnesses, 4), K_BRK: np.tile(breakaways, 4)}
     # one group for each stiffness of the oil: its best and its second-best breakaway force, (4, p) each
     best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
-    fit = fit_from_starts(segment, [priors.centre, *best_starts], noise, n_best=2)
-    if not segment.is_explained(fit.cost(noise, priors.normal)):
-        fit = fit_from_starts(segment, [fit.theta, *second_best_starts], noise, n_best=2)
-    return fit
+    fit = fit_from_starts(segment, best_starts, noise, n_best=2)
+    is_explained = segment.is_explained(fit.cost(noise, priors.normal))
+    others = [priors.centre] if is_explained else [priors.centre, *second_best_starts]
+    return fit_from_starts(segment, [fit.theta, *others], noise, n_best=2)
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
