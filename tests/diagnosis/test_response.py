@@ -79,7 +79,7 @@ def test_a_path_that_made_the_record_is_followed() -> None:
     np.testing.assert_allclose(followed[:, K_OIL], BELIEFS.centre[K_OIL], rtol=0.02)
 
 
-@pytest.mark.parametrize("seed", [102, 104, 107])
+@pytest.mark.parametrize("seed", [104, 107, 121])
 def test_a_short_fast_record_does_not_end_in_a_minimum_of_a_faster_leaking_pump(seed: int) -> None:
     recording = ss.simulate(command="5 sin(2t)", duration=20.0, set={"pump.G_pump": "4e-13 m^3/(s Pa)"}, seed=seed)
     level = measure_leak(recording, THESIS).level

@@ -23,7 +23,7 @@ from scipy.linalg.lapack import dtbtrs
 from scipy.ndimage import gaussian_filter1d
 
 from sealscope.diagnosis.inference.comparison.recording_sums import NO_SUMS, RecordingSums
-from sealscope.diagnosis.inference.onset import WITHIN_95, Information
+from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint, Linearisation, Normal, Priors
 from sealscope.diagnosis.inference.pressures.leak import ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
@@ -65,7 +65,7 @@ _N_STEPS, _MIN_GAIN = 12, 5.0
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
 #: Joint fit of all blocks: maximum number of Gauss-Newton steps; fraction of a step that follows a failed one; largest
 #: predicted increase of -2 log posterior at a second start.
-_N_JOINT_STEPS, _PART, _MAX_LOSS = 10, 0.3, 100.0
+_N_JOINT_STEPS, _PART, _MAX_LOSS = 10, 0.3, 1000.0
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
@@ -445,10 +445,10 @@ class Follower:
 def fit_jointly(follower: Follower, blocks: Sequence[Recording], block_s: float) -> Joint:
     """Fit the parameters in all K consecutive blocks of a recording, each `block_s` [s] long, together.
 
-    `follower`: filter at the first sample. It tracks the parameters through the blocks; about these the model is
-    linearised first, then anew about the fitted parameters (Gauss-Newton steps). Conductance and gain may lie in a
-    wrong minimum, as a faster pump feeds a leak: if the mean conductance is improbable by its prior, a second start
-    has the conductance of a healthy machine, unless the linearised fit excludes it.
+    `follower`: filter at the first sample. It tracks the parameters through the blocks, and the model is linearised
+    about these. Conductance and gain may lie in a wrong minimum, as a faster pump feeds a leak: if the mean conductance
+    is above its usual range, and the linearised fit does not exclude that of a healthy machine, the model is
+    linearised anew, step by step, from the fitted parameters and from those of a healthy machine.
     """
     states = follower.states
 
@@ -472,12 +472,12 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], block_s: float)
                 break
         return joint
 
-    joint = converge(Joint.fit([follower.update(block) for block in blocks], follower.priors, block_s, G))
+    joint = Joint.fit([follower.update(block) for block in blocks], follower.priors, block_s, G)
     centre, width = follower.priors.centre[G], follower.priors.width[G]
     healthy, loss = joint.condition(G, centre)
-    if joint.fitted[:, G].mean() > centre + WITHIN_95 * width and loss < _MAX_LOSS:
-        other = converge(linearise(limit_step(healthy, joint.theta)))
-        joint = min(joint, other, key=lambda fit: fit.cost(joint.variance))
+    if joint.fitted[:, G].mean() > centre + width and loss < _MAX_LOSS:
+        fits = [converge(linearise(limit_step(start, joint.theta))) for start in (joint.fitted, healthy)]
+        joint = min(fits, key=lambda fit: fit.cost(joint.variance))
     return joint
 
 
