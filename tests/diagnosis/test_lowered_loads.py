@@ -59,6 +59,19 @@ def test_only_the_piston_that_moves_while_the_pump_rests_is_lowered() -> None:
     assert not is_lowering[phase > 30.5].any()
 
 
+@pytest.mark.parametrize("rest", [1.0, 1.5, 4.0])
+def test_steps_with_rests_at_a_small_load_are_no_lowering(rest: float) -> None:
+    """Averages over time that reach into a rest contain some of the motion before and after it."""
+    rate, cycle = 500.0, 1.0 + rest
+    t = np.arange(round(12.0 * cycle * rate)) / rate
+    phase, way = t % cycle, np.where((t / cycle).astype(int) % 2 == 0, 1.0, -1.0)
+    speed = np.where(phase < 1.0, way * SPEED * np.sin(np.pi * phase), 0.0)
+    x = np.cumsum(speed) / rate
+    p_A = 5e5 + np.where(phase < 1.0, 1e5 * way, 1e3)
+    signals = Signals({"p_A": p_A, "p_B": np.full(t.size, 5e5), "x": np.round(x, 6)}, rate)
+    assert not flag_lowering(AREA_A * np.diff(x), signals).any()
+
+
 def test_lowering_changes_nothing_that_the_pump_shows() -> None:
     """The balance of a lift is that of its strokes up: as fast or slow as the load may come down."""
     recording = lift(1)

@@ -575,15 +575,21 @@ def flag_lowering(pump_volume: Array, signals: Signals) -> NDArray[np.bool_]:
     max_creep = max_rest_rate(x_step, rate, INFERENCE.rest.lowers) * relative_load
     limit = np.maximum(max_creep, max_rest_rate(x_step, rate, fraction=0.0))
     excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
-    window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
-    sums = np.cumsum(np.pad([excess, ~rests], ((0, 0), (1, 0))), axis=1)
-    mean_excess, n_turning = sums[:, window:] - sums[:, :-window]  # over the window after each sample, times its length
-    is_lowering = rests & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0.0), window)
-    for first, length in find_runs(~is_lowering).tolist():
-        if length < INFERENCE.rest.lasting * rate and rests[first : first + length].all():
-            is_lowering[first : first + length] = True
     margin = math.ceil(AVERAGING_TIME * rate)
-    return extend_flags(is_lowering, 2 * margin + 1)[margin:-margin]
+
+    def extend_both_ways(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Flag `margin` more samples at either end of each run of flags."""
+        return extend_flags(flags, 2 * margin + 1)[margin:-margin]
+
+    is_turning = extend_both_ways(~rests)  # averages next to motion contain some of it
+    window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
+    sums = np.cumsum(np.pad([excess, is_turning], ((0, 0), (1, 0))), axis=1)
+    mean_excess, n_turning = sums[:, window:] - sums[:, :-window]  # over the window after each sample, times its length
+    is_lowering = ~is_turning & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0.0), window)
+    for first, length in find_runs(~is_lowering).tolist():
+        if length < INFERENCE.rest.lasting * rate and not is_turning[first : first + length].any():
+            is_lowering[first : first + length] = True
+    return extend_both_ways(is_lowering)
 
 
 def _absolute_offset(pressure: Array) -> float:
