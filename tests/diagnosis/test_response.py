@@ -87,6 +87,14 @@ def test_a_short_fast_record_does_not_end_in_a_minimum_of_a_faster_leaking_pump(
     assert level.deviation < 3e-13
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+def test_random_walks_are_no_response(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    t = np.arange(round(60.0 * RATE)) / RATE
+    pressures = {name: 5e5 + np.cumsum(random.normal(0.0, 1e3, t.size)) for name in ("p_A", "p_B")}
+    assert fit_response(Recording(t, {"u": 3.0 * np.sin(4.0 * t), **pressures}, UNITS, RATE), THESIS) is None
+
+
 def test_conditioned_parameters_have_the_stated_mean_and_cost_what_the_posterior_says(
     leaking: tuple[ss.Recording, float],
 ) -> None:

@@ -61,7 +61,7 @@ class FollowPriors(PriorTable):
     centring: float  # [s] time constant of the mean position, from which the load's spring force is counted
     slow: float  # [periods of the ringing] width of the Gaussian filter that removes the ringing
     unexplained: float  # jumps are tried above this chi square of a block, in standard deviations from its mean
-    explained: float  # largest fraction of the variance of p_A - p_B that a valid fit leaves unexplained
+    explained: float  # largest fraction of the variance of p_A - p_B in a block that a valid fit leaves unexplained
 
 
 class PressureResponsePriors(PriorTable):

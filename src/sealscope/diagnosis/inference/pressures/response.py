@@ -498,8 +498,9 @@ def fit_response(recording: Recording, rig: Rig) -> Joint | None:
             except np.linalg.LinAlgError:
                 return None
         is_finite = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
-        max_variance = _FOLLOW.explained * np.var(recording["p_A"] - recording["p_B"])
-        return joint if is_finite and joint.variance < max_variance else None
+        # within blocks, since the sensor offset follows what changes from block to block, whatever it is
+        variance_in_blocks = np.mean([np.var(block["p_A"] - block["p_B"]) for block in blocks])
+        return joint if is_finite and joint.variance < _FOLLOW.explained * variance_in_blocks else None
 
     return compute_once(recording, ("response", rig), compute_fit, ("u", "p_A", "p_B"))
 
