@@ -266,8 +266,8 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
     fit = fit_from_starts(segment, best_starts, noise, n_best=2)
     is_explained = segment.is_explained(fit.cost(noise, priors.normal))
-    others = [priors.centre] if is_explained else [priors.centre, *second_best_starts]
-    return fit_from_starts(segment, [fit.theta, *others], noise, n_best=2)
+    further_starts = [priors.centre] if is_explained else [priors.centre, *second_best_starts]
+    return fit_from_starts(segment, [fit.theta, *further_starts], noise, n_best=2)
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
