@@ -329,6 +329,9 @@ class Follower:
                 follower, fit = bristles, bristles_fit
         follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
         follower._converge_on_beginning(recording)
+        # the filter lets the conductance wander as far as a leak takes it, be it into a wrong minimum (`fit_jointly`)
+        if follower.theta[G] > follower.priors.centre[G] + follower.priors.width[G]:
+            follower.theta = fit.theta
         return follower
 
     def _converge_on_beginning(self, recording: Recording) -> None:
