@@ -174,7 +174,7 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """Duration [s]: from the first sample to one interval after the last, or by the rate if the time steps back."""
+        """Duration [s] from the first sample to one interval after the last, or by the rate if the time steps back."""
         span = float(self.t[-1] - self.t[0]) + 1.0 / self.rate if self.t.size else 0.0
         # `span` is that of the number of samples up to rounding, and is not finite if a time is missing
         differs = math.isfinite(span) and abs(span * self.rate - self.t.size) > 0.5 and np.all(np.diff(self.t) >= 0.0)
