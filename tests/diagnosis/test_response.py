@@ -95,17 +95,17 @@ def test_random_walks_are_no_response(seed: int) -> None:
     assert fit_response(Recording(t, {"u": 3.0 * np.sin(4.0 * t), **pressures}, UNITS, RATE), THESIS) is None
 
 
-def test_conditioned_parameters_have_the_stated_mean_and_cost_what_the_posterior_says(
+def test_parameters_fitted_with_a_mean_have_it_and_cost_what_the_posterior_says(
     leaking: tuple[ss.Recording, float],
 ) -> None:
     joint = fit_response(leaking[0], THESIS)
     assert joint is not None
     mean = joint.fitted[:, G].mean()
-    conditioned, loss = joint.condition(G, mean + 1e-12)
-    assert conditioned[:, G].mean() == pytest.approx(mean + 1e-12)
-    change = ((conditioned - joint.fitted) / joint.priors.unit).ravel()
+    constrained, loss = joint.fit_with_mean(G, mean + 1e-12)
+    assert constrained[:, G].mean() == pytest.approx(mean + 1e-12)
+    change = ((constrained - joint.fitted) / joint.priors.unit).ravel()
     assert loss == pytest.approx(float(change @ np.linalg.solve(joint.covariance, change)), rel=1e-3)
-    np.testing.assert_allclose(joint.condition(G, mean)[0], joint.fitted)
+    np.testing.assert_allclose(joint.fit_with_mean(G, mean)[0], joint.fitted)
 
 
 @pytest.fixture(scope="module")

@@ -74,7 +74,7 @@ CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
 #: Limit of a rest for a pump or piston that never counts as resting: no speed is below it.
 NEVER = -1.0
 #: Quantile of the magnitudes of speeds up to which they count in a mean: glitches are rarer than motion.
-TOP_SPEED = 0.999
+SPEED_QUANTILE = 0.999
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
 
@@ -543,12 +543,12 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
     It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
     deviations of the noise of a mean of v over `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or
-    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above the quantile `TOP_SPEED`, as of
-    a glitch, count as that quantile.
+    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above their quantile `SPEED_QUANTILE`,
+    as of a glitch, count as that quantile.
     """
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
-    speed = np.minimum(speed, np.quantile(speed, TOP_SPEED)) if speed.size else speed
+    speed = np.minimum(speed, np.quantile(speed, SPEED_QUANTILE)) if speed.size else speed
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample

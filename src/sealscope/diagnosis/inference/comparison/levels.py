@@ -137,7 +137,7 @@ def _compare_held(
     leaks = np.array([getattr(recording, name)[:2] for recording in (*baseline, judged)])
     session_deviation = None if session_share is None else session_share * abs(float(leaks[:-1, 0].mean()))
     return leak_rise(
-        [*baseline, judged], leaks, part=1.0, min_crossover=min_crossover, session_deviation=session_deviation
+        [*baseline, judged], leaks, min_scatter=1.0, min_crossover=min_crossover, session_deviation=session_deviation
     )
 
 
@@ -145,15 +145,15 @@ def leak_rise(
     recordings: Sequence[RecordingSums],
     leaks: Array,
     *,
-    part: float,
+    min_scatter: float,
     min_crossover: float = 0.0,
     session_deviation: float | None = None,
 ) -> Rise:
     """Estimate by how much the leak of a recording, measured in each by itself, exceeds that of healthy recordings.
 
     `recordings` (n + 1): the healthy ones, then the judged one; `leaks` (n + 1, 2): conductance and standard deviation
-    [m^3/(s Pa)] of each; `part`: smallest plausible scatter of the healthy leaks, over their median standard deviation;
-    `min_crossover`, `session_deviation`: as in `_compare_levels`.
+    [m^3/(s Pa)] of each; `min_scatter`: smallest plausible scatter of the healthy leaks, over their median standard
+    deviation; `min_crossover`, `session_deviation`: as in `_compare_levels`.
     """
     *baseline, judged = recordings
     *healthy_leaks, leak = leaks[:, 0]
@@ -166,7 +166,7 @@ def leak_rise(
         baseline,
         values=np.array([leak - level]),
         rises=(np.array(healthy_leaks) - level)[None],
-        errors=np.array([max(part * error, min_error)]),
+        errors=np.array([max(min_scatter * error, min_error)]),
         level=max(level, 0.0),  # a mean below 0 is an error of the estimates
         level_error=error / np.sqrt(len(baseline)),
         min_crossover=min_crossover,

@@ -136,10 +136,11 @@ class Joint:
         """Fitted parameters in all blocks, (K, p)."""
         return self.theta + self.mean.reshape(self.theta.shape) * self.priors.unit
 
-    def condition(self, parameter: int, mean: float) -> tuple[Array, float]:
-        """Fit the parameters (K, p) if that with the index `parameter` has a given `mean` over all blocks.
+    def fit_with_mean(self, parameter: int, mean: float) -> tuple[Array, float]:
+        """Fit the parameters of all blocks (K, p) so that one of them has a given mean over the blocks.
 
-        Also returns the increase of -2 log posterior by this condition. The model is the linearised one.
+        `parameter`: its index; `mean`: in its unit. Also returns by how much -2 log posterior is larger than without
+        this constraint. Both follow from the linearised model.
         """
         indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
         change = (mean - self.fitted[:, parameter].mean()) / self.priors.unit[parameter]

@@ -117,7 +117,7 @@ class ResponseLeak(LeakMeasure):
         return leak_rise(
             conditions,
             np.array(levels),
-            part=INFERENCE.scatter.estimate,
+            min_scatter=INFERENCE.scatter.estimate,
             # levels are compared by their differences, as they are uncertain by the assumed friction
             min_crossover=INFERENCE.scatter.largest * self.conditions.conductance_of_flow,
             session_deviation=PRESSURE.conductance.level,

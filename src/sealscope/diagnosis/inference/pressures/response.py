@@ -65,7 +65,7 @@ _N_STEPS, _MIN_GAIN = 12, 5.0
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
 #: Joint fit of all blocks: maximum number of Gauss-Newton steps; fraction of a step that follows a failed one; largest
 #: predicted increase of -2 log posterior at a second start.
-_N_JOINT_STEPS, _PART, _MAX_LOSS = 10, 0.3, 1000.0
+_N_JOINT_STEPS, _SMALLER_STEP, _MAX_LOSS = 10, 0.3, 1000.0
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
@@ -463,21 +463,21 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], block_s: float)
 
     def converge(joint: Joint) -> Joint:
         """Take Gauss-Newton steps as long as each improves the fit clearly."""
-        part = 1.0  # fraction of the next step
+        fraction = 1.0  # of the next step
         for _ in range(_N_JOINT_STEPS):
-            step = part * (joint.fitted - joint.theta)
+            step = fraction * (joint.fitted - joint.theta)
             stepped = linearise(limit_step(joint.theta + step, joint.theta))
             if joint.cost(joint.variance) - stepped.cost(joint.variance) >= _MIN_GAIN:
-                joint, part = stepped, 1.0
-            elif part == 1.0:
-                part = _PART
+                joint, fraction = stepped, 1.0
+            elif fraction == 1.0:
+                fraction = _SMALLER_STEP
             else:
                 break
         return joint
 
     joint = Joint.fit([follower.update(block) for block in blocks], follower.priors, block_s, G)
     centre, width = follower.priors.centre[G], follower.priors.width[G]
-    healthy, loss = joint.condition(G, centre)
+    healthy, loss = joint.fit_with_mean(G, centre)
     if joint.fitted[:, G].mean() > centre + width and loss < _MAX_LOSS:
         fits = [converge(linearise(limit_step(start, joint.theta))) for start in (joint.fitted, healthy)]
         joint = min(fits, key=lambda fit: fit.cost(joint.variance))
