@@ -543,7 +543,7 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
 
     It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
     deviations of the noise of a mean of v over `AVERAGING_TIME`. `increments` (n,): increments of the position [m] or
-    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above their quantile `SPEED_QUANTILE`,
+    of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above the quantile `SPEED_QUANTILE`,
     as of a glitch, count as that quantile.
     """
     velocity = increments[np.isfinite(increments)] * rate
