@@ -7,8 +7,11 @@ import re
 import tomllib
 from functools import cache
 from pathlib import Path
+from typing import get_args
 
 import pytest
+
+from sealscope.diagnosis.verdict.evidence import Verdict
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCE = ROOT / "src" / "sealscope"
@@ -89,6 +92,22 @@ def test_a_class_name_stands_in_one_package():
                 packages.setdefault(node.name, set()).add(package)
     assert len(packages) > 100
     assert {name: sorted(homes) for name, homes in packages.items() if len(homes) > 1} == {}
+
+
+#: Where the words of a verdict stand: in their type, and as the name of an attribute of a watch.
+VERDICT_FILES = {"diagnosis/verdict/evidence.py", "diagnosis/live/watch.py"}
+
+
+def test_the_words_of_a_verdict_stand_in_one_place():
+    words = set(get_args(Verdict))
+    found = {
+        name_of(path)
+        for folder in ("diagnosis", "monitor")
+        for path in (SOURCE / folder).rglob("*.py")
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Constant) and node.value in words
+    }
+    assert found == VERDICT_FILES
 
 
 def test_nothing_is_called_utils():

@@ -21,7 +21,8 @@ from typing import Any, Literal
 
 from sealscope.diagnosis.commissioned.machine import JUDGEMENTS
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval, WatchedLeak
-from sealscope.diagnosis.verdict.states import state_of
+from sealscope.diagnosis.verdict.evidence import LEAK
+from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, state_of
 from sealscope.errors import InputError
 from sealscope.monitor.settings import WatchSettings
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict
@@ -31,7 +32,7 @@ AlarmState = Literal["new", "acknowledged", "valid", "invalid", "closed"]
 #: Message number of each level in the message catalogue of a control or a plant.
 DIAGNOSTIC_NUMBERS: dict[Level, int] = {"warning": 4101, "error": 4102}
 #: Condition of the machine at each level, which determines its state by NAMUR NE 107.
-_CONDITIONS: dict[Level, str] = {"warning": "leak", "error": "leak over the limit"}
+_CONDITIONS: dict[Level, str] = {"warning": LEAK, "error": LEAK_OVER_LIMIT}
 #: Bits of the status word.
 WARNING_BIT, ERROR_BIT, NEW_BIT = 1, 2, 4
 #: Largest evidence that is stored, beyond that of any threshold.

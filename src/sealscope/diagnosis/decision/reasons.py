@@ -66,18 +66,18 @@ def leak_text(case: Case, evidence: Evidence, alarm: LeakTest) -> str:
     """Describe in words a leak that the test `alarm` detected, or without measured leakage the change that it makes."""
     if case.leak is None:
         if case.tested_observable is not None and case.tested_observable.data == "plug-in":
-            return text_of("leak", "plug_in", provider=case.judge.provider)
-        return text_of("leak", "details", **_change_values(case))
+            return text_of("alarm", "plug_in", provider=case.judge.provider)
+        return text_of("alarm", "details", **_change_values(case))
     key = {WITHIN: "within", AGAINST: "against"}.get(alarm.name, "level")
     if key == "within" and not case.has_onset_within:
         key = "older"
     total = evidence.total_leakage
     if key == "level" and total is not None and total.lpm is not None and total.healthy_lpm is not None:
-        return text_of("leak", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
+        return text_of("alarm", "level_flow", lpm=total.lpm, healthy=total.healthy_lpm)
     if key in ("within", "against") and case.leak.provider == PRESSURE_RESPONSE:
         key = f"conductance_{key}"
-    text = text_of("leak", key)
-    return f"{text}; {text_of('leak', 'no_size')}" if "leak_lpm" in evidence.refuses else text
+    text = text_of("alarm", key)
+    return f"{text}; {text_of('alarm', 'no_size')}" if "leak_lpm" in evidence.refuses else text
 
 
 def _bound_text(case: Case, evidence: Evidence, bound: float) -> str:

@@ -44,7 +44,7 @@ MAX_BLOCKS = 240
 #: Degree of the Legendre polynomials of the drifts.
 DRIFT_DEGREE = 2
 #: Kinds of coefficients (`Term.drift`) that are free in each block while its rows are weighted.
-UNSTEADY = ("leak", "pump", "bias", "outside")
+UNSTEADY = ("piston", "pump", "bias", "outside")
 #: Maximum number of Gauss-Newton steps to the offset of p_A - p_B.
 _MAX_OFFSET_STEPS = 3
 

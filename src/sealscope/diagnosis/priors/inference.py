@@ -10,7 +10,7 @@ class DriftPriors(PriorTable):
     compliance: float  # compressed oil
     air: float  # free air in the oil
     bias: float  # constant flow, such as a tachometer shows at standstill because of its offset
-    leak: float  # leakage past the piston
+    piston: float  # leakage past the piston
     pump: float  # leakage of the pump
     outside: float  # leakage to the outside
     edge: float  # gain of a servo valve's control edge

@@ -30,7 +30,7 @@ from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, find_episodes,
 from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, Evidence, Verdict
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
-from sealscope.diagnosis.verdict.states import MachineState, state_of
+from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, state_of
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.quality import Finding
@@ -165,7 +165,7 @@ class Trend:
         """State of the machine by NAMUR NE 107, such as "good"; a failure if a leak is surely over the repair limit."""
         condition: str = self.verdict
         if self.verdict == LEAK and self.wear is not None and self.limit is not None:
-            condition = "leak over the limit" if self.wear.total.low > self.limit else LEAK
+            condition = LEAK_OVER_LIMIT if self.wear.total.low > self.limit else LEAK
         elif self.verdict == NO_LEAK:
             condition = "watched"  # as for a running machine; the condition "no leak" is that of a single recording
         return state_of(condition, self.decision.cause, action=self.next_check)

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
-from sealscope.diagnosis.verdict.states import MachineState, action_of, state_of
+from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, action_of, state_of
 from sealscope.errors import InputError, MissingExtra
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
@@ -202,7 +202,7 @@ class Diagnosis(Evidence):
     def state(self) -> MachineState:
         """State of the machine by NAMUR NE 107, such as "good"; "failure" for a leak surely over the repair limit."""
         is_over_limit = self.severity is not None and self.severity.level == "repair"
-        condition = "leak over the limit" if is_over_limit else self._condition
+        condition = LEAK_OVER_LIMIT if is_over_limit else self._condition
         onset_s = to_plain(self.onset_s)  # None if not finite
         return state_of(condition, self.named_cause, since_s=onset_s, action=self.next_check)
 

@@ -17,7 +17,8 @@ from typing import Any
 from sealscope.diagnosis.verdict.evidence import LEAK
 
 #: Conditions of a machine that leaks past piston or pump. Their state is the same for all causes of the leak.
-LEAKING = (LEAK, "leak over the limit")
+LEAK_OVER_LIMIT = "leak over the limit"
+LEAKING = LEAK, LEAK_OVER_LIMIT
 
 
 @dataclass(frozen=True, kw_only=True)

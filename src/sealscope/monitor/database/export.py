@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from sealscope.diagnosis.verdict.evidence import LEAK
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.database.tables import FIGURES
 from sealscope.storage.csv_file import write_csv
@@ -18,7 +19,7 @@ ALARM_COLUMNS = (
 )
 ESTIMATE_COLUMNS = ("actuator", "t", "status", *FIGURES, "label", "alarm")
 #: Label of the estimates during an alarm, by the mark of the alarm.
-_LABELS = {"valid": "leak", "repaired": "leak", "invalid": "healthy"}
+_LABELS = {"valid": LEAK, "repaired": LEAK, "invalid": "healthy"}
 
 
 def export_labels(store: MonitorStore, folder: Path) -> tuple[int, int]:

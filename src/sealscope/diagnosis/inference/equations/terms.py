@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
 #: Kinds of coefficients: each has a prior on its differences between recordings and, but for "speed", on its drift.
-Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "leak", "pump", "outside", "edge"]
+Coefficient = Literal["motion", "speed", "compliance", "air", "bias", "piston", "pump", "outside", "edge"]
 
 
 class Term(NamedTuple):
@@ -109,7 +109,7 @@ class Equation(NamedTuple):
 
 
 #: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
-LEAK, ORIFICE = "leak", "leak through an orifice"
+LEAK, ORIFICE = "laminar leak", "leak through an orifice"
 #: Free air in both chambers together, instead of one term for each chamber.
 AIR = "free air"
 #: The pump's leakage, driven by the pressures at its ports.
@@ -156,7 +156,7 @@ def conductance_term(
 
 _LEAK_CAUSE: Cause = "piston or pump leak"
 LEAKS = (
-    conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, _LEAK_CAUSE, drift="leak"),
+    conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, _LEAK_CAUSE, drift="piston"),
     Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, _LEAK_CAUSE, needs=PRESSURES, driver="root"),
 )
 
