@@ -46,8 +46,8 @@ class ConductancePriors(PriorTable):
 class FrictionLaw(PriorTable):
     """Parameters of a law of friction for the contact of piston and seal."""
 
-    # [m/N] displacement per force before sliding: centre, standard deviation, change in 90 s
-    give: tuple[float, float, float]
+    # [m/N] displacement per force before sliding, as a row of `PressureResponsePriors.response`
+    give: tuple[float, float, float, float]
     creep: float | None = None  # [m/s] below this speed the contact creeps; None to use the rig's `friction.v_th`
 
 
@@ -68,15 +68,16 @@ class PressureResponsePriors(PriorTable):
     """All tables of `inference/pressures/priors.toml`, for machines that are judged by pressures and command.
 
     Three of them are mappings from the name of a parameter, whose values are over the rig's own or in the unit that the
-    file states. `response` gives centre, standard deviation and change in 90 s. `start` gives the middle of the values
-    from which fits start, and the factor from it to the largest one. `jump` gives the same for values after a jump.
+    file states. `response` gives centre, standard deviation, change in 90 s and difference between recordings. `start`
+    gives the middle of the values from which fits start, and the factor from it to the largest one. `jump` gives the
+    same for values after a jump.
     """
 
     blocks: ResponseBlocks
     scale: MachineScale
     mains: MainsPriors
     conductance: ConductancePriors
-    response: Mapping[Parameter, tuple[float, float, float]]
+    response: Mapping[Parameter, tuple[float, float, float, float]]
     stribeck: FrictionLaw
     bristles: FrictionLaw
     follow: FollowPriors

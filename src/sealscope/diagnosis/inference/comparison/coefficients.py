@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import compress
+from typing import Protocol
 
 import numpy as np
 
@@ -19,6 +20,37 @@ from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
+
+
+class ComparedColumns(Protocol):
+    """Columns of Gram matrices that are compared between recordings, with their priors, such as `ColumnRoles`."""
+
+    @property
+    def names(self) -> Sequence[str]:
+        """Names of the coefficients; that of a laminar leak is `terms.LEAK`."""
+
+    @property
+    def compared(self) -> Sequence[int]:
+        """Columns whose coefficients are fitted."""
+
+    @property
+    def leak(self) -> int:
+        """Column of the leak."""
+
+    @property
+    def left(self) -> int:
+        """Column of the left side."""
+
+    @property
+    def healthy_conductance(self) -> float:
+        """Standard deviation of a healthy machine's leak [m^3/(s Pa)], infinite if unknown."""
+
+    @property
+    def between_deviation(self) -> Array:
+        """Prior standard deviations of differences between recordings, infinite without a prior."""
+
+    def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
+        """Compute the prior precisions of differences between recordings."""
 
 
 def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None) -> Array:
@@ -43,7 +75,7 @@ def _limit_precisions(prior: Array, gram: Array) -> Array:
     return np.minimum(prior, 1e9 * np.diag(gram))
 
 
-def coefficient_level(gram: Array, columns: Sequence[ColumnRoles]) -> tuple[float, float]:
+def coefficient_level(gram: Array, columns: Sequence[ComparedColumns]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
     `gram` (E, m, m): Gram matrices of E equations after `eliminate_unshared`. All other coefficients are free; the
@@ -121,7 +153,7 @@ def subtract_fit(gram: Array, fitted: Sequence[int], coefficients: Array, left: 
 
 
 def subtract_reference(
-    gram: Array, reference: Array, roles: ColumnRoles, *, has_leak: bool = False
+    gram: Array, reference: Array, roles: ComparedColumns, *, has_leak: bool = False
 ) -> tuple[Array, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
@@ -149,7 +181,7 @@ def subtract_reference(
 
 
 def estimate_leak_excess(
-    gram: Array, reference: Array, columns: Sequence[ColumnRoles], widths: Array
+    gram: Array, reference: Array, columns: Sequence[ComparedColumns], widths: Array
 ) -> tuple[Array, Array]:
     """Estimate the excess of a recording's leak coefficient over that of reference recordings, and the standard errors.
 

@@ -36,6 +36,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.coefficients import (
+    ComparedColumns,
     coefficient_level,
     eliminate_unshared,
     estimate_leak_excess,
@@ -61,12 +62,19 @@ PARTS, PART_WIDTH = 7, 0.5
 MAX_Z = 30.0
 
 
-def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequence[ColumnRoles]) -> Rise:
+def rise(
+    judged: RecordingSums,
+    baseline: Sequence[RecordingSums],
+    columns: Sequence[ComparedColumns],
+    *,
+    min_crossover: float = 0.0,
+    session_deviation: float | None = None,
+) -> Rise:
     """Estimate by how much a recording's leak coefficient exceeds that of healthy recordings of the same machine.
 
     The rise and its standard deviation are in the unit of the leak's coefficient, for the laminar leak m^3/(s Pa). The
     result is an average over widths of the prior on the differences of the other coefficients between recordings
-    (`_compare_levels`).
+    (`_compare_levels`, with `min_crossover` and `session_deviation`).
     """
     healthy_sums = np.sum([recording.sums for recording in baseline], axis=0)
     count, prior = len(baseline), INFERENCE.scatter
@@ -95,6 +103,8 @@ def rise(judged: RecordingSums, baseline: Sequence[RecordingSums], columns: Sequ
         log_widths=log_widths,
         level=level,
         level_error=level_error,
+        min_crossover=min_crossover,
+        session_deviation=session_deviation,
     )
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.comparison.recording_sums import NO_SUMS, RecordingSums
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Estimate, Information, step_tests
-from sealscope.diagnosis.inference.pressures.leak import ResponseLeak
+from sealscope.diagnosis.inference.onset import Information, step_tests
+from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak
 from sealscope.diagnosis.inference.pressures.response import measure_leak
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
@@ -44,13 +44,14 @@ class PressureResponse:
         """Summarise a healthy recording by its leakage and conditions; None if the leakage cannot be measured.
 
         - `level`, `error`: mean conductance past the piston and its standard error [m^3/(s Pa)];
-        - the fields of `recording_sums.RecordingSums` that are known but the sums.
+        - `law`: law of friction that describes the recording;
+        - the fields of `recording_sums.RecordingSums` that are known.
         """
-        leak = self.reading(recording)
+        leak = measure_leak(recording, self.rig, is_healthy=True)
         if leak is None:
             return None
-        summary = {"level": leak.level.value, "error": leak.level.deviation, **leak.conditions._asdict()}
-        del summary["sums"]
+        level = {"level": leak.level.value, "error": leak.level.deviation, "law": leak.law}
+        summary = level | leak.conditions._asdict()
         return {name: value for name, value in summary.items() if value is not None}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
@@ -59,12 +60,11 @@ class PressureResponse:
         The leakage is compared with that of the healthy recordings in `baseline`. If it cannot be measured or a leak
         would not show, the report states only the reason (`lack`).
         """
-        leak = self.reading(recording)
+        leak = measure_leak(recording, self.rig, _restore(healthy_summaries(self, baseline)))
         if leak is None:
             return Observed(
                 self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
             )
-        leak.healthy = [_restore_level(summary) for summary in healthy_summaries(self, baseline)]
         if leak.step is None and leak.rise is None:
             return Observed(self.name, lack="too little motion: no leak would show")
         is_known = np.ones(len(recording), bool) if recording.bridged is None else ~recording.bridged
@@ -73,11 +73,22 @@ class PressureResponse:
         return Observed(self.name, observables, leak, share=float(is_known.mean()), judged_until=float(judged_until))
 
 
-def _restore_level(summary: Summary) -> tuple[Estimate, RecordingSums]:
-    """Return the leakage and the conditions of a healthy recording from its summary; those of old files are unknown."""
-    level = Estimate(summary["level"], summary.get("error", 0.0))
-    flow, pressure = summary.get("flow", 0.0), summary.get("pressure", 0.0)
-    return level, RecordingSums(NO_SUMS, flow, pressure, summary.get("start_s"), summary.get("oil_degC"))
+def _restore(summaries: Iterable[Summary]) -> list[HealthyResponse]:
+    """Return healthy recordings from their summaries; those of old files, which lack the parameters, are left out."""
+    return [
+        HealthyResponse(
+            summary["law"],
+            RecordingSums(
+                np.asarray(summary["sums"]),
+                summary["flow"],
+                summary["pressure"],
+                summary.get("start_s"),
+                summary.get("oil_degC"),
+            ),
+        )
+        for summary in summaries
+        if "sums" in summary
+    ]
 
 
 def score_response_steps(information: Mapping[str, Information]) -> tuple[Observable, ...]:

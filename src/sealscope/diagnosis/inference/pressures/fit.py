@@ -14,7 +14,8 @@ widths of their priors.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -40,31 +41,75 @@ class Normal(NamedTuple):
         return (theta - self.mean) / self.unit
 
 
-class Priors(NamedTuple):
-    """Prior on p parameters that vary during a recording, (p,) each.
+@dataclass(frozen=True, eq=False)
+class Priors:
+    """Prior on p parameters that vary during a recording.
 
-    `centre`, `width`: prior mean and standard deviation of each parameter's average over the recording; `wander`:
-    standard deviation that the parameter's random walk reaches within the time `blocks.wander` of `priors.toml`, 90 s.
+    - `centre` (p,): prior mean of each parameter's average over the recording;
+    - `covariance` (p, p): prior covariance of these averages, in units of `unit`;
+    - `wander` (p,): standard deviation that the parameter's random walk reaches within the time `blocks.wander` of
+      `priors.toml`, 90 s;
+    - `between` (p,): standard deviation of the difference between recordings of one machine;
+    - `unit` (p,): units in which the parameters are counted, small enough for finite differences.
     """
 
     centre: Array
-    width: Array
+    covariance: Array
     wander: Array
+    between: Array
+    unit: Array
+
+    @staticmethod
+    def independent(centre: Array, width: Array, wander: Array, between: Array) -> Priors:
+        """Make the prior of independent parameters (p,) whose averages have the standard deviations `width` (p,)."""
+        unit = _DIFFERENCE * np.minimum(width, wander)
+        return Priors(centre, np.diag((width / unit) ** 2), wander, between, unit)
 
     @property
-    def unit(self) -> Array:
-        """Units (p,) in which the parameters are counted, small enough for finite differences."""
-        return np.asarray(_DIFFERENCE * np.minimum(self.width, self.wander))
+    def width(self) -> Array:
+        """Prior standard deviations (p,) of the parameters' averages over the recording."""
+        return np.asarray(np.sqrt(self.variance) * self.unit)
 
-    @property
+    @cached_property
     def normal(self) -> Normal:
-        """Normal prior of the parameters' means over the recording: mean `centre`, standard deviations `width`."""
-        return Normal(self.centre, np.diag(1.0 / self.variance), self.unit)  # mean, precision, unit
+        """Normal prior of the parameters' averages over the recording."""
+        return Normal(self.centre, np.asarray(np.linalg.inv(self.covariance)), self.unit)
 
     @property
     def variance(self) -> Array:
-        """Prior variances (p,) of the parameters, the squares of `width`, in squares of `unit`."""
-        return np.asarray((self.width / self.unit) ** 2)
+        """Prior variances (p,) of the parameters' averages, in squares of `unit`."""
+        return np.diag(self.covariance)
+
+    @property
+    def sums(self) -> Array:
+        """The prior as the Gram matrix (p + 1, p + 1) of a recording (`Joint.sums`)."""
+        return _gram_of_normal(self.normal.precision, self.normal.precision @ (self.centre / self.unit), self.unit)
+
+    def sums_of_machine(self, sums: Array, tested: int) -> Array:
+        """Return the likelihood of a machine's parameters by one of its recordings, as Gram matrix (p + 1, p + 1).
+
+        `sums` (p + 1, p + 1): likelihood of the recording's parameters (`Joint.sums`), which differ from those of the
+        machine by `between`, but for that with the index `tested`.
+        """
+        differing = np.flatnonzero(np.arange(len(self.centre)) != tested)
+        rows = sums[differing] * self.between[differing, None]  # of differences in units of `between`
+        matrix = rows[:, differing] * self.between[differing] + np.eye(len(differing))
+        return np.asarray(sums - rows.T @ np.linalg.solve(matrix, rows))
+
+    def of_machine(self, recordings: Sequence[Array], tested: int) -> Priors:
+        """Return the prior of a further recording of a machine, of which healthy `recordings` are known.
+
+        `recordings`: their likelihoods (`Joint.sums`), (p + 1, p + 1) each. The parameters of a recording differ from
+        those of the machine by `between`; in the further one, that with the index `tested` by any amount that a block
+        may add to it, as `wander` states.
+        """
+        units = np.append(self.unit, 1.0)
+        likelihoods = [self.sums_of_machine(sums, tested) for sums in recordings]
+        gram = (np.sum(likelihoods, axis=0) + self.sums) * units * units[:, None]
+        covariance = np.asarray(np.linalg.inv(gram[:-1, :-1]))
+        centre = covariance @ gram[:-1, -1] * self.unit
+        differences = np.where(np.arange(len(centre)) == tested, self.wander, self.between) / self.unit
+        return replace(self, centre=centre, covariance=covariance + np.diag(differences**2))
 
     def wander_variance(self, seconds: float) -> Array:
         """Compute the variances (p,) that the random walks add within a time [s], in squares of `unit`."""
@@ -120,7 +165,7 @@ class Joint:
     `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p): fitted
     deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): prior precision
     of the same deviations; `variance`: variance of the residual [Pa^2]; `squares`: sum of squares of the residual at
-    `theta` [Pa^2].
+    `theta` [Pa^2]; `gain`: decrease of -2 log posterior from `theta` to the fitted parameters in the linearised model.
     """
 
     priors: Priors
@@ -130,24 +175,12 @@ class Joint:
     prior_precision: Array
     variance: float
     squares: float
+    gain: float
 
     @property
     def fitted(self) -> Array:
         """Fitted parameters in all blocks, (K, p)."""
         return self.theta + self.mean.reshape(self.theta.shape) * self.priors.unit
-
-    def fit_with_mean(self, parameter: int, mean: float) -> tuple[Array, float]:
-        """Fit the parameters of all blocks (K, p) so that one of them has a given mean over the blocks.
-
-        `parameter`: its index; `mean`: in its unit. Also returns by how much -2 log posterior is larger than without
-        this constraint. Both follow from the linearised model.
-        """
-        indices = slice(parameter, None, self.theta.shape[1])  # the parameter in all blocks
-        change = (mean - self.fitted[:, parameter].mean()) / self.priors.unit[parameter]
-        covariances = self.covariance[:, indices].mean(axis=1)  # of all parameters with that mean
-        variance = float(covariances[indices].mean())
-        changes = (covariances * (change / variance)).reshape(self.theta.shape)
-        return self.fitted + changes * self.priors.unit, float(change**2 / variance)
 
     def cost(self, variance: float) -> float:
         """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise `variance` [Pa^2]."""
@@ -171,11 +204,36 @@ class Joint:
         inflation = 1.0  # white noise at first
         for _ in range(2):  # the fit changes the variance of the noise, which weights the prior
             factor = cho_factor(gram / (variance * inflation) + prior_precision, check_finite=False)
-            mean = cho_solve(factor, gradient / (variance * inflation) - prior_gradient, check_finite=False)
+            vector = gradient / (variance * inflation) - prior_gradient
+            mean = cho_solve(factor, vector, check_finite=False)
             variance, inflation = _estimate_noise(blocks, mean, parameter)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
         squares = sum(float(block.gram[0, 0]) for block in blocks)
-        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares)
+        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares, float(vector @ mean))
+
+    def sums(self, parameter: int, step: float) -> Array:
+        """Compute the likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1).
+
+        It is that of a regression with a column for each parameter, in the parameter's unit, and the left side: the
+        precision of the averages, and its products with them. The prior of the fit is removed. `parameter`: index of
+        the tested parameter, which in place of the prior's random walk has one with the standard deviation `step` from
+        block to block.
+        """
+        normal, unit, (n_blocks, n_parameters) = self.priors.normal, self.priors.unit, self.theta.shape
+        indices = slice(parameter, None, n_parameters)  # the tested parameter in all blocks
+        precision = np.linalg.inv(self.covariance)
+        vector = precision @ self.mean  # of the deviations from `theta`
+        differences = np.diff(np.eye(n_blocks), axis=0)
+        usual_walk = self.prior_precision[indices, indices] - normal.precision[parameter, parameter] / n_blocks**2
+        change = differences.T @ differences * (unit[parameter] / step) ** 2 - usual_walk
+        precision[indices, indices] += change
+        vector[indices] -= change @ self.theta[:, parameter] / unit[parameter]
+        covariance = np.linalg.inv(precision)
+        average = np.kron(np.full(n_blocks, 1.0 / n_blocks), np.eye(n_parameters))  # (p, K p)
+        averages = self.theta.mean(axis=0) / unit + average @ covariance @ vector
+        posterior = np.linalg.inv(average @ covariance @ average.T)
+        moments = posterior @ averages - normal.precision @ (normal.mean / unit)
+        return _gram_of_normal(posterior - normal.precision, moments, unit)
 
     def information(self, parameter: int, time: Array, wander: float) -> Information:
         """Compute the likelihood of the parameter with the index `parameter` in K blocks, all others eliminated.
@@ -197,6 +255,16 @@ class Joint:
         vector = posterior @ self.mean[indices] + prior_gradient + precision @ linearised_at
         precision = 0.5 * (precision + precision.T) / unit**2
         return Information(time, precision, vector / unit, slope=wander, walk=wander)
+
+
+def _gram_of_normal(precision: Array, moments: Array, unit: Array) -> Array:
+    """Return the Gram matrix (p + 1, p + 1) of a regression whose coefficients have a normal distribution.
+
+    `precision` (p, p) and `moments` (p,), the precision times the mean, are those of the coefficients over `unit` (p,).
+    """
+    gram = np.block([[precision, moments[:, None]], [moments, np.ones(1)]])
+    units = np.append(unit, 1.0)
+    return np.asarray(0.5 * (gram + gram.T) / units / units[:, None])
 
 
 def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:

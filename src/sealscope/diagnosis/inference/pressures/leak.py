@@ -5,15 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.comparison.levels import leak_rise
+from sealscope.diagnosis.inference.comparison.levels import rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.inference.equations.terms import LEAK
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise
 from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate, Information, StepTest, fit_history, step_test
+from sealscope.diagnosis.inference.pressures.fit import Priors
+from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS, G
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, Cause, LeakCourse, TotalLeakage
@@ -40,18 +43,52 @@ def states_flow(rig: Rig) -> bool:
     return rig.states("cylinder.A_A", "cylinder.A_B", "cylinder.M_eq")
 
 
+class HealthyResponse(NamedTuple):
+    """A healthy recording: its law of friction (`reduced_rig.LAWS`), and the likelihood of its parameters.
+
+    `recording.sums` (1, p + 1, p + 1): that of the parameters' averages over the recording (`fit.Joint.sums`).
+    """
+
+    law: str
+    recording: RecordingSums
+
+    @property
+    def sums(self) -> Array:
+        """Likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1)."""
+        return np.asarray(self.recording.sums[0])
+
+
+class ResponseColumns:
+    """Columns of the Gram matrices of p parameters and the left side (`fit.Joint.sums`), as `coefficients` reads them.
+
+    `between` (p,): standard deviations of the parameters' differences between recordings of one machine.
+    """
+
+    compared, unshared, hold_leak = tuple(range(len(PARAMETERS))), (), None
+    leak, left, healthy_conductance = G, len(PARAMETERS), np.inf
+    names = tuple(LEAK if k == G else name for k, name in enumerate(PARAMETERS))
+
+    def __init__(self, between: Array) -> None:
+        self.between_deviation = between
+
+    def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
+        """Return the prior precisions (c,) of the differences of c parameters between recordings."""
+        return np.asarray(self.between_deviation[indices] ** -2)
+
+
 class ResponseLeak(LeakMeasure):
     """The leakage of a recording as measured by the response of its pressures.
 
     - `parameters`: likelihood in K blocks of each parameter of the response, by the parameter's name; "G" is the
       conductance past the piston [m^3/(s Pa)].
     - `pressure` (K,): mean of abs(p_A - p_B) in each block [Pa].
-    - `conditions`: mean flow of the pump and mean of abs(p_A - p_B), date and oil of the recording, without sums.
+    - `conditions`: summary of the recording, with the likelihood of its parameters (`HealthyResponse`).
+    - `law`, `priors`: law of friction, and priors of the rig's parameters.
     - `stated`: true if the rig's file states the sizes that convert a conductance to L/min.
-    - `healthy`: `level` and `conditions` of each healthy recording of the machine.
+    - `healthy`: healthy recordings of the machine with this law of friction.
 
-    There is no `rise_flow`, since the level of the conductance depends on the assumed friction, and no leak's share of
-    the pump's flow (`relative`), which is only assumed from the command.
+    Without healthy recordings there is no `rise_flow`, since the level of the conductance depends on the assumed
+    friction. There is no leak's share of the pump's flow (`relative`), which is only assumed from the command.
     """
 
     provider = PRESSURE_RESPONSE
@@ -65,11 +102,13 @@ class ResponseLeak(LeakMeasure):
         pressure: Array,
         conditions: RecordingSums,
         *,
+        law: str,
+        priors: Priors,
         stated: bool,
-        healthy: Sequence[tuple[Estimate, RecordingSums]] = (),
+        healthy: Sequence[HealthyResponse] = (),
     ) -> None:
         self.parameters, self.pressure, self.conditions = parameters, pressure, conditions
-        self.stated, self.healthy = stated, healthy
+        self.law, self.priors, self.stated, self.healthy = law, priors, stated, healthy
 
     @property
     def information(self) -> Information:
@@ -89,14 +128,21 @@ class ResponseLeak(LeakMeasure):
 
     @property
     def step_flow(self) -> Estimate:
-        """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B).
+        """Mean flow [m^3/s] of a leak that begins within the recording, at the recording's mean abs(p_A - p_B)."""
+        return UNKNOWN_FLOW if self.step is None else self._flow_of(self.step.fitted)
+
+    @property
+    def rise_flow(self) -> Estimate | None:
+        """Mean flow [m^3/s] of the leakage above that of the healthy recordings; None without these."""
+        return None if self.rise is None else self._flow_of(Estimate(self.rise.value, self.rise.deviation))
+
+    def _flow_of(self, conductance: Estimate) -> Estimate:
+        """Compute the mean flow [m^3/s] of a leak at the recording's mean abs(p_A - p_B).
 
         The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
         of a laminar leak. The result is the mean of the two, which count as the ends of a 95 % interval in its error.
         """
-        if self.step is None:
-            return UNKNOWN_FLOW
-        size, deviation = self.step.fitted
+        size, deviation = conductance
         # flow over that of a laminar leak: between 1 and `ORIFICE_RATIO`
         mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
         law_deviation = half_range * abs(size) / WITHIN_95
@@ -113,11 +159,16 @@ class ResponseLeak(LeakMeasure):
         """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings; None without these."""
         if not self.healthy:
             return None
-        levels, conditions = zip(*self.healthy, (self.level, self.conditions), strict=True)
-        return leak_rise(
-            conditions,
-            np.array(levels),
-            min_scatter=INFERENCE.scatter.estimate,
+        # parameters that no recording tells are those of the rig
+        prior = self.priors.sums / len(self.healthy)
+        healthy = [
+            response.recording._replace(sums=(self.priors.sums_of_machine(response.sums, G) + prior)[None])
+            for response in self.healthy
+        ]
+        return rise(
+            self.conditions,
+            healthy,
+            [ResponseColumns(self.priors.between)],
             # levels are compared by their differences, as they are uncertain by the assumed friction
             min_crossover=INFERENCE.scatter.largest * self.conditions.conductance_of_flow,
             session_deviation=PRESSURE.conductance.level,

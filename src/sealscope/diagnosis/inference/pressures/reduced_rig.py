@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections import namedtuple
+from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -193,12 +194,13 @@ def simulate_response(
     store(states, 7, reading)
 
 
-def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
+def response_priors(rig: Rig, law: str = STRIBECK, *, is_healthy: bool = False) -> Priors:
     """Compute the priors on the parameters `PARAMETERS` of the pressure response from the parameters of a rig.
 
     They are the table `[response]` of `priors.toml`, multiplied by the rig's value of the parameter, or absolute if the
     rig has none; the prior of the contact's compliance, "give", depends on the `law` of friction, one of `LAWS`. The
-    Coulomb friction is that at the charge pressure. The table states the bias, a speed, in volts of the command.
+    Coulomb friction is that at the charge pressure. The table states the bias, a speed, in volts of the command. Within
+    a recording the leakage of a healthy machine (`is_healthy`) changes only as `conductance.wander` states.
     """
     friction, gain = rig.friction, rig.motor.omega_per_volt
     p_charge, of_difference = rig.fluid.p_charge, friction.coulomb_pressure == "difference"
@@ -206,8 +208,13 @@ def response_priors(rig: Rig, law: str = STRIBECK) -> Priors:
     rig_values = {"gain": gain, "bias": gain, "K": rig.fluid.K_oil, "F_C": coulomb}
     rig_values |= {name: getattr(friction, name) for name in ("F_v", "K_brk", "C_c")}
     relative = {str(name): row for name, row in PRESSURE.response.items()} | {"give": _FRICTION[law].give}
-    # one row of centre, width and wander for each parameter
-    return Priors(*np.array([rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]).T)
+    # one row of centre, width, wander and difference between recordings for each parameter
+    rows = [rig_values.get(name, 1.0) * np.array(relative[name]) for name in PARAMETERS]
+    priors = Priors.independent(*np.array(rows).T)
+    if is_healthy:
+        wander = np.where(np.arange(len(PARAMETERS)) == G, PRESSURE.conductance.wander, priors.wander)
+        priors = replace(priors, wander=wander)
+    return priors
 
 
 class Machine(NamedTuple):

@@ -16,16 +16,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.linalg.lapack import dtbtrs
 from scipy.ndimage import gaussian_filter1d
 
-from sealscope.diagnosis.inference.comparison.recording_sums import NO_SUMS, RecordingSums
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint, Linearisation, Normal, Priors
-from sealscope.diagnosis.inference.pressures.leak import ResponseLeak, states_flow
+from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
     BRISTLES,
     C_C,
@@ -63,9 +63,8 @@ _POSITIVE, _MIN = [GAIN, K_OIL, F_C, K_BRK, C_C], 1e-9
 _N_STEPS, _MIN_GAIN = 12, 5.0
 #: Fractions of a Gauss-Newton step that are tried together.
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
-#: Joint fit of all blocks: maximum number of Gauss-Newton steps; fraction of a step that follows a failed one; largest
-#: predicted increase of -2 log posterior at a second start.
-_N_JOINT_STEPS, _SMALLER_STEP, _MAX_LOSS = 10, 0.3, 1000.0
+#: Joint fit of all blocks: maximum number of Gauss-Newton steps; factor on a step after a failed one, and its minimum.
+_N_JOINT_STEPS, _SMALLER_STEP, _SMALLEST_STEP = 20, 0.3, 0.05
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
@@ -82,6 +81,24 @@ def limit_step(stepped: Array, theta: Array) -> Array:
     limited[..., _POSITIVE] = np.clip(stepped[..., _POSITIVE], 0.5 * theta[..., _POSITIVE], 2.0 * theta[..., _POSITIVE])
     limited[..., [LAG, COMPLIANCE]] = np.maximum(stepped[..., [LAG, COMPLIANCE]], [0.0, _MIN])
     return limited
+
+
+def is_explained(cost: float, n_samples: float) -> bool:
+    """Return True if the chi-squared `cost` of a fit to n samples is at most n + c sqrt(2 n).
+
+    That is c = `follow.unexplained` (`priors.toml`) standard deviations above the mean of chi-squared.
+    """
+    return bool(cost <= n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * n_samples))
+
+
+def noise_variance(recording: Recording) -> float:
+    """Estimate the variance of the noise of p_A - p_B [Pa^2], at least 1, as it is a divisor.
+
+    The noise of p_A - p_B is that of p_A + p_B without what both readings share. p_A - p_B also rings. The squares of
+    the coefficients (1, -3, 3, -1) of a third difference have the sum 20.
+    """
+    total, difference = recording["p_A"] + recording["p_B"], recording["p_A"] - recording["p_B"]
+    return max(float(np.diff([total, difference], 3).var(axis=1).min()) / 20.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,13 +232,6 @@ class Segment:
         # a sum of at least 1 Pa^2, since the variance is a divisor elsewhere
         return max(squares, 1.0) / count * max(1.0, 2.0 * math.sqrt(math.pi) * self.smooth)
 
-    def is_explained(self, cost: float) -> bool:
-        """Return True if the chi-squared `cost` of a fit to n samples is at most n + c sqrt(2 n).
-
-        That is c = `follow.unexplained` (`priors.toml`) standard deviations above the mean of chi-squared.
-        """
-        return bool(cost <= self.n_samples + _FOLLOW.unexplained * math.sqrt(2.0 * self.n_samples))
-
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to sums of products; the scores are those of G for each second."""
         rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
@@ -265,9 +275,21 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
     # one group for each stiffness of the oil: its best and its second-best breakaway force, (4, p) each
     best_starts, second_best_starts, *_ = rank_starts(segment, theta, n_groups=4, values=variants)
     fit = fit_from_starts(segment, best_starts, noise, n_best=2)
-    is_explained = segment.is_explained(fit.cost(noise, priors.normal))
-    further_starts = [priors.centre] if is_explained else [priors.centre, *second_best_starts]
+    further_starts = [priors.centre]
+    if not is_explained(fit.cost(noise, priors.normal), segment.n_samples):
+        further_starts += [*second_best_starts]
     return fit_from_starts(segment, [fit.theta, *further_starts], noise, n_best=2)
+
+
+def fit_from_conductances(segment: Segment, noise: float) -> Linearisation:
+    """Fit the parameters to a first segment of samples of a known machine, of which only the leakage is not known.
+
+    The fit starts from the best of several conductances. `noise`: variance of the noise [Pa^2].
+    """
+    sets = np.tile(segment.priors.centre, (SINGLE_WIDTH, 1))
+    sets[1:, G] = _geometric_grid(*PRESSURE.jump["G"], count=SINGLE_WIDTH - 1)
+    best_starts = sets[segment.residual_squares(sets).argsort()[: SINGLE_WIDTH // 5]]
+    return fit_from_starts(segment, best_starts, noise, n_best=2)
 
 
 def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: float, n_best: int) -> Linearisation:
@@ -283,49 +305,63 @@ def fit_from_starts(segment: Segment, starts: Sequence[Array] | Array, noise: fl
     return fits[0]
 
 
+class KnownMachine(NamedTuple):
+    """A machine known by healthy recordings: law of friction (`reduced_rig.LAWS`), priors of a further recording."""
+
+    law: str
+    priors: Priors
+
+
 class Follower:
     """Iterated Kalman filter that tracks the parameters of the pressure response from block to block.
 
     `rig`: assumed machine; `rate`: sampling rate [Hz]; `sense`: 1 if p_A - p_B rises with the command, else -1; `law`:
-    law of friction, one of `reduced_rig.LAWS`.
+    law of friction, one of `reduced_rig.LAWS`; `priors`: priors of the parameters, None for those of the rig.
     """
 
-    def __init__(self, rig: Rig, rate: float, sense: float, law: str = STRIBECK) -> None:
-        self.machine, self.priors, self.sense = Machine.from_rig(rig, rate, law), response_priors(rig, law), sense
+    def __init__(self, rig: Rig, rate: float, sense: float, law: str = STRIBECK, priors: Priors | None = None) -> None:
+        self.machine, self.sense = Machine.from_rig(rig, rate, law), sense
+        self.priors = response_priors(rig, law) if priors is None else priors
         self.theta = self.priors.centre  # parameters (p,)
-        self.covariance = np.diag(self.priors.variance)  # covariance of the parameters, in units of `priors.unit`
+        self.covariance = self.priors.covariance  # covariance of the parameters, in units of `priors.unit`
         self.variance = math.nan  # variance of the noise [Pa^2]
         self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
         self.excess = 0.0  # misfit of the last block of n samples, (chi squared - n) / sqrt(2 n)
 
     @staticmethod
-    def fit_start(recording: Recording, rig: Rig) -> Follower:
+    def fit_start(
+        recording: Recording, rig: Rig, known: KnownMachine | None = None, *, is_healthy: bool = False
+    ) -> Follower:
         """Start a filter with parameters that are fitted to the beginning of a recording.
 
-        `rig`: assumed machine, which gives sizes and priors. The law of friction is chosen as the module states.
+        `rig`: assumed machine, which gives sizes and priors; `known`: law of friction and priors of a known machine, or
+        None, for the priors of the rig (`is_healthy`: of a healthy machine), and a law that is chosen as the module
+        states.
         """
         u, dp = recording["u"], recording["p_A"] - recording["p_B"]
         # 1 if a positive command raises p_A - p_B or has no effect, -1 if it lowers it
         sense = float(np.sign(np.mean(u * (dp - dp.mean())))) or 1.0
         beginning = recording.samples(slice(0, math.ceil(_FOLLOW.window * recording.rate)))
-        total = beginning["p_A"] + beginning["p_B"]
-        # both have the noise of p_A - p_B; p_A - p_B also rings, and p_A + p_B has the noise that both readings share;
-        # the squares of the coefficients (1, -3, 3, -1) of a third difference have the sum 20; at least 1 Pa^2, as a
-        # divisor
-        rough = np.diff([total, beginning["p_A"] - beginning["p_B"]], 3)
-        noise_variance = max(float(rough.var(axis=1).min()) / 20.0, 1.0)
-        follower = Follower(rig, recording.rate, sense)
+        noise = noise_variance(beginning)
+        law, priors = known or (STRIBECK, response_priors(rig, is_healthy=is_healthy))
+        follower = Follower(rig, recording.rate, sense, law, priors)
         segment = follower.next_segment(beginning)
-        fit = fit_from_priors(segment, total, noise_variance)
-        cost = fit.cost(noise_variance, follower.priors.normal)
-        if not segment.is_explained(cost):  # try LuGre's friction in place of Stribeck's
-            bristles = Follower(rig, recording.rate, sense, BRISTLES)
+        if known is not None:
+            fit = fit_from_conductances(segment, noise)
+            follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
+            follower._converge_on_beginning(recording)
+            return follower
+        fit = fit_from_priors(segment, beginning["p_A"] + beginning["p_B"], noise)
+        cost = fit.cost(noise, follower.priors.normal)
+        if not is_explained(cost, segment.n_samples):  # try LuGre's friction in place of Stribeck's
+            priors = response_priors(rig, BRISTLES, is_healthy=is_healthy)
+            bristles = Follower(rig, recording.rate, sense, BRISTLES, priors)
             starts = np.array([fit.theta, bristles.priors.centre])
             # the fit with Stribeck's friction says nothing about the compliance
             starts[:, COMPLIANCE] = bristles.priors.centre[COMPLIANCE]
-            bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise_variance, n_best=1)
-            if bristles_fit.cost(noise_variance, bristles.priors.normal) < cost:
+            bristles_fit = fit_from_starts(bristles.next_segment(beginning), starts, noise, n_best=1)
+            if bristles_fit.cost(noise, bristles.priors.normal) < cost:
                 follower, fit = bristles, bristles_fit
         follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
         follower._converge_on_beginning(recording)
@@ -410,7 +446,7 @@ class Follower:
             return fit.cost(self.variance, prior), fit, prior
 
         candidates = [fit_candidate(self.theta, self._prior(block_s))]
-        if not segment.is_explained(candidates[0][0]):
+        if not is_explained(candidates[0][0], segment.n_samples):
             # the grid of the conductance after a jump is absolute, that of the stiffness relative to the current one
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
                 sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
@@ -445,90 +481,118 @@ class Follower:
         return segment.block_sums(fit)
 
 
-def fit_jointly(follower: Follower, blocks: Sequence[Recording], block_s: float) -> Joint:
-    """Fit the parameters in all K consecutive blocks of a recording, each `block_s` [s] long, together.
+def fit_jointly(follower: Follower, blocks: Sequence[Recording], noise: float) -> Joint:
+    """Fit the parameters in all K consecutive blocks of a recording together.
 
-    `follower`: filter at the first sample. It tracks the parameters through the blocks, and the model is linearised
-    about these. Conductance and gain may lie in a wrong minimum, as a faster pump feeds a leak: if the mean conductance
-    is above its usual range, and the linearised fit does not exclude that of a healthy machine, the model is
-    linearised anew, step by step, from the fitted parameters and from those of a healthy machine.
+    `follower`: filter at the first sample; `noise`: variance of the noise [Pa^2]. The model is linearised step by step,
+    first about the parameters with which the filter begins. If that explains the recording no further than to a change
+    within it, the fit from the parameters that the filter tracks through the blocks is tried as well.
     """
-    states = follower.states
+    states, start = follower.states, np.tile(follower.theta, (len(blocks), 1))
+    seconds = float(np.mean([block.duration for block in blocks]))
 
     def linearise(theta: Array) -> Joint:
         """Simulate all blocks with the parameters `theta` (K, p) and fit them together."""
         follower.states, follower.last = states, math.nan
         sums = [follower.linearise(block, row) for block, row in zip(blocks, theta, strict=True)]
-        return Joint.fit(sums, follower.priors, block_s, G)
+        return Joint.fit(sums, follower.priors, seconds, G)
 
     def converge(joint: Joint) -> Joint:
-        """Take Gauss-Newton steps as long as each improves the fit clearly."""
+        """Take Gauss-Newton steps, or fractions of them, as long as each improves the fit clearly."""
         fraction = 1.0  # of the next step
         for _ in range(_N_JOINT_STEPS):
+            if not (joint.gain >= _MIN_GAIN and fraction > _SMALLEST_STEP):
+                break
             step = fraction * (joint.fitted - joint.theta)
             stepped = linearise(limit_step(joint.theta + step, joint.theta))
-            if joint.cost(joint.variance) - stepped.cost(joint.variance) >= _MIN_GAIN:
+            if joint.cost(noise) - stepped.cost(noise) >= _MIN_GAIN:
                 joint, fraction = stepped, 1.0
-            elif fraction == 1.0:
-                fraction = _SMALLER_STEP
             else:
-                break
+                fraction *= _SMALLER_STEP
         return joint
 
-    joint = Joint.fit([follower.update(block) for block in blocks], follower.priors, block_s, G)
-    centre, width = follower.priors.centre[G], follower.priors.width[G]
-    healthy, loss = joint.fit_with_mean(G, centre)
-    if joint.fitted[:, G].mean() > centre + width and loss < _MAX_LOSS:
-        fits = [converge(linearise(limit_step(start, joint.theta))) for start in (joint.fitted, healthy)]
-        joint = min(fits, key=lambda fit: fit.cost(joint.variance))
-    return joint
+    fits = [converge(linearise(start))]
+    if not is_explained(fits[0].cost(noise), sum(len(block) for block in blocks)):
+        follower.theta, follower.states, follower.last = start[0], states, math.nan
+        tracked = Joint.fit([follower.update(block) for block in blocks], follower.priors, seconds, G)
+        fits.append(converge(tracked))
+    return fits[int(np.argmin(np.nan_to_num([fit.cost(noise) for fit in fits], nan=np.inf)))]
 
 
-def fit_response(recording: Recording, rig: Rig) -> Joint | None:
-    """Fit the response of p_A and p_B to the command in a recording, once; None if no parameters describe it.
+class Fit(NamedTuple):
+    """Joint fit of the response in a recording, and its law of friction."""
 
-    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine.
+    joint: Joint
+    law: str
+
+
+def fit_response(
+    recording: Recording, rig: Rig, known: KnownMachine | None = None, *, is_healthy: bool = False
+) -> Fit | None:
+    """Fit the response of p_A and p_B to the command in a recording; None if no parameters describe it.
+
+    `recording` must meet the requirements (`find_unmet_requirement`). `rig`: assumed machine; `known`: a known machine,
+    None to fit it once by the priors of the rig; `is_healthy`: true if the machine is known to be healthy.
     """
 
-    def compute_fit(recording: Recording) -> Joint | None:
+    def compute_fit(recording: Recording) -> Fit | None:
         """Track the parameters through all blocks, then fit these together; None if that fails or explains little."""
         edges = block_edges(recording).tolist()
         with np.errstate(over="ignore", invalid="ignore"):
             try:
-                follower = Follower.fit_start(recording, rig)
+                follower = Follower.fit_start(recording, rig, known, is_healthy=is_healthy)
                 blocks = [recording.samples(slice(first, end)) for first, end in pairwise(edges)]
-                joint = fit_jointly(follower, blocks, recording.duration / len(blocks))
+                joint = fit_jointly(follower, blocks, noise_variance(recording))
             except np.linalg.LinAlgError:
                 return None
         is_finite = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
         # within blocks, since the sensor offset follows what changes from block to block, whatever it is
         variance_in_blocks = np.mean([np.var(block["p_A"] - block["p_B"]) for block in blocks])
-        return joint if is_finite and joint.variance < _FOLLOW.explained * variance_in_blocks else None
+        describes = is_finite and joint.variance < _FOLLOW.explained * variance_in_blocks
+        return Fit(joint, follower.machine.law) if describes else None
 
-    return compute_once(recording, ("response", rig), compute_fit, ("u", "p_A", "p_B"))
+    if known is not None:
+        return compute_fit(recording)
+    return compute_once(recording, ("response", rig, is_healthy), compute_fit, ("u", "p_A", "p_B"))
 
 
-def measure_leak(recording: Recording, rig: Rig) -> ResponseLeak | None:
+def measure_leak(
+    recording: Recording, rig: Rig, healthy: Sequence[HealthyResponse] = (), *, is_healthy: bool = False
+) -> ResponseLeak | None:
     """Measure the leakage of a recording by the response of its pressures.
 
-    Return None if a requirement is not met (`find_unmet_requirement`), or if no parameters describe the response.
+    `healthy`: healthy recordings of the machine, which tell all of it but the leakage; `is_healthy`: true if this
+    recording is one of these. Return None if a requirement is
+    not met (`find_unmet_requirement`), or if no parameters describe the response.
     """
-    joint = fit_response(recording, rig) if find_unmet_requirement(recording, rig) is None else None
-    if joint is None:
+    if find_unmet_requirement(recording, rig) is not None:
         return None
+    known = None
+    if healthy:
+        law = healthy[-1].law  # that of the latest
+        healthy = [response for response in healthy if response.law == law]
+        known = KnownMachine(law, response_priors(rig, law).of_machine([response.sums for response in healthy], G))
+    fit = fit_response(recording, rig, known, is_healthy=is_healthy)
+    if fit is None:
+        return None
+    joint, law = fit
     edges, dp = block_edges(recording), np.abs(recording["p_A"] - recording["p_B"])
     middles = recording.t[0] + 0.5 * (edges[1:] + edges[:-1]) / recording.rate
     parameters = parameter_information(joint, middles, recording.duration)
     pressure = np.add.reduceat(dp, edges[:-1]) / np.diff(edges)
     mean_speed = rig.motor.omega_per_volt * float(np.mean(np.abs(recording["u"])))
+    step = PRESSURE.conductance.wander * math.sqrt(recording.duration / len(middles) / PRESSURE.blocks.wander)
     conditions = RecordingSums(
-        NO_SUMS,
+        joint.sums(G, step)[None],
         flow=mean_speed * rig.pump.q_b / (2.0 * np.pi),
         pressure=float(pressure.mean()),
         start_s=start_seconds(recording),
         oil_degC=oil_temperature(recording),
     )
-    return ResponseLeak(parameters, pressure, conditions, stated=states_flow(rig))
+    priors = response_priors(rig, law)
+    return ResponseLeak(
+        parameters, pressure, conditions, law=law, priors=priors, stated=states_flow(rig), healthy=healthy
+    )
 
 
 def parameter_information(joint: Joint, time: Array, seconds: float) -> dict[str, Information]:
