@@ -21,7 +21,7 @@ def nothing(_: object) -> np.ndarray:
 
 def columns() -> ColumnRoles:
     """A balance of three terms that drift, the leak, and a term that is no nuisance."""
-    kinds = {"stroke": "compliance", "oil": "air", "bias": "bias", LEAK: "leak", "other": ""}
+    kinds = {"stroke": "compliance", "oil": "air", "bias": "bias", LEAK: "piston", "other": ""}
     terms = [Term(name, "", nothing, "sensor fault", drift) for name, drift in kinds.items()]
     return ColumnRoles(Equation("test", nothing, tuple(terms)))
 

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.equations.terms import ORIFICE
+from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.onset import Information, step_test
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
@@ -137,7 +137,7 @@ def test_an_orifice_shows_by_the_law_of_its_flow_where_a_constant_conductance_hi
     time, pressure = 3.0 * np.arange(60.0), np.exp(rng.uniform(np.log(1e5), np.log(1e7), 60))
     root = pressure**-0.5
     blocks = SimpleNamespace(gram=np.array([[[[1.0, r], [r, r * r]]] for r in root]))
-    columns = [SimpleNamespace(leak=0, names=("leak", ORIFICE))]
+    columns = [SimpleNamespace(leak=0, names=(LEAK, ORIFICE))]
     precision = pressure**2 / 1e12  # the flow is equally well known in each block
     leak = 1.2e4 * root * (time > 90.0) / np.sqrt(precision.mean())
     noise = rng.standard_normal(60) / np.sqrt(precision)

@@ -42,7 +42,7 @@ COLUMNS = ColumnRoles(
         (
             Term("oil", "", nothing, "air in the oil", "compliance"),
             Term("bias", "", nothing, "sensor fault", "bias"),
-            Term(LEAK, "", nothing, "piston or pump leak", "leak"),
+            Term(LEAK, "", nothing, "piston or pump leak", "piston"),
         ),
     )
 )
@@ -454,7 +454,7 @@ def test_the_viscous_drop_tells_thin_oil_from_a_leak_where_no_thermometer_is_log
 
 
 MOTION_TERM = Term("motion", "", nothing, "sensor fault", "motion")
-LEAK_TERM = Term(LEAK, "", nothing, "piston or pump leak", "leak")
+LEAK_TERM = Term(LEAK, "", nothing, "piston or pump leak", "piston")
 MOVING = ColumnRoles(
     Equation("test", nothing, (MOTION_TERM, Term("oil", "", nothing, "air in the oil", "compliance"), LEAK_TERM))
 )

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.equations.terms import ORIFICE
+from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.onset import Estimate, Information
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, fit_rise
@@ -48,7 +48,7 @@ def fit(
     in which the pressures are equal.
     """
     blocks: Any = ConstantPressure(pressed=np.arange(K) < K - unpressed)
-    columns: Any = [SimpleNamespace(leak=0, names=("leak", ORIFICE))]
+    columns: Any = [SimpleNamespace(leak=0, names=(LEAK, ORIFICE))]
     unit, deviation = 1.0 / PRESSURE, 0.05  # conductance of a flow of 1; error of the rise
     precision = weights / weights.mean() / (0.15 * unit) ** 2
     random = np.random.default_rng(seed)
