@@ -32,6 +32,20 @@ class RestLimits(NamedTuple):
     shortest: float = MIN_REST
 
 
+class LoweringLimits(NamedTuple):
+    """Limits of flow, speed and load of a piston that moves past the resting pump (`balance.flag_lowering`).
+
+    - `pump`: flow below which the pump rests [m^3/s];
+    - `creep`: speed of the piston [m/s] up to which it creeps by a leak while it carries `load`, abs(p_A - p_B) [Pa];
+    - `noise`: speed of the piston that its sensor may show at rest [m/s].
+    """
+
+    pump: float
+    creep: float
+    load: float
+    noise: float
+
+
 class Signals:
     """Samples (n,) of recorded channels by name, in SI units, and signals derived from them.
 
