@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from functools import cache, partial
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,7 +59,6 @@ from sealscope.units import P_ATM
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-_Limits = TypeVar("_Limits", RestLimits, LoweringLimits)
 _BLOCKS = INFERENCE.blocks
 #: Maximum and minimum length of a block [s].
 MAX_BLOCK_TIME: float = _BLOCKS.longest
@@ -146,7 +145,7 @@ class BlockStream(SavedAttributes):
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
         self._rest_limits: RestLimits | None = None  # known after the first motion
-        self._lowering_limits: LoweringLimits | None = None  # the same
+        self._lowering_limits: LoweringLimits | None = None  # of all blocks so far
         self._sign_evidence = SignEvidence(balances, self.columns)
         self._feed_sums, self.n_meanings = FeedSums(), 0
         self._flow_range = (0.0, 0.0)  # lowest and highest value of the flow's channel
@@ -232,10 +231,6 @@ class BlockStream(SavedAttributes):
         if self._finds_rests:
             limits = find_rest_limits(samples, self._rate, self._balances[0])
             self._rest_limits = _raise_limits(limits, self._rest_limits)
-        if self._flow_channel:
-            signals = Signals(samples, self._rate)
-            lowering_limits = find_lowering_limits(self._balances[0].left(signals), signals)
-            self._lowering_limits = _raise_limits(lowering_limits, self._lowering_limits)
 
     def _learn_flow(self, samples: Mapping[str, Array], first: int, end: int) -> None:
         """Add the blocks `first` to `end` - 1 to what is known of the pump's flow: its sign, and an open circuit.
@@ -287,7 +282,7 @@ class BlockStream(SavedAttributes):
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
         weights. The first call also determines absolute minus gauge pressures. All calls up to the first that surely
         moves determine the signs of the left sides, and the speeds below which the machine rests; for a whole recording
-        that is its only call. Later blocks keep all of these.
+        that is its only call. Later blocks keep all of these, and learn on what is a motion past the resting pump.
         """
         length = self._length
         group = {
@@ -299,6 +294,9 @@ class BlockStream(SavedAttributes):
         elif not self.left_signs:
             self._learn_limits(group)
         if self._flow_channel:
+            signals = Signals(group, self._rate)
+            limits = find_lowering_limits(self._balances[0].left(signals), signals)
+            self._lowering_limits = self._lowering_limits.average_with(limits) if self._lowering_limits else limits
             self._learn_flow(samples, first, end)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
@@ -504,9 +502,11 @@ def _work_z_score(sums: Array) -> float:
     return _z_score(work - mean * flow, work_square - 2.0 * mean * load_square + mean**2 * square)
 
 
-def _raise_limits(limits: _Limits, earlier: _Limits | None) -> _Limits:
-    """Return the larger of two of each limit; `earlier` is None for the first samples."""
-    return limits if earlier is None else type(limits)(*map(max, limits, earlier))
+def _raise_limits(limits: RestLimits, earlier: RestLimits | None) -> RestLimits:
+    """Return the larger of two limits of pump and piston; `earlier` is None for the first samples."""
+    if earlier is None:
+        return limits
+    return limits._replace(pump=max(limits.pump, earlier.pump), piston=max(limits.piston, earlier.piston))
 
 
 def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Array:
@@ -578,12 +578,13 @@ def find_lowering_limits(pump_volume: Array, signals: Signals) -> LoweringLimits
     `pump_volume`: as in `flag_lowering`.
     """
     x_step, max_flow = signals.step("x"), max_rest_rate(pump_volume, signals.rate)
-    load = np.abs(signals.pressure_difference)[~find_rests(pump_volume, signals.rate, max_flow)]
+    load = np.abs(signals.pressure_difference)[~find_rests(pump_volume, signals.rate, max_flow)]  # while it turns
     return LoweringLimits(
         pump=max_flow,
         creep=max_rest_rate(x_step, signals.rate, INFERENCE.rest.lowers),
         load=float(np.median(np.nan_to_num(load))) if load.size else 0.0,
         noise=max_rest_rate(x_step, signals.rate, fraction=0.0),
+        time=len(load) / signals.rate,
     )
 
 
