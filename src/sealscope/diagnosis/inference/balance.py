@@ -238,7 +238,7 @@ class BlockStream(SavedAttributes):
         A flow without a sign counts with one from the first blocks on that show the piston moving both ways.
         """
         (balance,) = self._balances
-        was_unsigned, feed_before = self._is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
+        was_unsigned, feed_before = self.is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
         piece, begin = self._with_margins(samples, first, end)
         signals = self._signals(piece)
         span = slice(first * self._length - begin, end * self._length - begin)
@@ -248,7 +248,7 @@ class BlockStream(SavedAttributes):
             min(self._flow_range[0], float(np.nanmin(recorded, initial=0.0))),
             max(self._flow_range[1], float(np.nanmax(recorded, initial=0.0))),
         )
-        if self._is_unsigned != was_unsigned:
+        if self.is_unsigned != was_unsigned:
             # what earlier blocks told of the sign is of no use
             self._feed_sums = self._feed_sums._replace(work=abs(self._feed_sums.work))
             self._sign_evidence, self.left_signs = SignEvidence(self._balances, self.columns), ()
@@ -256,17 +256,17 @@ class BlockStream(SavedAttributes):
         if self._feeds_one_chamber:
             self._used_balances = (feed_one_chamber(balance, feed),)
         feeds_as_before = not self._feeds_one_chamber or feed == feed_before
-        self.n_meanings += self._is_unsigned != was_unsigned or not feeds_as_before
+        self.n_meanings += self.is_unsigned != was_unsigned or not feeds_as_before
 
     @property
-    def _is_unsigned(self) -> bool:
+    def is_unsigned(self) -> bool:
         """True if the pump's flow stays on one side of zero while the piston moves both ways."""
         has_one_sign = self._flow_channel in UNSIGNED and is_one_sided(*self._flow_range)
         return has_one_sign and is_two_way(*self._feed_sums.ways)
 
     def _restore_sign(self, samples: Mapping[str, Array]) -> dict[str, Array]:
         """Restore the sign of the pump's flow, if it has none; each block by its samples with margins."""
-        if not self._is_unsigned:
+        if not self.is_unsigned:
             return dict(samples)
         # flow [m^3/s] of one unit of the channel
         unit = float(self._balances[0].left(Signals({self._flow_channel: np.ones(2)}, self._rate))[0]) * self._rate
