@@ -274,8 +274,9 @@ class LiveBalance(SavedAttributes):
             _fit_to_blocks(model, np.array(grams), column_order, blocks.rows)
         # updates_model=False: the fit already contains these blocks
         precisions = np.array([self._solve_block(block, updates_model=False)[0] for block in _split(blocks)])
-        # of a usual block that tells of the leak
-        self._precision = float(np.median(precisions[precisions > NEGLIGIBLE * precisions.max()]))
+        if self._has_own_leakage:  # only rests under load tell of the leak
+            precisions = precisions[precisions > NEGLIGIBLE * precisions.max(initial=0.0)]
+        self._precision = float(np.median(precisions)) if precisions.size else 0.0  # of a usual block
         estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))
         return [estimate for estimate in estimates if not isinstance(estimate, NotJudged)]
 
