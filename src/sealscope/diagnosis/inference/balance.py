@@ -296,7 +296,8 @@ class BlockStream(SavedAttributes):
         if self._flow_channel:
             signals = Signals(group, self._rate)
             limits = find_lowering_limits(self._balances[0].left(signals), signals)
-            self._lowering_limits = self._lowering_limits.average_with(limits) if self._lowering_limits else limits
+            if np.isfinite(limits).all():  # not so for impossible readings
+                self._lowering_limits = self._lowering_limits.average_with(limits) if self._lowering_limits else limits
             self._learn_flow(samples, first, end)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
