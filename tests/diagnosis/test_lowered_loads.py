@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis.inference.balance import flag_lowering
 from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.signals import LoweringLimits, Signals
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.live.balance import LiveBalance
 from sealscope.diagnosis.live.joining import SampleRun
@@ -164,3 +164,14 @@ def test_a_stream_leaves_a_damped_phase_out_in_whatever_pieces_it_comes() -> Non
     )
     assert np.concatenate([before - before.mean(), after - after.mean()]).std() < 0.05 * leak
     assert after.mean() - before.mean() == pytest.approx(leak, rel=0.05)
+
+
+def test_a_first_minute_without_load_sets_no_limits_of_a_stream_for_good() -> None:
+    rests, strokes, flights = (
+        LoweringLimits(pump=1e-7, creep=creep, load=load, noise=1e-4, time=time)
+        for creep, load, time in ((1e-3, 0.0, 0.0), (2e-2, 3e5, 20.0), (5e-3, 3e6, 180.0))
+    )
+    assert rests.average_with(strokes) == strokes
+    limits = strokes.average_with(flights)
+    assert limits.load == pytest.approx(0.1 * strokes.load + 0.9 * flights.load)
+    assert (limits.time, limits.pump) == (200.0, pytest.approx(1e-7))
