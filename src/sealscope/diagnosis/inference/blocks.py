@@ -586,9 +586,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
-    # prior precisions of the fit, a row for each nuisance column, without that of the flow offset
-    rows = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])
-    prior = np.delete(rows, fit.nuisance.index(bias), axis=0).ravel()
+    prior = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])  # a row for each nuisance column
+    prior = np.delete(prior, fit.nuisance.index(bias), axis=0).ravel()  # without the flow offset
     leaks, biases = (_build_normal_equations(gram, fit.polynomials, nuisance, k, roles.left) for k in (leak, bias))
     coupling = np.vstack([leaks.coupling, biases.coupling])
     solution = solve(leaks.gram + np.diag(prior), np.column_stack([coupling.T, leaks.moment]))
