@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.diagnosis.inference.balance import BlockStream, recorded_blocks
-from sealscope.diagnosis.inference.blocks import Blocks, information
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_offset, information
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
@@ -134,7 +134,7 @@ def test_clipped_peaks_of_a_pressure_still_drive_the_leak() -> None:
     assert left.rows.sum() < 0.8 * whole.rows.sum()
     assert left.pressure_weights == pytest.approx(whole.pressure_weights)
     mean_pressures = [
-        np.average(np.abs(blocks.pressures).mean(axis=1), weights=blocks.pressure_weights) for blocks in (whole, left)
+        np.average(blocks.mean_pressure(0.0), weights=blocks.pressure_weights) for blocks in (whole, left)
     ]
     recorded = np.abs(clipped["p_A"] - clipped["p_B"]).mean()
     assert mean_pressures[1] == pytest.approx(recorded, rel=0.03)
@@ -220,11 +220,13 @@ def test_a_shifted_zero_leaves_score_and_size(side: str, shift: float, load: flo
     assert moved.fitted[0] == pytest.approx(test.fitted[0], rel=0.05)
     assert moved.onsets[moved.best] == pytest.approx(test.onsets[test.best], abs=1.0)
     added = shift if side == "p_A" else -shift
-    zeros = [float(own.zero[0]) for own in (apart, blocks)]
+    columns = tuple(ColumnRoles(balance) for balance in equations(RIG, frozenset(recording.channels)))
+    zeros = [estimate_offset(own, columns) for own in (apart, blocks)]
     assert zeros[0] - zeros[1] == pytest.approx(added, abs=2e4 + 0.03 * abs(added))
     # what a leak passes: coefficient times mean size of the pressure difference about its zero
     flows = [
-        own.fitted[0] * float(of.mean_pressure().mean()) for own, of in zip((moved, test), (apart, blocks), strict=True)
+        own.fitted[0] * float(of.mean_pressure(zero).mean())
+        for own, of, zero in zip((moved, test), (apart, blocks), zeros, strict=True)
     ]
     assert flows[0] == pytest.approx(flows[1], rel=0.05)
 

@@ -45,6 +45,8 @@ MAX_BLOCKS = 240
 DRIFT_DEGREE = 2
 #: Kinds of coefficients (`Term.drift`) that are free in each block while its rows are weighted.
 UNSTEADY = ("leak", "pump", "bias", "outside")
+#: Maximum number of Gauss-Newton steps to the offset of p_A - p_B.
+_MAX_OFFSET_STEPS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,9 +153,13 @@ class Blocks:
             zero=self.zero[first],
         )
 
-    def mean_pressure(self) -> Array:
-        """Compute the mean of abs(p_A - p_B - zero) [Pa] in each block, shape (K,), for a laminar leak."""
-        return np.asarray(np.abs(self.pressures - self.zero[:, None]).mean(axis=1))
+    def mean_pressure(self, offset: float | None = None) -> Array:
+        """Compute the mean of abs(p_A - p_B - offset) [Pa] in each block, shape (K,).
+
+        The flow of a laminar leak is proportional to it. `offset` [Pa]: sensor offset of p_A - p_B, by default `zero`.
+        """
+        subtracted = self.zero[:, None] if offset is None else offset
+        return np.asarray(np.abs(self.pressures - subtracted).mean(axis=1))
 
     def mean_root(self) -> Array:
         """Compute the mean of sqrt(abs(p_A - p_B - zero)) [Pa^0.5] in each block, shape (K,), for an orifice."""
@@ -318,6 +324,20 @@ class ColumnRoles:
             conductance = min(conductance, INFERENCE.healthy.piston)
         return conductance * per_conductance[driver]
 
+    def offset_deviation(self, column: int, blocks: Blocks) -> float:
+        """Compute the prior standard deviation of the error that a pressure sensor's offset causes in a `column`.
+
+        The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice. It
+        is 0 if no pressure drives the column's term, and in an equation without flow offset, whose column is needed to
+        remove the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the
+        mean of abs(p_A - p_B - zero) over `blocks`: pressures recorded in counts are much smaller numbers.
+        """
+        driver = self.drivers[column] if self.bias is not None else ""
+        root = float(np.mean(blocks.mean_root()))
+        # derivatives of the driver by the pressure: d sqrt(p)/dp = 1/(2 sqrt(p))
+        per_pascal = {"": 0.0, "pressure": 1.0, "root": 0.5 / root if root > 0.0 else 0.0}
+        return min(INFERENCE.zero.pressure, float(np.mean(blocks.mean_pressure()))) * per_pascal[driver]
+
 
 class Weighting(SavedAttributes):
     """Huber's weights of the rows of successive blocks, which limit the effect of outliers.
@@ -385,19 +405,19 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, with_
 
     With the residual variance s^2 of a row, precision and vector of an equation are the Schur complements
 
-        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 b) / s^2.
+        precision = (N - C (G + P)^-1 C') / s^2,    vector = (n - C (G + P)^-1 (b + P mu)) / s^2.
 
     The nuisance columns are those of the other coefficients. N is the diagonal matrix of the tested column's sums of
     squares in each block, n contains its products with the left side, and C those with the nuisance columns. G is the
     Gram matrix of the nuisance columns and b their products with the left side. P / s^2 is the prior precision of their
-    coefficients.
+    coefficients, and mu the prior mean.
     """
     count = len(blocks)
     precision, vector = np.zeros((count, count)), np.zeros(count)
     for e, roles in enumerate(columns):
         fit = _fit_equation(blocks, e, roles, test)
         normal = fit.normal
-        right_sides = np.column_stack([normal.coupling.T, normal.moment])
+        right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
         solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
         schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
         moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
@@ -418,8 +438,9 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     times the relative error `blocks.expansion` (`priors.toml`). The terms of the compliance hardly describe air at low
     pressures. The error is small where pressures rise and fall again, and large where they only relax.
     """
-    # a flag for each polynomial of each nuisance column
-    is_compliance = np.repeat(np.isin(fit.nuisance, roles.compliance), fit.polynomials.shape[1])
+    n_polynomials = fit.polynomials.shape[1]
+    # a flag for each polynomial of each nuisance column, and of the offset's, which is the last
+    is_compliance = np.repeat([*(k in roles.compliance for k in fit.nuisance), False], n_polynomials)
     coupling = np.where(is_compliance, fit.normal.coupling, 0.0)
     gram, _, _ = fit.normal.eliminate_tested()
     covariances = solve(gram + np.diag(fit.prior_precision), coupling.T) * fit.variance
@@ -480,17 +501,19 @@ def _build_normal_equations(
     )
 
 
-def _fit_nuisance(normal: _NormalEquations, deviations: Array, n_rows: float) -> tuple[Array, Array, float]:
+def _fit_nuisance(
+    normal: _NormalEquations, deviations: Array, prior_mean: Array, n_rows: float
+) -> tuple[Array, Array, Array, float]:
     """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
 
-    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `deviations` (c,):
-    standard deviations of the normal priors about 0 on the c other coefficients (a deviation of 0 fixes a coefficient,
-    an infinite one is no prior); `n_rows`: number of rows in all blocks.
+    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `deviations`,
+    `prior_mean` (c,): standard deviations and means of the normal priors on the c other coefficients (a deviation of 0
+    fixes a coefficient, an infinite one is no prior); `n_rows`: number of rows in all blocks.
 
     The variance of a row, `row_variance`, weights the prior, and so determines the fit: both are found by iteration,
     until the variance changes by at most the fraction `TOLERANCE`, or for `MAX_ITERATIONS`. Rows that overlap are
     correlated, as if their variance were OVERLAP times as large. The weight of the prior and the returned variance
-    contain this factor. Returns `coefficients`, `prior_precision` and `variance` of `_EquationFit`.
+    contain this factor. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
     """
     gram, moment, left_square = normal.eliminate_tested()
     min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
@@ -503,54 +526,100 @@ def _fit_nuisance(normal: _NormalEquations, deviations: Array, n_rows: float) ->
         # this limit is enough to fix a coefficient; the diagonal of `gram` would be no measure, as the elimination may
         # leave only rounding errors of it
         prior_precision = np.minimum(precision, 1e9 * np.diag(normal.gram))
-        coefficients = solve(gram + np.diag(prior_precision), moment)
-        # by the normal equations, the difference is the sum of squared residuals plus c' P c, with the prior's
-        # precision P; this is about OVERLAP row variances for each coefficient with a prior, a small share with many
-        # rows
+        prior_moment = prior_precision * prior_mean
+        coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
+        # by the normal equations, the difference is the sum of squared residuals plus c' P (c - mu), with the prior's
+        # precision P and mean mu; this is about OVERLAP row variances for each coefficient with a prior, a small share
+        # with many rows
         previous, row_variance = row_variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
         if abs(row_variance - previous) <= TOLERANCE * previous:
             break
-    return coefficients, prior_precision, max(OVERLAP * row_variance, np.finfo(float).tiny)
+    return coefficients, prior_precision, prior_moment, max(OVERLAP * row_variance, np.finfo(float).tiny)
 
 
 class _EquationFit(NamedTuple):
-    """Fit of the nuisance coefficients of one equation to K blocks.
+    """Fit of one equation to K blocks: sensor offset of p_A - p_B and nuisance coefficients.
 
     - `nuisance`: indices of the nuisance columns; `polynomials` (K, n): those of their drifts;
-    - `normal`: normal equations;
-    - `coefficients` (c,): n for each nuisance column, the constant first;
-    - `prior_precision` (c,): prior precision times `variance`;
+    - `normal`: normal equations after subtracting `offset` [Pa], relative to that already removed. If an orifice is
+      tested, it is an error of the root of p_A - p_B [Pa^0.5];
+    - `coefficients` (c,): n for each nuisance column, the constant first; the last n are the error that remains of the
+      offset, which does not drift;
+    - `prior_precision` (c,): prior precision times `variance`; `prior_moment` (c,): its product with the prior mean;
     - `variance`: variance of a row's residual, inflated for overlapping rows.
     """
 
     nuisance: list[int]
     polynomials: Array
     normal: _NormalEquations
+    offset: float
     coefficients: Array
     prior_precision: Array
+    prior_moment: Array
     variance: float
 
 
 def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None) -> _EquationFit:
-    """Fit the nuisance coefficients of an equation, while the tested coefficient is free in each block.
+    """Fit the nuisance coefficients of an equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
 
-    `test`: column of the tested coefficient, by default the leak's.
+    The tested coefficient g is free in each block. The leakage is g (p_A - p_B - z) = g (p_A - p_B) - g z. A change of
+    g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
+    offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
+
+    `test`: column of g, by default the leak's.
     """
     gram, test = blocks.gram[:, equation], roles.leak if test is None else test
     nuisance = [k for k in roles.nuisance if k != test]
     seconds = max(float(blocks.end[-1] - blocks.start[0]), 1e-9)
     position = (blocks.time - blocks.start[0]) / seconds * 2.0 - 1.0  # -1 to 1, the range of Legendre polynomials
     polynomials = np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0)  # of the drifts
+    n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
     constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
     level = roles.level_deviations(total)[nuisance]
     magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation, which `constants` may exceed
-    deviations = np.empty((len(nuisance), polynomials.shape[1]))  # prior standard deviations of constants and drifts
-    deviations[:, 0] = level
-    deviations[:, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
-    normal = _build_normal_equations(gram, polynomials, nuisance, test, roles.left)
-    nuisance_fit = _fit_nuisance(normal, deviations.ravel(), max(float(blocks.rows.sum()), 1.0))
-    return _EquationFit(nuisance, polynomials, normal, *nuisance_fit)
+    offset_deviation = roles.offset_deviation(test, blocks)
+    # prior standard deviations of constants and drifts; last those of the offset, whose drift is 0, and whose constant
+    # has no prior if the offset has no effect
+    deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
+    deviations[:-1, 0] = level
+    deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
+    deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
+    nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
+    offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
+    for iteration in range(_MAX_OFFSET_STEPS + 1):
+        shifted = _shift_offset(gram, roles, test, tested_coefficients, offset)
+        normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
+        prior_mean[-1, 0] = -offset  # of the remaining error
+        nuisance_fit = _fit_nuisance(normal, deviations.ravel(), prior_mean.ravel(), n_rows)
+        fit = _EquationFit(nuisance, polynomials, normal, offset, *nuisance_fit)
+        step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
+        is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
+        # in the first iteration g is 0, so that the offset has no effect
+        if is_last or (iteration > 0 and abs(step) <= TOLERANCE * offset_deviation):
+            break
+        offset += step
+        tested_residual = normal.tested_moment - normal.coupling @ fit.coefficients
+        tested_coefficients = tested_residual / np.maximum(normal.energy, np.finfo(float).tiny)
+    return fit
+
+
+def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
+    """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
+
+    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure or its root times the
+    sampling interval dt, from which `offset` [Pa] or [Pa^0.5] times dt is subtracted; `coefficients` (K,): coefficient
+    g of this column in each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the
+    volume balance with respect to the offset. Without a flow offset, whose column is dt, nothing is corrected, and the
+    last column is zero.
+    """
+    size = gram.shape[1]
+    transform = np.zeros((len(gram), size, size + 1))
+    transform[:, :, :size] = np.eye(size)
+    if roles.bias is not None:  # the column of the flow offset is dt
+        transform[:, roles.bias, test] -= offset  # tested column minus offset dt
+        transform[:, roles.bias, size] -= coefficients  # appended column -g dt
+    return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
 
 
 def offset_cost(offset: Any) -> Any:
@@ -563,6 +632,16 @@ def offset_cost(offset: Any) -> Any:
     """
     usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
     return np.minimum((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds))
+
+
+def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
+    """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
+
+    Only a leak that changes between blocks reveals it; otherwise it stays near `blocks.zero`, the offset already
+    removed.
+    """
+    offsets = [_fit_equation(blocks, e, roles).offset for e, roles in enumerate(columns)]
+    return float(np.mean(blocks.zero)) + float(np.mean(offsets))
 
 
 def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Array]:
@@ -586,7 +665,8 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]
-    prior = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])  # a row for each nuisance column
+    # prior precisions of the fit, a row for each nuisance column; the last row is the sensor offset's, not used here
+    prior = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])[:-1]
     prior = np.delete(prior, fit.nuisance.index(bias), axis=0).ravel()  # without the flow offset
     leaks, biases = (_build_normal_equations(gram, fit.polynomials, nuisance, k, roles.left) for k in (leak, bias))
     coupling = np.vstack([leaks.coupling, biases.coupling])
@@ -606,7 +686,7 @@ def estimate_weighted_mean(
     its level over the whole recording is extrapolated if the piston moves in a few blocks only. With mean m and
     covariance V of the leak, and C, G, b, P and s^2 as in `information`, the coefficients are
 
-        (G + P)^-1 (b - C' m),    covariance = (G + P)^-1 s^2 + (G + P)^-1 C' V C (G + P)^-1.
+        (G + P)^-1 (b + P mu - C' m),    covariance = (G + P)^-1 s^2 + (G + P)^-1 C' V C (G + P)^-1.
 
     A leak that is free in each block would take the place of a steady motion.
     """
@@ -620,7 +700,7 @@ def estimate_weighted_mean(
         contrast[first : first + n_polynomials] = weight * mean_polynomials
     factors = solve(normal.gram + np.diag(fit.prior_precision), contrast)
     by_leak = normal.coupling @ factors
-    value = factors @ normal.moment - by_leak @ leak.mean
+    value = factors @ (normal.moment + fit.prior_moment) - by_leak @ leak.mean
     variance = float(contrast @ factors * fit.variance + by_leak @ leak.covariance @ by_leak)
     return float(value), float(np.sqrt(max(variance, 0.0)))
 

@@ -1,12 +1,12 @@
 """Sensor offset (constant error) of the recorded p_A - p_B, estimated from a change of the leakage and removed.
 
 With a sensor offset z, the flow of a leak with the coefficient g is g (d - z), where d is the recorded difference p_A -
-p_B. A change of g then also changes the constant flow (the flow offset of the balance), by -g z. z may be larger than
-the pressure difference itself. In block k the Gram matrix determines two values: g_k, from the dependence of the flow
-on d within the block, and the flow o_k at the block's mean difference d_k. The leak's coefficient has a slow change F a
-(level and slope), a random walk w, and a step delta whose shape s is 0 before the onset and 1 after it. The constant
-flow has a slow change B b (level, slope and curvature). With the variance kappa of the noise and q kappa of the walk in
-a block,
+p_B. A change of g then also changes the constant flow (the flow offset of the balance), by -g z. A small z is a term of
+every fit (`blocks`). Here z is estimated even if it is larger than the pressure difference itself. In block k the Gram
+matrix determines two values: g_k, from the dependence of the flow on d within the block, and the flow o_k at the
+block's mean difference d_k. The leak's coefficient has a slow change F a (level and slope), a random walk w, and a step
+delta whose shape s is 0 before the onset and 1 after it. The constant flow has a slow change B b (level, slope and
+curvature). With the variance kappa of the noise and q kappa of the walk in a block,
 
     g_k = F_k a + w_k + delta s_k,    o_k = (d_k - z) g_k + B_k b,    cov(w_k, w_l) = kappa q min(k, l);
 
@@ -55,7 +55,7 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
         return blocks
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
     # prior standard deviation of the offset of good sensors [Pa], smaller for pressures in counts
-    unit = min(INFERENCE.zero.pressure, float(np.mean(blocks.mean_pressure())))
+    unit = columns[0].offset_deviation(columns[0].leak, blocks)
     offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
     gram = blocks.gram.copy()
     for k, roles in enumerate(columns):

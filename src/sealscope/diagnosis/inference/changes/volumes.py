@@ -15,6 +15,7 @@ import numpy as np
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
+    estimate_offset,
     information,
     offset_cost,
     solve,
@@ -86,7 +87,7 @@ def volume_observables(
     # these steps need be dated only to a fraction 1 / `blocks.coarse` of the recording
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
-    leak_disadvantage = float(offset_cost(blocks.zero[0]))
+    leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
     law_prior_of = dict(zip(EXPONENTS, law_priors(), strict=True))
     observables = []
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]

@@ -436,7 +436,7 @@ class BalanceLeak(LeakMeasure):
             blocks = balance.running_blocks
             history = fit_history(balance.leak, balance.test, with_step=True).relative_to(blocks.time < onset_s)
         value, deviation = history.mean, np.sqrt(np.maximum(np.diag(history.covariance), 0.0))
-        lpm = blocks.mean_pressure() * balance.size.scale / LITRE_PER_MINUTE  # per conductance
+        lpm = blocks.mean_pressure(balance.pressure_offset) * balance.size.scale / LITRE_PER_MINUTE  # per conductance
         half_width = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
         low, high = (value - half_width) * lpm, (value + half_width) * lpm
         return LeakCourse(blocks.time, value * lpm, low, high, whole=onset_s is None)

@@ -13,6 +13,7 @@ from sealscope.diagnosis.inference.balance import derive_drive_signals, flag_low
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
+    estimate_offset,
     estimate_weighted_mean,
     information,
     offset_cost,
@@ -413,10 +414,10 @@ class RecordedBalance:
             shares.append(float(squares[is_load].sum()) / max(float(squares.sum()), np.finfo(float).tiny))
         return shares[0], shares[1]
 
-    @property
+    @cached_property
     def pressure_offset(self) -> float:
-        """Estimated sensor offset of p_A - p_B [Pa], about 0 unless a change of the leak reveals it."""
-        return float(self.blocks.zero[0])
+        """Estimated sensor offset of p_A - p_B [Pa]; near `Blocks.zero` unless a change of the leak reveals another."""
+        return estimate_offset(self.blocks, self.columns)
 
     @cached_property
     def position_delay(self) -> Estimate | None:
@@ -432,7 +433,8 @@ class RecordedBalance:
 
     def mean_pressure(self) -> float:
         """Compute the mean of abs(p_A - p_B) [Pa] without the sensor offset."""
-        return float(np.average(self.blocks.mean_pressure(), weights=self.blocks.pressure_weights))
+        pressures = self.blocks.mean_pressure(self.pressure_offset)
+        return float(np.average(pressures, weights=self.blocks.pressure_weights))
 
     def outside_unit_flows(self) -> dict[str, float]:
         """Compute the flow [m^3/s] of each external leak with a conductance of 1 m^3/(s Pa), by the name of its term.
