@@ -206,7 +206,7 @@ _RMS = table_type(
     duty=_Array,
 )
 #: Numbers in the summary of friction and drifts, and their standard errors.
-_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *ZERO_KEYS)
+_SIGNAL_NUMBERS = (*FRICTION_KEYS, *DRIFT_KEYS, *ZERO_KEYS)
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
