@@ -233,7 +233,6 @@ _SUMMARIES = {
     ),
 }
 _ABOUT = {
-    "sha256": str,
     "pressure_bar": _Number,
     "oil_degC": _Number,
     "noise": uniform_table_type(_Magnitude),
