@@ -330,8 +330,7 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
         tree |= machine.rig.as_dict()
     summary = machine.summary
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
-    terms = {name: term._asdict() for name, term in summary.terms.items()}
-    tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
+    tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest}
     tree["healthy"] = [{"file": entry.file, "summary": format_summary(entry).checksum} for entry in machine.healthy]
     tree["alarms"] = [
         {

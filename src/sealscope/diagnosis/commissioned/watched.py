@@ -9,9 +9,8 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.machine_file import read_machine
-from sealscope.diagnosis.commissioned.summary import fit_columns
 from sealscope.diagnosis.healthy import SummarisedRecording
-from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
@@ -132,7 +131,8 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
         return None
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
-    *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
+    columns = [*nuisance, roles.leak]
+    *_, leak_coefficient = solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])  # least squares
     # true over computed flow; 0 if it is unknown: the stream computes its flows with the same assumed sizes
     scale = float(summary["scale"]) or 1.0
     conductance = float(leak_coefficient * scale)
