@@ -199,7 +199,7 @@ _BALANCE = table_type(
 _RMS = table_type(
     "allow",
     chambers=list_type(str),
-    recorded=(list_type(str), None),
+    recorded=list_type(str),
     rate=_Positive,
     start_s=(_Time, None),
     levels=_Array,
