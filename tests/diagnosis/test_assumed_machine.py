@@ -99,7 +99,7 @@ def test_pressures_alone_state_no_flow_without_a_rig() -> None:
     assert known.leak_lpm == pytest.approx(0.02, rel=0.5)
     assert (known.verdict, known.score) == (foreign.verdict, foreign.score)
     assert foreign.leak_lpm is None and foreign.severity is None
-    assert says(foreign.reason, "leak.no_size") and "L/min," not in foreign.reason
+    assert says(foreign.reason, "alarm.no_size") and "L/min," not in foreign.reason
     assert all(own.leak_lpm is None and own.course is None for own in foreign.parts)
     area_alone = judge(PressureResponse(stated(area=f"{AREA} m^2")), pressures)
     assert area_alone.leak_lpm is None  # the ringing needs the moving mass, too

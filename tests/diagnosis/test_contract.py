@@ -326,9 +326,9 @@ def test_the_chance_agrees_with_score_and_threshold(
 
 
 def test_odds_in_words() -> None:
-    said = {chance: Evidence("leak", "", chance=chance).odds for chance in (None, 1e-9, 1e-4, 0.00312, 0.05, 0.5, 1.0)}
+    said = {chance: Evidence("leak", "", chance=chance).odds for chance in (None, 1e-4, 0.00312, 0.05, 0.5, 1.0)}
     assert said[None] is None
-    assert said[1e-9] == said[1e-4] == "fewer than 1 in 10 000 healthy recordings looks like this"
+    assert said[1e-4] == "fewer than 1 in 10 000 healthy recordings looks like this"
     assert said[0.00312] == "1 in 320 healthy recordings looks like this"
     assert said[0.05] == "1 in 20 healthy recordings looks like this"
     assert said[0.5] == said[1.0] == "more than 1 in 5 healthy recordings look like this"

@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import butter, sosfilt
 
 from sealscope.diagnosis.healthy import SummarisedRecording
-from sealscope.diagnosis.inference.changes.healthy_levels import FRICTION_KEYS, HealthyLevels, _compare_friction
+from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.recordings.recording import Recording
 
@@ -237,24 +237,3 @@ def test_nothing_is_learnt_of_hardly_any_samples(count: int) -> None:
     """A file with a heading and no rows is read as an empty recording, which has no difference to take."""
     shortest = Recording(T[:count], {name: np.zeros(count) for name in ("p_A", "p_B", "x")}, record().units, RATE)
     assert HealthyLevels().learn(shortest) is None
-
-
-def test_the_estimate_that_scatters_less_between_healthy_days_is_compared() -> None:
-    """Loads wander on the healthy days of one machine; on another one contacts spoil the estimate without them."""
-    rng = np.random.default_rng(5)
-    steady, scattered = 1e5 * np.exp(0.03 * rng.standard_normal(6)), 1e5 * np.exp(0.5 * rng.standard_normal(6))
-
-    def summarise(levels: float, beside_loads: float) -> dict[str, float]:
-        values = zip(FRICTION_KEYS, (levels, beside_loads), strict=True)
-        return {key: number for (name, error), value in values for key, number in ((name, value), (error, 2e3))}
-
-    def chance(judged: dict[str, float], levels: np.ndarray, beside_loads: np.ndarray) -> float:
-        healthy = [summarise(*pair) for pair in zip(levels.tolist(), beside_loads.tolist(), strict=True)]
-        found = _compare_friction(judged, healthy)
-        assert found is not None
-        return found.chance
-
-    assert chance(summarise(1e5, 5e5), steady, scattered) > 0.1
-    assert chance(summarise(5e5, 1e5), scattered, steady) > 0.1
-    assert chance(summarise(5e5, 1e5), steady, scattered) < 1e-3
-    assert chance(summarise(1e5, 5e5), scattered, steady) < 1e-3

@@ -10,8 +10,10 @@ import pytest
 
 from sealscope.diagnosis.inference.balance import flag_lowering
 from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
-from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.equations.signals import LoweringLimits, Signals
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.live.balance import LiveBalance
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -143,3 +145,33 @@ def test_connected_chambers_show_the_zeros_of_their_sensors_and_a_lowered_load_n
     assert abs(zeros[0].value) < 3.0 * zeros[0].deviation < 1e5
     assert zeros[1].value - zeros[0].value == pytest.approx(7e5, rel=0.05)
     assert estimate_connected_difference(lowered, lowered["omega"][1:] / RATE) is None
+
+
+def test_a_stream_leaves_a_damped_phase_out_in_whatever_pieces_it_comes() -> None:
+    rig, leak, recording = RIG.with_overrides({"cylinder.A_B": AREA_A}), 2e-13, flight(2, 2e-13)
+    streams = []
+    for size in (len(recording), 777):
+        live = LiveBalance(rig, tuple(recording.channels))
+        pieces = [recording.samples(slice(first, first + size)) for first in range(0, len(recording), size)]
+        runs = [SampleRun(piece.t, piece.channels, RATE, follows=piece is not pieces[0]) for piece in pieces]
+        results = [result for run in runs for result in live.take(run)]
+        streams.append([block for result in results if isinstance(result, list) for block in result])
+    blocks = streams[0]
+    assert streams[1] == blocks
+    assert not [block for block in blocks if block.begin > 43.0 and block.end < 69.0]  # damped
+    before, after = (
+        np.array([block.total for block in blocks if first < block.end < end]) for first, end in ((0, 40), (73, 120))
+    )
+    assert np.concatenate([before - before.mean(), after - after.mean()]).std() < 0.05 * leak
+    assert after.mean() - before.mean() == pytest.approx(leak, rel=0.05)
+
+
+def test_a_first_minute_without_load_sets_no_limits_of_a_stream_for_good() -> None:
+    rests, strokes, flights = (
+        LoweringLimits(pump=1e-7, creep=creep, load=load, noise=1e-4, time=time)
+        for creep, load, time in ((1e-3, 0.0, 0.0), (2e-2, 3e5, 20.0), (5e-3, 3e6, 180.0))
+    )
+    assert rests.average_with(strokes) == strokes
+    limits = strokes.average_with(flights)
+    assert limits.load == pytest.approx(0.1 * strokes.load + 0.9 * flights.load)
+    assert (limits.time, limits.pump) == (200.0, pytest.approx(1e-7))

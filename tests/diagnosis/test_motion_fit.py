@@ -108,16 +108,3 @@ def test_strokes_that_pass_the_same_places_tell_a_drift() -> None:
     assert learnt is not None
     assert learnt["drift_A"] == pytest.approx(4e5, abs=3.0 * learnt["drift_A_error"])
     assert learnt["drift_A_error"] < 2e4
-
-
-def test_friction_shows_beside_a_load_that_wanders() -> None:
-    position = strokes(*[0.3, 0.1, 0.4, 0.0, 0.35, 0.05] * 3, hold=1.0, stroke=2.0)
-    steps = np.random.default_rng(3).standard_normal(len(position))
-    load = 4e4 * np.cumsum(steps)  # 3 bar in a second, 10 bar in ten
-    recording = record(position)
-    channels = {**recording.channels, "p_A": recording["p_A"] + load}
-    recording = Recording(recording.t, channels, recording.units, RATE)
-    level, change = fit_difference(recording), fit_difference(recording, without_slow_changes=True)
-    assert level is not None and change is not None
-    assert change.friction == pytest.approx(2e5, abs=3.0 * change.friction_error)
-    assert change.friction_error < 0.5 * level.friction_error

@@ -145,7 +145,7 @@ def test_8_a_leak_from_the_start_was_kept_as_the_baseline() -> None:
     assert "keep this recording as a baseline" not in text.lower()
     stated = diagnose(machine(1, G=1.0e-12).only(CHANNELS), rig="thesis")
     assert (stated.verdict, stated.onset_s) == ("leak", None)
-    assert says(stated.reason, "leak.level_flow")
+    assert says(stated.reason, "alarm.level_flow")
 
 
 @pytest.mark.slow

@@ -44,7 +44,7 @@ def test_smallest_leak_with_throttles_half_closed(count: int, records) -> None: 
         assert one.onset_interval_s[0] <= one.onset_s <= one.onset_interval_s[1]
         assert one.onset_interval_s[0] <= 90.0 <= one.onset_interval_s[1]
         assert one.leak_lpm is None
-    assert all(says(one.reason, "leak.details") for one in result)  # leakage damps the ringing
+    assert all(says(one.reason, "alarm.details") for one in result)  # leakage damps the ringing
 
 
 @pytest.mark.slow

@@ -258,4 +258,4 @@ def test_a_scale_of_the_position_shows_behind_a_servo_valve() -> None:
     balance = VolumeBalance(load_rig("servo-valve")).balance(wrong)
     assert balance is not None
     scores = {observable.name: observable.score for observable in balance.observables}
-    assert scores["scale"] > scores["leak"] + 10.0
+    assert scores["scale"] > scores["leak through a gap"] + 10.0

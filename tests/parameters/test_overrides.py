@@ -168,6 +168,7 @@ ACROSS = (
     "must be in a line",
     "must belong to a filter",
     "must be within the spool's stroke",
+    "must be < nu_40",
 )
 
 

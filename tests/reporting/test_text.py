@@ -60,8 +60,8 @@ def test_no_leak_claims_no_onset_and_no_flow(make_diagnosis):
 
 
 def test_no_leak_says_how_large_one_could_be(make_diagnosis):
-    bound = {"verdict": "no leak", "score": 1.5, "onset_s": None, "leak_lpm": 1e-5, "leak_interval_lpm": (-8e-5, 1e-4)}
-    assert messages.how_much(make_diagnosis(**bound)) == "none found; at most 0.0001 L/min (95 % interval)"
+    bound = {"verdict": "no leak", "score": 1.5, "onset_s": None, "leak_lpm": None, "bound_lpm": 1e-4}
+    assert messages.how_much(make_diagnosis(**bound)) == "none above 0.0001 L/min (95 % bound)"
 
 
 def test_a_different_cause_is_stated_with_what_to_check(make_diagnosis):

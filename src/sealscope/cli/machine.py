@@ -30,7 +30,7 @@ def commission(
 
     `diagnose`, `trend`, `report` and `monitor` use the file with --machine.
     """
-    from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, checksum_of, recordings_in
+    from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, recordings_in
     from sealscope.diagnosis.commissioned.machine import commission as learn_machine
     from sealscope.diagnosis.commissioned.machine_file import update_machine, write_machine
 
@@ -56,7 +56,7 @@ def commission(
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:
-                machine = machine.with_healthy(machine.read(path), file=path.name, checksum=checksum_of(path))
+                machine = machine.with_healthy(machine.read(path), file=path.name)
             undated = [recording.file for recording in machine.healthy if recording.start_s is None]
             if repair_s is not None and (lost := [path.name for path in paths if path.name in undated]):
                 raise InputError(f"a recording added with --since must have a date, got none of {lost[0]}")

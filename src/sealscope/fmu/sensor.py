@@ -85,10 +85,10 @@ COLUMNS = (
     *(f"motion {way}, {side} carries" for way in ("out", "in") for side in "AB"),
     *(name for s in "AB" for name in (f"compliance {s}", f"compliance {s} over the stroke", f"free air {s}",
                                       f"dissolving air {s}")),
-    "lag", "bias", "leak", "response",
+    "lag", "bias", "leak through a gap", "response",
 )  # fmt: skip
 _N_COLUMNS, _MOTION, _COMPLIANCE = len(COLUMNS), 0, (COLUMNS.index("compliance A"), COLUMNS.index("compliance B"))
-_LAG, _BIAS, _LEAK, _RESPONSE = (COLUMNS.index(name) for name in ("lag", "bias", "leak", "response"))
+_LAG, _BIAS, _LEAK, _RESPONSE = (COLUMNS.index(name) for name in ("lag", "bias", "leak through a gap", "response"))
 _ALL_COLUMNS = tuple(range(_N_COLUMNS))
 #: Columns of `history`, the results of the last blocks: conductance G estimated with the present coefficients [m^3/(s
 #: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, and the mean

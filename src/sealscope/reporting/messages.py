@@ -96,10 +96,8 @@ def since(diagnosis: Diagnosis) -> str | None:
     """Format the onset of the leak with its interval, or the reason why there is none; None for other verdicts."""
     if diagnosis.verdict != "leak":
         return None
-    if diagnosis.onset_s is None:
+    if diagnosis.onset_s is None or diagnosis.onset_interval_s is None:
         return say("since.unsettled" if diagnosis.rises_within else "since.whole")
-    if diagnosis.onset_interval_s is None:
-        return clock(diagnosis.onset_s)
     low, high = map(clock, diagnosis.onset_interval_s)
     return say("since.interval", onset=clock(diagnosis.onset_s), low=low, high=high)
 
@@ -109,20 +107,14 @@ def how_much(diagnosis: Diagnosis) -> str | None:
 
     For verdicts other than "leak", the text is the upper bound of a leak, or None if it is not known.
     """
-    interval, leak = diagnosis.leak_interval_lpm, diagnosis.leak_lpm
     if diagnosis.verdict != "leak":
-        if diagnosis.bound_lpm is not None:
-            return say("how_much.bound", bound=number(diagnosis.bound_lpm, 2))
-        if diagnosis.verdict == "no leak" and leak is not None and interval is not None and interval[1] > 0:
-            return say("how_much.at_most", high=number(interval[1], 2))
-        return None
-    if leak is None:
+        bound = diagnosis.bound_lpm
+        return None if bound is None else say("how_much.bound", bound=number(bound, 2))
+    if diagnosis.leak_lpm is None or diagnosis.leak_interval_lpm is None:
         fraction = _pump_fraction(diagnosis)
         return _why_no_flow(diagnosis) if fraction is None else f"{fraction}; {_why_no_flow(diagnosis)}"
-    if interval is None:
-        return f"{number(leak)} L/min"
-    low, high = map(number, interval)
-    return say("how_much.interval", leak=number(leak), low=low, high=high)
+    low, high = map(number, diagnosis.leak_interval_lpm)
+    return say("how_much.interval", leak=number(diagnosis.leak_lpm), low=low, high=high)
 
 
 def _pump_fraction(diagnosis: Diagnosis) -> str | None:
@@ -418,10 +410,10 @@ def _format_lines(diagnosis: Diagnosis, rows: list[tuple[str, str | None]]) -> s
 
 def format_leak_flow(diagnosis: Diagnosis) -> str:
     """Format the leak flow [L/min] with its interval, or its bound for verdicts other than "leak", for a table."""
-    if diagnosis.verdict == "leak" and diagnosis.leak_lpm is not None:
-        low, high = diagnosis.leak_interval_lpm or (diagnosis.leak_lpm, diagnosis.leak_lpm)
+    if diagnosis.leak_lpm is not None and diagnosis.leak_interval_lpm is not None:
+        low, high = diagnosis.leak_interval_lpm
         return f"{number(diagnosis.leak_lpm, 2)} L/min ({number(low, 2)} to {number(high, 2)})"
-    if diagnosis.verdict != "leak" and diagnosis.bound_lpm is not None:
+    if diagnosis.bound_lpm is not None:
         return f"none above {number(diagnosis.bound_lpm, 2)} L/min"
     return "L/min not stated"
 

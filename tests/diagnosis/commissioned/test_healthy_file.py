@@ -119,7 +119,7 @@ def test_a_text_names_no_summaries_elsewhere(pair, tmp_path, name):
     other.mkdir()
     hostile = other / "hostile.toml"
     hostile.write_text(text.read_text().replace('summaries = "actuator7.healthy"', f'summaries = "{name}"'))
-    assert refused(hostile).startswith("hostile.healthy must be in the folder")
+    assert "machine.summaries" in refused(hostile)
 
 
 @pytest.mark.slow

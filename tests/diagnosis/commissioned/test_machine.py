@@ -67,7 +67,7 @@ def test_a_summary_names_what_the_recordings_lack(channels, needed):
     """Not the speed, where it is recorded."""
     units = {name: CHANNEL_UNITS[name] for name in channels}
     recordings = [SummarisedRecording(f"{k}.csv", str(k), units, 50.0, 60.0, None, {}) for k in range(6)]
-    assert needed in " ".join(MachineSummary({}, {}, None).text(recordings, None).split())
+    assert needed in " ".join(MachineSummary({}, None).text(recordings, None).split())
 
 
 def test_a_summary_states_a_problem_of_many_recordings_once():
@@ -100,9 +100,6 @@ def test_the_predicted_smallest_leak_is_what_is_found(machine):
 
 def test_what_is_learnt_is_the_machine(machine):
     summary = machine.summary
-    leak = next(term for name, term in summary.terms.items() if name.startswith("motion"))
-    assert leak.unit == "m^2"
-    assert leak.value == pytest.approx(633e-6, rel=0.02)
     assert summary.noise["p_A"] == pytest.approx(1.25 * 6894.76, rel=0.2)
     assert summary.problems == []
     assert str(machine).count("\n") < 15

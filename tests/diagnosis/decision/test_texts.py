@@ -40,7 +40,7 @@ def test_every_text_is_asked_for() -> None:
             node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)
         }
     unused = {f"{table}.{key}" for table, keys in TEXTS.items() for key in keys if key not in constants}
-    made = {f"leak.conductance_{key}" for key in ("within", "against")}
+    made = {f"alarm.conductance_{key}" for key in ("within", "against")}
     assert unused - made == set()
 
 

@@ -199,14 +199,14 @@ _BALANCE = table_type(
 _RMS = table_type(
     "allow",
     chambers=list_type(str),
-    recorded=(list_type(str), None),
+    recorded=list_type(str),
     rate=_Positive,
     start_s=(_Time, None),
     levels=_Array,
     duty=_Array,
 )
 #: Numbers in the summary of friction and drifts, and their standard errors.
-_SIGNAL_NUMBERS = (*FRICTION_KEYS[0], *FRICTION_KEYS[1], *DRIFT_KEYS, *ZERO_KEYS)
+_SIGNAL_NUMBERS = (*FRICTION_KEYS, *DRIFT_KEYS, *ZERO_KEYS)
 #: Types of the summaries of Sealscope's own methods; those of others are plain tables.
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
@@ -233,7 +233,6 @@ _SUMMARIES = {
     ),
 }
 _ABOUT = {
-    "sha256": str,
     "pressure_bar": _Number,
     "oil_degC": _Number,
     "noise": uniform_table_type(_Magnitude),

@@ -158,14 +158,13 @@ class CommissionedMachine:
             file=None if isinstance(recording, Recording) else recording,
         )
 
-    def with_healthy(self, recording: Recording, *, file: str = "recording", checksum: str = "") -> CommissionedMachine:
+    def with_healthy(self, recording: Recording, *, file: str = "recording") -> CommissionedMachine:
         """Return the machine with one more healthy recording.
 
-        `file` is the name of the recording and `checksum` the SHA-256 of its file. Raises InputError if the recording
-        is judged leaking, overlaps in time with a confirmed leak, has the samples of a known one, cannot be trusted, or
-        if no detector can use it.
+        `file` is the name of the recording. Raises InputError if the recording is judged leaking, overlaps in time with
+        a confirmed leak, has the samples of a known one, cannot be trusted, or if no detector can use it.
         """
-        extended = self._with_recording(recording, file, checksum)
+        extended = self._with_recording(recording, file)
         if self.healthy:
             diagnosis = self.diagnose(recording)
             if diagnosis.verdict == LEAK:
@@ -175,14 +174,14 @@ class CommissionedMachine:
             raise InputError(f"a healthy recording must be from a time without a leak, got {leak} ({file})")
         return extended
 
-    def _with_recording(self, recording: Recording, file: str, checksum: str) -> CommissionedMachine:
+    def _with_recording(self, recording: Recording, file: str) -> CommissionedMachine:
         """Return the machine with one more healthy recording, which is not tested for leaks (`with_healthy`).
 
         Raises InputError if the recording has the samples of a known one, cannot be trusted, or if no detector can use
         it.
         """
         rig, _ = assumed_rig(self.rig, recording)
-        summarised = summarise_healthy(recording, rig, file, checksum)
+        summarised = summarise_healthy(recording, rig, file)
         if known := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
             raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
         # sorted by date; recordings of unknown date come first
@@ -279,12 +278,12 @@ def _is_own_output(file: Path) -> bool:
         return False  # the error is reported when the recording is read
 
 
-def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str = "") -> SummarisedRecording:
+def summarise_healthy(recording: Recording, rig: Rig, file: str) -> SummarisedRecording:
     """Compute the summaries of a healthy recording by all detectors that can use the recording.
 
-    `rig` states the sizes that the detectors assume, `file` is the name of the recording and `checksum` the SHA-256 of
-    its file. A detector that fails is left out, and its error is logged. Raises InputError if the recording cannot be
-    trusted, or if no detector can use it.
+    `rig` states the sizes that the detectors assume, and `file` is the name of the recording. A detector that fails is
+    left out, and its error is logged. Raises InputError if the recording cannot be trusted, or if no detector can use
+    it.
     """
     from sealscope.diagnosis.commissioned.healthy_file import check_summary
     from sealscope.diagnosis.commissioned.summary import describe_recording
@@ -318,7 +317,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str, checksum: str =
             seconds=recording.duration,
             start_s=start_seconds(recording, file),
             summaries=summaries,
-            about={"sha256": checksum, **describe_recording(recording, inspection)},
+            about=describe_recording(recording, inspection),
             statistics=dict(healthy_surprisals(part, rig)),
         )
 
@@ -392,7 +391,7 @@ def commission(
     for label, path in path_of.items():
         try:
             recording = recording_of.get(label) or machine.read(path)
-            machine = machine._with_recording(recording, label, checksum_of(path))
+            machine = machine._with_recording(recording, label)
         except SealscopeError as error:
             problems.append(str(error))
     if not machine.healthy:
@@ -440,11 +439,3 @@ def _distinct_names(paths: Sequence[Path]) -> list[str]:
         return list(counts)
     folder = os.path.commonpath([path.absolute().parent for path in paths])
     return [path.name if counts[path.name] == 1 else path.absolute().relative_to(folder).as_posix() for path in paths]
-
-
-def checksum_of(path: str | os.PathLike[str]) -> str:
-    """Return the SHA-256 of a file in hexadecimal digits."""
-    from hashlib import file_digest
-
-    with Path(path).open("rb") as file:
-        return file_digest(file, "sha256").hexdigest()

@@ -16,8 +16,7 @@ from __future__ import annotations
 
 import json
 import os
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -77,8 +76,6 @@ def parse_moment(text: Any) -> float:
     return seconds
 
 
-#: Name of a file of summaries in the same folder.
-_FILE_NAME = re.compile(r"[^/\\\0:]{1,200}\.healthy")
 _Moment = Annotated[float, BeforeValidator(parse_moment)]
 
 
@@ -102,6 +99,8 @@ _FILE = table_type(
     machine=table_type(
         format=Annotated[int, AfterValidator(_check_format)],
         name=str,
+        # a file in the same folder
+        summaries=(Annotated[str, Field(pattern=r"^[^/\\\x00:]{1,200}\.healthy$")], None),
         rate=(float, None),
         limit=(str, None),
         left_out=(list_type(str), None),
@@ -202,19 +201,24 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     below `_SPARE`. Raises InputError if the TOML file could not be read back, or if it would undo a change by another
     process.
     """
-    data = (_HEAD + "\n".join(_format_table(_build_tree(machine, target))) + "\n").encode()
-    new_tree = parse_toml(data, "a machine's file", str(target))  # the tables as they will be read back
+    new_lines = [format_summary(recording) for recording in machine.healthy]
+    tree = _build_tree(machine, target, new_lines)
+    data = (_HEAD + "\n".join(_format_table(tree)) + "\n").encode()
+    new_tree = parse_toml(data, "a machine's file", str(target))  # as it will be read back
     _convert_tree(new_tree, str(target))  # raises InputError
     if change := _find_change(machine.origin, target, new_tree):
         raise InputError(f"a machine's file must not have changed, got {change}: load it again ({target})")
     backup = target.with_suffix(".toml.bak")
     present_lines, named_checksums = dict[str, Line](), list[str]()
     for path in (target, backup):
-        tree = _read_if_readable(path)
+        try:
+            tree = _read_checked(path)
+        except InputError:  # names no summaries that could be read
+            tree = {"machine": {}, "healthy": []}
         present_lines |= {line.checksum: line for line in read_lines(_summaries_path(path, tree))}
-        named_checksums += _named_summaries(tree)
+        named_checksums += [row["summary"] for row in tree["healthy"]]
     lines = {checksum: present_lines[checksum] for checksum in named_checksums if checksum in present_lines}
-    lines |= {line.checksum: line for line in map(format_summary, machine.healthy)}
+    lines |= {line.checksum: line for line in new_lines}
     size = sum(len(line.data) for line in lines.values())
     for checksum, line in present_lines.items():  # renamed or copied TOML files may name other summaries
         if checksum not in lines:
@@ -280,36 +284,21 @@ def _read_checked(path: Path) -> dict[str, Any]:
     return tree
 
 
-def _read_if_readable(path: Path) -> dict[str, Any]:
-    """Read the tables of a machine's file without checking them; an empty mapping if it cannot be read."""
-    try:
-        return read_toml(path, "a machine's file", str(path))
-    except InputError:
-        return {}
-
-
-def _named_summaries(tree: Mapping[str, Any]) -> list[str]:
-    """List the checksums of summaries in the tables `tree` of a machine's file; what is not valid is skipped."""
-    rows = tree.get("healthy")
-    checksums = [row.get("summary") for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
-    return [checksum for checksum in checksums if isinstance(checksum, str)]
-
-
 def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
     """Return the path of the file of summaries that belongs to a machine's file at `path`, with the tables `tree`.
 
     It has the same name with the suffix `.healthy`. If it does not exist, `summaries` of `[machine]` may name it.
     """
-    machine_table, same_name = tree.get("machine"), path.with_suffix(SUFFIX)
-    name = machine_table.get("summaries") if isinstance(machine_table, dict) else None
-    if not same_name.exists() and isinstance(name, str) and _FILE_NAME.fullmatch(name):
-        named = path.with_name(name)
-        return named if named.exists() else same_name
-    return same_name
+    same_name = path.with_suffix(SUFFIX)
+    named = path.with_name(tree["machine"].get("summaries", same_name.name))
+    return named if named.exists() and not same_name.exists() else same_name
 
 
-def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
-    """Build the nested tables of a machine's file at `path`; values that are None are not written (`_format_table`)."""
+def _build_tree(machine: CommissionedMachine, path: Path, summaries: Sequence[Line]) -> dict[str, Any]:
+    """Build the nested tables of a machine's file at `path`, with the `summaries` of its healthy recordings.
+
+    Values that are None are not written (`_format_table`).
+    """
     from importlib.metadata import version
 
     machine_table = {
@@ -330,9 +319,9 @@ def _build_tree(machine: CommissionedMachine, path: Path) -> dict[str, Any]:
         tree |= machine.rig.as_dict()
     summary = machine.summary
     smallest = {} if summary.smallest is None else {"smallest_leak": summary.smallest._asdict()}
-    terms = {name: term._asdict() for name, term in summary.terms.items()}
-    tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest, "terms": terms}
-    tree["healthy"] = [{"file": entry.file, "summary": format_summary(entry).checksum} for entry in machine.healthy]
+    tree["learnt"] = {"problems": summary.problems, "noise": summary.noise, **smallest}
+    entries = zip(machine.healthy, summaries, strict=True)
+    tree["healthy"] = [{"file": entry.file, "summary": line.checksum} for entry, line in entries]
     tree["alarms"] = [
         {
             "alarm": alarm.alarm,

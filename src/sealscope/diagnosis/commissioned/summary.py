@@ -1,4 +1,4 @@
-"""Summarise a machine from its healthy recordings: volume balance, sensors, smallest detectable leak, and problems."""
+"""Summarise a machine from its healthy recordings: noise of its sensors, smallest detectable leak, and problems."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
-from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
@@ -36,18 +35,6 @@ _PRIORS = COMMISSIONED.smallest
 _NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
 
-class TermEstimate(NamedTuple):
-    """Estimated coefficient of one term of the volume balance, such as leakage or compressed oil, in `unit`.
-
-    `deviation` is its standard error, and `scatter` the standard deviation over recordings, None for a single one.
-    """
-
-    value: float
-    deviation: float
-    scatter: float | None
-    unit: str
-
-
 class SmallestLeak(NamedTuple):
     """The smallest leak that the next recording shows with a stated probability (`power` of `priors.toml`)."""
 
@@ -65,7 +52,6 @@ class SmallestLeak(NamedTuple):
 class MachineSummary:
     """Figures of a machine, estimated from its healthy recordings."""
 
-    terms: Mapping[str, TermEstimate]  # coefficients of the volume balance by the name of the term
     noise: Mapping[str, float]  # standard deviation of the noise of each channel, in the channel's unit
     smallest: SmallestLeak | None  # smallest detectable leak, None if no volume balance can state one
     problems: list[str] = field(default_factory=list)  # problems of the recordings, one line each
@@ -214,8 +200,8 @@ def summarise_machine(
 ) -> MachineSummary:
     """Estimate the figures of a machine from the summaries of its `healthy` recordings.
 
-    The volume balance and the smallest detectable leak are those of the recordings whose balance has the same terms as
-    the first one; others are listed as problems, and so is each text in `left_out`.
+    The smallest detectable leak is that of the recordings whose volume balance has the same terms as the first one;
+    others are listed as problems, and so is each text in `left_out`.
     """
     problems = [*left_out, *_collect_problems(healthy)]
     noises = defaultdict[str, list[float]](list)
@@ -233,39 +219,9 @@ def summarise_machine(
             problems.append(f"{recording.file} has other channels than {with_balance[0].file}")
     rig = rig or unstated_rig()
     channels = frozenset(with_balance[0].units if with_balance else ())
-    if not (summaries and equations(rig, channels)):
-        return MachineSummary(terms={}, noise=noise, smallest=None, problems=problems)
-    # [0]: Gram matrix of the first balance, as a rig with a servo valve has several
-    terms = _estimate_terms([np.asarray(summary["sums"], dtype=float)[0] for summary in summaries], rig, channels)
-    smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if len(summaries) > 1 else None
-    return MachineSummary(terms, noise, smallest, problems)
-
-
-def _estimate_terms(sums: Sequence[Array], rig: Rig, channels: frozenset[str]) -> dict[str, TermEstimate]:
-    """Estimate the unknown coefficients of a volume balance from all recordings together, by the name of the term.
-
-    `sums` holds for each recording the Gram matrix (m, m) of the balance's columns, with rows of unit noise. `rig` and
-    the recorded `channels` determine the terms. The `scatter` of a result is the standard deviation between estimates
-    from single recordings.
-    """
-    equation = equations(rig, channels)[0]  # a rig with a servo valve has several; the first one is used
-    roles = ColumnRoles(equation)
-    units = {term.name: term.unit for term in equation.terms}
-    nuisance = list(roles.nuisance)  # columns of the terms with unknown coefficients
-    by_recording = np.array([fit_columns(gram, roles, nuisance) for gram in sums])
-    total = np.sum(sums, axis=0)
-    values = fit_columns(total, roles, nuisance)
-    variance = np.diag(solve(total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))))  # for unit noise
-    scatter = by_recording.std(axis=0, ddof=1).tolist() if len(sums) > 1 else [None] * len(nuisance)
-    return {
-        name: TermEstimate(float(values[i]), float(np.sqrt(max(variance[i], 0.0))), scatter[i], units[name])
-        for i, name in enumerate(roles.names[k] for k in nuisance)
-    }
-
-
-def fit_columns(gram: Array, roles: ColumnRoles, columns: Sequence[int]) -> Array:
-    """Fit the coefficients (c,) of c `columns` of a volume balance by least squares, from its Gram matrix (m, m)."""
-    return solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])
+    has_scatter = len(summaries) > 1 and bool(equations(rig, channels))
+    smallest = _smallest_leak(VolumeBalance(rig), summaries, channels) if has_scatter else None
+    return MachineSummary(noise, smallest, problems)
 
 
 def _smallest_leak(balance: VolumeBalance, summaries: Sequence[Summary], channels: frozenset[str]) -> SmallestLeak:

@@ -9,9 +9,8 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.machine_file import read_machine
-from sealscope.diagnosis.commissioned.summary import fit_columns
 from sealscope.diagnosis.healthy import SummarisedRecording
-from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
@@ -118,11 +117,12 @@ def _healthy_level(healthy: tuple[SummarisedRecording, ...], rig: Rig) -> Health
 def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
-    The result is None without a summary by the balance, for a rig with no or several balances (servo valve), if the
-    summary has other terms than the rig's balance, or if the fit fails.
+    The result is None without a summary by the balance, for a rig with no or several balances (servo valve), for one
+    whose stream leaves the pump's leakage out (open circuit), if the summary has other terms than the rig's balance, or
+    if the fit fails.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
-    if summary is None or len(balances) != 1:
+    if summary is None or len(balances) != 1 or rig.circuit.feeds_one_chamber:
         return None
     roles = ColumnRoles(balances[0])
     gram = np.asarray(summary["sums"], dtype=float)[0]  # Gram matrix of the only balance
@@ -131,7 +131,8 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
         return None
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
-    *_, leak_coefficient = fit_columns(gram, roles, [*nuisance, roles.leak])
+    columns = [*nuisance, roles.leak]
+    *_, leak_coefficient = solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])  # least squares
     # true over computed flow; 0 if it is unknown: the stream computes its flows with the same assumed sizes
     scale = float(summary["scale"]) or 1.0
     conductance = float(leak_coefficient * scale)

@@ -14,7 +14,6 @@ from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import (
     CANNOT_TELL,
-    LEAK,
     NO_LEAK,
     PRESSURE_RESPONSE,
     RMS_CHANGE,
@@ -64,9 +63,7 @@ def combine(decisions: Sequence[Evidence], refusal: str | None) -> Evidence:
             doubts.append(text_of("doubt", "rest"))
     verdict = CANNOT_TELL if doubts else judge.verdict
     other_parts = [decision for decision in ranked if decision is not judge]
-    combined = replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
-    # an onset is stated only for a leak
-    return combined if verdict == LEAK else replace(combined, onset_s=None, onset_interval_s=None)
+    return replace(judge, verdict=verdict, reason="".join([*reasons, *doubts]), parts=(judge, *other_parts))
 
 
 def _explain_undecided(ranked: Sequence[Evidence], usable: Sequence[Evidence]) -> Evidence:

@@ -25,6 +25,7 @@ from sealscope.diagnosis.inference.equations.signals import (
     HALF_DIFFERENCE,
     MIN_ABSOLUTE_PRESSURE,
     MIN_REST,
+    LoweringLimits,
     RestLimits,
     Signals,
     extend_flags,
@@ -75,6 +76,9 @@ CLIPPED_DIFFERENCE = "p_A - p_B, clipped"
 NEVER = -1.0
 #: Quantile of the magnitudes of speeds up to which they count in a mean: glitches are rarer than motion.
 SPEED_QUANTILE = 0.999
+#: Time over which samples tell whether an interval belongs to a motion past the resting pump (`flag_lowering`), beyond
+#: that for rests [s]: a window, and twice the time by which flags are extended. A longer pause is cut at its ends.
+LOWERING_MARGIN = MIN_REST + 2.0 * AVERAGING_TIME
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
 
@@ -92,7 +96,7 @@ class BlockStream(SavedAttributes):
       to estimate the factors from the first blocks or, of a stream, from all up to the first that surely move.
     - `on_samples`: called with the start time [s] and the samples of each block.
     - `flow_channel`: channel of the pump's flow if the samples come as recorded: a flow without a sign gets one
-      (`corrections.unsigned`).
+      (`corrections.unsigned`), and is left out while the piston moves past the resting pump (`flag_lowering`).
     - `feeds_one_chamber`: with `flow_channel`, the circuit is open; the only balance is adapted to what the blocks so
       far show of it, and a flow that circulates is left out (`equations.feed`). `n_meanings` counts how often its terms
       or the sign have changed their meaning.
@@ -100,12 +104,13 @@ class BlockStream(SavedAttributes):
 
     SAVED = (
         *("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits"),
-        *("_weighting", "_sign_evidence", "_feed_sums", "_flow_range", "n_meanings"),
+        *("_weighting", "_sign_evidence", "_feed_sums", "_flow_range", "n_meanings", "_lowering_limits"),
     )
     SAVED_TYPES: ClassVar = {
         "_absolute_offsets": dict[str, float],
         "left_signs": tuple[float, ...],
         "_rest_limits": RestLimits,
+        "_lowering_limits": LoweringLimits,
     }
 
     def __init__(
@@ -133,11 +138,14 @@ class BlockStream(SavedAttributes):
         self._drops_rests = is_separate_at_rest(balances[0])
         has_rest_terms = self._drops_rests or any(MOVING_BIAS in columns.names for columns in self.columns)
         self._finds_rests = has_rest_terms or bool(flow_channel)
-        if has_rest_terms or feeds_one_chamber:  # some terms differ at rest
+        if self._finds_rests or feeds_one_chamber:  # some terms differ at rest
             self._margin += round(AVERAGING_TIME * rate) + round(MIN_REST * rate)
+        if flow_channel:
+            self._margin += math.ceil(LOWERING_MARGIN * rate)
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
         self._rest_limits: RestLimits | None = None  # known after the first motion
+        self._lowering_limits: LoweringLimits | None = None  # of all blocks so far
         self._sign_evidence = SignEvidence(balances, self.columns)
         self._feed_sums, self.n_meanings = FeedSums(), 0
         self._flow_range = (0.0, 0.0)  # lowest and highest value of the flow's channel
@@ -230,7 +238,7 @@ class BlockStream(SavedAttributes):
         A flow without a sign counts with one from the first blocks on that show the piston moving both ways.
         """
         (balance,) = self._balances
-        was_unsigned, feed_before = self._is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
+        was_unsigned, feed_before = self.is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
         piece, begin = self._with_margins(samples, first, end)
         signals = self._signals(piece)
         span = slice(first * self._length - begin, end * self._length - begin)
@@ -240,7 +248,7 @@ class BlockStream(SavedAttributes):
             min(self._flow_range[0], float(np.nanmin(recorded, initial=0.0))),
             max(self._flow_range[1], float(np.nanmax(recorded, initial=0.0))),
         )
-        if self._is_unsigned != was_unsigned:
+        if self.is_unsigned != was_unsigned:
             # what earlier blocks told of the sign is of no use
             self._feed_sums = self._feed_sums._replace(work=abs(self._feed_sums.work))
             self._sign_evidence, self.left_signs = SignEvidence(self._balances, self.columns), ()
@@ -248,17 +256,17 @@ class BlockStream(SavedAttributes):
         if self._feeds_one_chamber:
             self._used_balances = (feed_one_chamber(balance, feed),)
         feeds_as_before = not self._feeds_one_chamber or feed == feed_before
-        self.n_meanings += self._is_unsigned != was_unsigned or not feeds_as_before
+        self.n_meanings += self.is_unsigned != was_unsigned or not feeds_as_before
 
     @property
-    def _is_unsigned(self) -> bool:
+    def is_unsigned(self) -> bool:
         """True if the pump's flow stays on one side of zero while the piston moves both ways."""
         has_one_sign = self._flow_channel in UNSIGNED and is_one_sided(*self._flow_range)
         return has_one_sign and is_two_way(*self._feed_sums.ways)
 
     def _restore_sign(self, samples: Mapping[str, Array]) -> dict[str, Array]:
         """Restore the sign of the pump's flow, if it has none; each block by its samples with margins."""
-        if not self._is_unsigned:
+        if not self.is_unsigned:
             return dict(samples)
         # flow [m^3/s] of one unit of the channel
         unit = float(self._balances[0].left(Signals({self._flow_channel: np.ones(2)}, self._rate))[0]) * self._rate
@@ -274,7 +282,7 @@ class BlockStream(SavedAttributes):
         The indices count from the start of the stream. One robust fit to all rows of these blocks determines their
         weights. The first call also determines absolute minus gauge pressures. All calls up to the first that surely
         moves determine the signs of the left sides, and the speeds below which the machine rests; for a whole recording
-        that is its only call. Later blocks keep all of these.
+        that is its only call. Later blocks keep all of these, and learn on what is a motion past the resting pump.
         """
         length = self._length
         group = {
@@ -286,6 +294,10 @@ class BlockStream(SavedAttributes):
         elif not self.left_signs:
             self._learn_limits(group)
         if self._flow_channel:
+            signals = Signals(group, self._rate)
+            limits = find_lowering_limits(self._balances[0].left(signals), signals)
+            if np.isfinite(limits).all():  # not so for impossible readings
+                self._lowering_limits = self._lowering_limits.average_with(limits) if self._lowering_limits else limits
             self._learn_flow(samples, first, end)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
@@ -330,7 +342,10 @@ class BlockStream(SavedAttributes):
         stop = end * self._length + (SPAN - 1) * self._stride + 1
         begin = max(self._first, first * self._length - self._margin)
         selected = slice(begin - self._first, stop + self._margin - self._first)
-        return self._restore_sign({name: values[selected] for name, values in samples.items()}), begin
+        piece = self._restore_sign({name: values[selected] for name, values in samples.items()})
+        if self._flow_channel:
+            piece = _without_lowering(piece, self._rate, self._balances[0], self._lowering_limits)
+        return piece, begin
 
     def _compute_rows(
         self, samples: Mapping[str, Array], first: int, end: int
@@ -558,7 +573,23 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
 
 
-def flag_lowering(pump_volume: Array, signals: Signals) -> NDArray[np.bool_]:
+def find_lowering_limits(pump_volume: Array, signals: Signals) -> LoweringLimits:
+    """Find the limits for `flag_lowering`; the load is the median while the pump turns, 0 if it never does.
+
+    `pump_volume`: as in `flag_lowering`.
+    """
+    x_step, max_flow = signals.step("x"), max_rest_rate(pump_volume, signals.rate)
+    load = np.abs(signals.pressure_difference)[~find_rests(pump_volume, signals.rate, max_flow)]  # while it turns
+    return LoweringLimits(
+        pump=max_flow,
+        creep=max_rest_rate(x_step, signals.rate, INFERENCE.rest.lowers),
+        load=float(np.median(np.nan_to_num(load))) if load.size else 0.0,
+        noise=max_rest_rate(x_step, signals.rate, fraction=0.0),
+        time=len(load) / signals.rate,
+    )
+
+
+def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits | None = None) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n,) in which the piston moves for a time although the pump rests.
 
     A valve then lowers a load past the pump, or connects the chambers of an actuator that is moved from outside. A leak
@@ -566,14 +597,14 @@ def flag_lowering(pump_volume: Array, signals: Signals) -> NDArray[np.bool_]:
     the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, reduced in the ratio of abs(p_A - p_B) to
     its median while the pump turns, on average over `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The
     flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end. `pump_volume` (n,): increments of
-    the pump's volume [m^3], NaN where missing.
+    the pump's volume [m^3], NaN where missing. `limits`: by default those of the same samples.
     """
+    limits = limits or find_lowering_limits(pump_volume, signals)
     rate, x_step, load = signals.rate, signals.step("x"), np.abs(signals.pressure_difference)
-    rests = find_rests(pump_volume, rate, max_rest_rate(pump_volume, rate))
-    usual_load = max(float(np.median(np.nan_to_num(load[~rests]))) if not rests.all() else 0.0, np.finfo(float).tiny)
-    relative_load = np.where(np.isfinite(load), np.minimum(load / usual_load, 1.0), 1.0)
-    max_creep = max_rest_rate(x_step, rate, INFERENCE.rest.lowers) * relative_load
-    limit = np.maximum(max_creep, max_rest_rate(x_step, rate, fraction=0.0))
+    rests = find_rests(pump_volume, rate, limits.pump)
+    usual_load = max(limits.load, np.finfo(float).tiny)
+    relative_load = np.where(np.isfinite(load), np.minimum(load, usual_load) / usual_load, 1.0)
+    limit = np.maximum(limits.creep * relative_load, limits.noise)
     excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
     margin = math.ceil(AVERAGING_TIME * rate)
 
@@ -789,13 +820,16 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
 
 
-def _without_lowering(samples: Mapping[str, Array], rate: float, balance: Equation) -> dict[str, Array]:
+def _without_lowering(
+    samples: Mapping[str, Array], rate: float, balance: Equation, limits: LoweringLimits | None = None
+) -> dict[str, Array]:
     """Set the channel of the pump's flow to NaN while the piston moves past the resting pump (`flag_lowering`).
 
-    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow;
+    `limits`: as in `flag_lowering`.
     """
     signals = Signals(samples, rate)
-    return _without_flow(samples, flag_lowering(balance.left(signals), signals))
+    return _without_flow(samples, flag_lowering(balance.left(signals), signals, limits))
 
 
 def _without_flow(samples: Mapping[str, Array], is_unknown: NDArray[np.bool_]) -> dict[str, Array]:

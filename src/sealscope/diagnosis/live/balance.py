@@ -2,7 +2,8 @@
 
 The blocks are cut as in a recording (`inference.balance.BlockStream`). All coefficients of the balance but the leak's
 are estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which
-lie in parallel; `sequential` tests it for a step.
+lie in parallel; `sequential` tests it for a step. In an open circuit valves cut the pump off at rest (`regimes`): the
+pump's own leakage is free in each block, and the conductance is that of the piston, from rests under load.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ import numpy as np
 
 from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import BlockStream
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
-from sealscope.diagnosis.inference.equations.balances import equations
-from sealscope.diagnosis.inference.equations.terms import PUMP, Equation
+from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
+from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
+from sealscope.diagnosis.inference.regimes import NEGLIGIBLE
 from sealscope.diagnosis.inference.rows.weak_form import stride_samples
 from sealscope.diagnosis.live.coefficients import (
     STANDSTILL,
@@ -145,6 +147,8 @@ class LiveBalance(SavedAttributes):
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self._balances = live_equations(rig, names, with_tested_terms=True)
+        if rig.circuit.feeds_one_chamber:
+            self._balances = [shut_at_rest(balance) for balance in self._balances]
         if not self._balances:
             needed = format_ways(rig.circuit.watched_by)
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
@@ -153,22 +157,25 @@ class LiveBalance(SavedAttributes):
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)
-        self.cause: Cause = "piston or pump leak" if rig.circuit.pump_moves_piston else "piston leak"
+        has_pump = rig.circuit.pump_moves_piston and not rig.circuit.feeds_one_chamber
+        self.cause: Cause = "piston or pump leak" if has_pump else "piston leak"
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column
         self._column_orders, self._models = [], list[Coefficients]()
-        for roles in self._roles:
-            nuisance = [k for k in roles.nuisance if k != roles.leak]
+        # columns of the pump's own leakage: free in each block, or left out if the flow's sign had to be restored
+        self._pump_columns = [[k for k, name in enumerate(roles.names) if name in STATES] for roles in self._roles]
+        for roles, pump_columns in zip(self._roles, self._pump_columns, strict=True):
+            nuisance = [k for k in roles.nuisance if k not in (roles.leak, *pump_columns)]
             self._column_orders.append(np.array([*nuisance, roles.leak, roles.left]))
             self._models.append(Coefficients(*map(np.zeros, coefficient_shapes(len(nuisance)))))
         self._precision = 0.0  # precision of a usual block's conductance; 0 before the coefficients are learned
         self._moving = 0  # number of successive blocks that move far more than the usual ones
         self._stored: Blocks | None = None  # the last blocks, packed
         self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
-        self._circuit, self._n_meanings = rig.circuit, 0
+        self._circuit, self._n_meanings, self._is_unsigned = rig.circuit, 0, False
         self._signals = SignalWindow()
-        # begin, channels, rate and `BlockStream.n_meanings` of each block
-        self._closed_samples: list[tuple[float, Mapping[str, Array], float, int]] = []
+        # begin, channels, rate, `BlockStream.n_meanings` and `is_unsigned` of each block
+        self._closed_samples: list[tuple[float, Mapping[str, Array], float, int, bool]] = []
         self._stream: BlockStream | None = None
         self._rate = 0.0
 
@@ -211,13 +218,13 @@ class LiveBalance(SavedAttributes):
     def _take_samples(self, begin: float, samples: Mapping[str, Array]) -> None:
         """Store the samples of a block that begins at `begin` [s], and the meaning of its terms."""
         assert self._stream is not None
-        self._closed_samples.append((begin, samples, self._rate, self._stream.n_meanings))
+        self._closed_samples.append((begin, samples, self._rate, self._stream.n_meanings, self._stream.is_unsigned))
 
     def _take_blocks(self, blocks: Blocks | None) -> Iterator[BlockResult]:
         """Yield the result of each complete block, if any, and store the features of its samples in `_signals`."""
         closed_samples, self._closed_samples = self._closed_samples, []
         for block, samples in zip([] if blocks is None else _split(blocks), closed_samples, strict=True):
-            begin, channels, rate, n_meanings = samples
+            begin, channels, rate, n_meanings, self._is_unsigned = samples
             self._signals.take(begin, channels, rate)
             is_complete = all(np.isfinite(values).all() for values in channels.values())
             yield self._take_block(block, n_meanings, is_complete)
@@ -261,12 +268,15 @@ class LiveBalance(SavedAttributes):
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
         """Fit the balances to the first blocks together, then estimate the conductance in each that is not at rest."""
-        for index, (model, column_order) in enumerate(zip(self._models, self._column_orders, strict=True)):
-            grams = np.ascontiguousarray(blocks.gram[:, index])  # products of one balance in each block
-            _fit_to_blocks(model, grams, column_order, blocks.rows)
+        grams_of_blocks = [self._fitted_grams(block) for block in _split(blocks)]
+        grams_of_balances = zip(*grams_of_blocks, strict=True)
+        for model, column_order, grams in zip(self._models, self._column_orders, grams_of_balances, strict=True):
+            _fit_to_blocks(model, np.array(grams), column_order, blocks.rows)
         # updates_model=False: the fit already contains these blocks
-        solutions = [self._solve_block(block, updates_model=False) for block in _split(blocks)]
-        self._precision = float(np.median([precision for precision, *_ in solutions]))  # of a usual block
+        precisions = np.array([self._solve_block(block, updates_model=False)[0] for block in _split(blocks)])
+        if self._has_own_leakage:  # only rests under load tell of the leak
+            precisions = precisions[precisions > NEGLIGIBLE * precisions.max(initial=0.0)]
+        self._precision = float(np.median(precisions)) if precisions.size else 0.0  # of a usual block
         estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))
         return [estimate for estimate in estimates if not isinstance(estimate, NotJudged)]
 
@@ -283,12 +293,29 @@ class LiveBalance(SavedAttributes):
         """Compute the mean square of the volume that the machine moves in a block, relative to earlier blocks."""
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
+    @property
+    def _has_own_leakage(self) -> bool:
+        """True if the pump's own leakage is free in each block."""
+        return any(self._pump_columns) and not self._is_unsigned
+
+    def _fitted_grams(self, block: Blocks) -> list[Array]:
+        """Return the products of each balance's columns in a block, after elimination of the pump's own leakage."""
+        if not self._has_own_leakage:
+            return list(block.gram[0])
+        grams = []
+        for gram, columns in zip(block.gram[0], self._pump_columns, strict=True):
+            coefficients = solve(gram[np.ix_(columns, columns)], gram[columns])
+            grams.append(gram - gram[:, columns] @ coefficients)
+        return grams
+
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
         """Sum the results (w, w g, w s, w^2 V) of `coefficients.estimate_leak` over the volume balances for a block."""
         n_equations = float(block.rows[0])
         results = [
             _estimate_leak(model, gram, column_order, n_equations, updates_model)
-            for model, gram, column_order in zip(self._models, block.gram[0], self._column_orders, strict=True)
+            for model, gram, column_order in zip(
+                self._models, self._fitted_grams(block), self._column_orders, strict=True
+            )
         ]
         return tuple(sum(values) for values in zip(*results, strict=True))
 
@@ -301,9 +328,9 @@ class LiveBalance(SavedAttributes):
         begin, end = self._sample_times(block)
         at_standstill = self._relative_motion(block) < STANDSTILL
         precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, updates_model)
-        min_precision = MIN_REST_PRECISION * self._precision if at_standstill else 0.0
+        min_precision = MIN_REST_PRECISION * self._precision if at_standstill or self._has_own_leakage else 0.0
         if not precision > min_precision:
-            return NotJudged.with_count(end, "at standstill")
+            return NotJudged.with_count(end, "at standstill" if at_standstill else "without a rest under load")
         total = weighted_total / precision
         return BlockConductance(
             begin,

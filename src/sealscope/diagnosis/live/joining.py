@@ -92,9 +92,8 @@ class SampleJoiner(SavedAttributes):
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
         """Yield the runs of samples without a gap; count dropped samples, gaps, and changes of rate or channels."""
         names = self._choose_names(samples)
-        if reason := _find_lack(samples, names):
-            # without `names` the channels are the reason, not the rate that `_find_lack` states
-            self.count(reason if names else f"samples without {format_ways(self.ways)}", len(samples))
+        if reason := _find_lack(samples, names) if names else f"samples without {format_ways(self.ways)}":
+            self.count(reason, len(samples))
             return
         if names != self.names:
             # `changed` is not set: for another set of channels the caller begins with a new estimator
@@ -157,17 +156,14 @@ class SampleJoiner(SavedAttributes):
 
 
 def _find_lack(samples: Recording, names: Sequence[str]) -> str:
-    """Describe why samples do not suffice to watch an actuator by the channels `names`; "" if they suffice.
-
-    Without `names` the text is that of a wrong rate; the caller replaces it.
-    """
+    """Describe why samples do not suffice to watch an actuator by the channels `names`; "" if they suffice."""
     for name in names:
         if name not in samples:
             return f"samples without {name}"
         if samples.units[name] != CHANNEL_UNITS[name]:
             return f"samples of {name} not in {CHANNEL_UNITS[name]}"
     # at slower rates a reversal is not resolved, at faster ones a block has too many samples
-    return "" if names and 10.0 <= samples.rate <= 1e5 else "samples at a rate outside 10 to 100000 Hz"
+    return "" if 10.0 <= samples.rate <= 1e5 else "samples at a rate outside 10 to 100000 Hz"
 
 
 def _count_leading(flags: NDArray[np.bool_]) -> int:

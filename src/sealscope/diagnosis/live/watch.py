@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 #: Name of the watch as a detector (`Evidence.detector`).
 WATCH = "watch"
 #: Version of the format of the saved state.
-STATE_VERSION = 19
+STATE_VERSION = 20
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
@@ -146,6 +146,7 @@ class Watch:
         self._learning, self._detector, self._null = BaselineLearning(), StepDetector(), StepNull()
         self._compared = np.empty(0, _BLOCK)  # the last blocks with which the next is compared, at most `RECENT`
         self._grouped = 0  # number of these that await the test of their mean
+        self._unjudged = 0  # number of blocks since the last judged one
         self._is_known = True  # True if the last block's duty (pressure and flow) was in the baseline's range
         self._since = math.nan  # beginning of the first block since the tests restarted [s]
 
@@ -194,15 +195,16 @@ class Watch:
     def evidence(self) -> Evidence:
         """Present verdict, with the detected leak or the 95 % upper bound of an undetected one.
 
-        The verdict is "cannot tell" until enough blocks have arrived.
+        The verdict is "cannot tell" until enough blocks have arrived, and after `GROUP` blocks that cannot be judged.
         """
         leak = self.leak
         probability = self._false_alarm_probability(STEP, self.block_seconds) if leak is None else leak.allowed
-        measure = None if leak is None and not len(self._compared) else self._measure(probability)
+        is_blind = leak is None and (self._unjudged >= GROUP or not len(self._compared))
+        measure = None if is_blind else self._measure(probability)
         report = Observed(WATCH, leak=measure)
         if measure is None or (leak is None and not math.isfinite(measure.bound_flow)):
             reasons = f": {', '.join(self.counters)}" if self.counters else ""
-            report = Observed(WATCH, lack=f"waits for the first blocks{reasons}")
+            report = Observed(WATCH, lack=f"waits for blocks that can be judged{reasons}")
         # other causes were weighed before the alarm (`_explain`)
         return decide(report, (), HealthyNull(), probability, weigh_rivals=False)
 
@@ -321,6 +323,7 @@ class Watch:
         A `result` that is no `NotJudged` has at least one block.
         """
         self.blocks += 1
+        self._unjudged = self._unjudged + 1 if isinstance(result, NotJudged) else 0
         if isinstance(result, NotJudged):
             if result.restarts:
                 self._forget()
@@ -608,7 +611,7 @@ class Watch:
 #: Attributes saved in addition to rig, litres and estimator; below, the types of those that may be None.
 _SAVED = (
     *("false_alarms_per_1000_h", "learn_hours", "blocks", "baseline_version", "_samples", "_detector", "_null"),
-    *("_learning", "baseline", "leak", "healthy", "_compared", "_grouped", "_since", "_is_known"),
+    *("_learning", "baseline", "leak", "healthy", "_compared", "_grouped", "_unjudged", "_since", "_is_known"),
 )
 _SAVED_TYPES = {"baseline": WatchBaseline, "leak": WatchedLeak, "healthy": HealthyLevel}
 

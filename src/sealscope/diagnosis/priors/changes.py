@@ -34,7 +34,6 @@ class HealthyLevelPriors(PriorTable):
     friction_error: float  # standard error of the logarithm of a recording's friction
     friction_scatter: float  # standard deviation of this logarithm between days
     recordings: float  # the prior on the scatter weighs as much as this number of recordings
-    load_seconds: float  # [s] time in which the load of a machine at work changes
     drift: float  # [Pa] drift of a pressure sensor's zero within a recording, a standard deviation between days
     drift_recordings: float  # the prior on this scatter weighs as much as this number of recordings
     drift_inflation: float  # largest factor by which the standard errors of the drifts may be too small

@@ -129,12 +129,11 @@ def observe_against(recording: Recording, baseline: Sequence[Healthy]) -> Observ
     judged pressures (`judged_chambers`) is mostly clipped.
     """
     chambers, recorded = judged_chambers(recording), list(chambers_of(recording))
-    # the duty is computed from all recorded chambers, which must therefore be the same; older summaries lack `recorded`
+    # the duty is computed from all recorded chambers, which must therefore be the same
     comparable = [
         summary
         for summary in healthy_summaries(RmsChange(), baseline)
-        if (summary.get("recorded") or summary["chambers"]) == recorded
-        and has_same_rate(summary["rate"], recording.rate)
+        if summary["recorded"] == recorded and has_same_rate(summary["rate"], recording.rate)
     ]
     summaries = [summary for summary in comparable if set(chambers) <= set(summary["chambers"])]
     if not summaries:

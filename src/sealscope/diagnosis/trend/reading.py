@@ -218,35 +218,26 @@ def build_timeline(
     """
     ordered = _sort_by_time(readings, every)
     notes = _note_problems(ordered)
-    used = [reading.scale for reading, note in zip(ordered, notes, strict=True) if not note]
-    used_groups = iter(_group_scales(used))
+    groups, scales = _group_scales([reading.scale for reading, note in zip(ordered, notes, strict=True) if not note])
+    used_groups = iter(groups)
     points = []
     for reading, note in zip(ordered, notes, strict=True):
         start = reading.start or 0.0  # no start is None after sorting
         fields = vars(reading) | {"start": start, "day": (start - (ordered[0].start or 0.0)) / DAY}
         points.append(TrendPoint(**fields, group=-1 if note else next(used_groups), note=note))
-    scales: list[float | None] = []  # of the first reading of each group
-    for point in points:
-        scale = None if point.scale is None or point.scale <= 0.0 else point.scale
-        if point.group == len(scales):  # a new group, as they are numbered in the order of their first reading
-            scales.append(scale)
-        elif point.group >= 0 and scales[point.group] is None:
-            scales[point.group] = scale  # the first that is known
-    differences = [""] * len(scales)
-    for number, scale in enumerate(scales[1:], 1):
-        # neither is None: readings of unknown ratio are of group 0, and so is the first one of known ratio
-        percent = 0.0 if scale is None or scales[0] is None else 100.0 * (scale / scales[0] - 1.0)
-        cause = "a sensor exchanged, or another machine"
-        differences[number] = f"position or angle is scaled by {percent:+.2g} %: {cause}"
-    return points, tuple(differences)
+    cause = "a sensor exchanged, or another machine"
+    percents = (100.0 * (scale / scales[0] - 1.0) for scale in scales[1:])
+    differences = (f"position or angle is scaled by {percent:+.2g} %: {cause}" for percent in percents)
+    return points, ("", *differences) if groups else ()
 
 
-def _group_scales(scales: Sequence[float | None]) -> list[int]:
-    """Group readings with nearly the same ratio of displacement to area, and return the group number of each reading.
+def _group_scales(scales: Sequence[float | None]) -> tuple[list[int], list[float]]:
+    """Group readings with nearly the same ratio of displacement to area.
 
-    `scales` are the measured ratios. Groups are numbered from 0 in the order of their first reading; a reading whose
-    ratio is unknown or not positive counts to group 0. Sorted by size, neighbouring ratios are of one group unless
-    their logarithms differ by more than a limit.
+    `scales` are the measured ratios. Sorted by size, neighbouring ratios are of one group unless their logarithms
+    differ by more than a limit. Returns the group number of each reading and the first ratio of each group. Groups are
+    numbered from 0 in the order of their first ratio; a reading whose ratio is unknown or not positive counts to group
+    0.
     """
     known = sorted({scale for scale in scales if scale is not None and scale > 0.0})
     gaps = np.diff(np.log(known))
@@ -257,8 +248,12 @@ def _group_scales(scales: Sequence[float | None]) -> list[int]:
         limit += prior.scatter * float(np.median(gaps))
     # by ratio, the number of its cluster, counted from the smallest ratio; not strict, for the case of no known ratio
     clusters: dict[float | None, int] = dict(zip(known, np.cumsum([0, *(gaps > limit)]).tolist(), strict=False))
-    numbers: dict[int, int] = {}  # number of the group of each cluster
-    return [numbers.setdefault(clusters[scale], len(numbers)) if scale in clusters else 0 for scale in scales]
+    first_ratios: dict[int, float] = {}  # of each cluster, in the order of the readings
+    for scale in scales:
+        if scale is not None and scale in clusters:
+            first_ratios.setdefault(clusters[scale], scale)
+    numbers = {cluster: number for number, cluster in enumerate(first_ratios)}
+    return [numbers[clusters[scale]] if scale in clusters else 0 for scale in scales], list(first_ratios.values())
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:

@@ -190,7 +190,7 @@ class Trend:
                 "verdict": self.verdict,
                 "reason": self.reason,
                 "cause": self.decision.cause,
-                "chance": self.decision.stated_chance,
+                "chance": self.decision.chance,
                 **{name: getattr(self.decision, name) for name in ("leak_lpm", "leak_interval_lpm", "bound_lpm")},
                 "total_leakage": total and {"lpm": total.lpm, "interval_lpm": total.interval_lpm},
                 "basis": self.basis,

@@ -254,7 +254,7 @@ class Diagnosis(Evidence):
             total["pressure_Pa"] = total.pop("pressure")
         methods = [
             {"name": method.detector, "score": method.score, "threshold": method.threshold, "verdict": method.verdict}
-            | {"reason": method.reason, "chance": method.stated_chance, "odds": method.odds}
+            | {"reason": method.reason, "chance": method.chance, "odds": method.odds}
             for method in self.methods
         ]
         finding_names = ("code", "channel", "count", "first_t", "severity", "text")
@@ -266,7 +266,7 @@ class Diagnosis(Evidence):
                 "cause": self.cause,
                 "next_check": self.next_check,
                 "total_leakage": total,
-                "chance": self.stated_chance,
+                "chance": self.chance,
                 "odds": self.odds,
                 "summary": self.summary,
                 "start": self.start,

@@ -152,7 +152,8 @@ class Evidence:
     usable : bool
         Whether the recording had the channels and the length that the detector needs.
     chance : float, optional
-        p-value: probability that a leak-free recording scores as high, judged by healthy recordings if there are any.
+        p-value: probability that a leak-free recording scores as high, judged by healthy recordings if there are any,
+        and at least `RAREST`.
     relative : RelativeLeak, optional
         The leak relative to other quantities of the recording; stated even if L/min is refused.
     ratio, ratio_interval : float and pair of floats, optional
@@ -209,22 +210,17 @@ class Evidence:
         return f"{self.cause} ({'none' if self.cause.endswith('leak') else 'no leak'} across the piston)"
 
     @property
-    def stated_chance(self) -> float | None:
-        """The p-value (`chance`) to display, at least `RAREST`, as smaller ones cannot be trusted; None if unknown."""
-        return None if self.chance is None else max(RAREST, self.chance)
-
-    @property
     def odds(self) -> str | None:
         """The p-value (`chance`) in words, such as "1 in 50 healthy recordings looks like this"; None if it is unknown.
 
         For the verdict `no leak` without an alarm, the words are "shows as much change" instead of "looks like this".
         """
-        if self.stated_chance is None:
+        if self.chance is None:
             return None
         is_unchanged = self.verdict == NO_LEAK and not self.alarmed
-        if self.stated_chance >= 0.2:
+        if self.chance >= 0.2:
             return f"more than 1 in 5 healthy recordings {'show as much change' if is_unchanged else 'look like this'}"
-        two_digits = float(f"{1.0 / self.stated_chance:.2g}")
+        two_digits = float(f"{1.0 / self.chance:.2g}")
         count = f"{two_digits:,.0f}".replace(",", " ")
-        limit = "fewer than " if self.stated_chance == RAREST else ""
+        limit = "fewer than " if self.chance == RAREST else ""
         return f"{limit}1 in {count} healthy recordings {'shows as much change' if is_unchanged else 'looks like this'}"

@@ -118,13 +118,10 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
 
 def _leak_level(diagnosis: Diagnosis) -> _Level | None:
     """Return the leak flow of a diagnosis or, for verdicts other than `leak`, its upper bound; None if not known."""
-    leak, bound = diagnosis.leak_lpm, diagnosis.bound_lpm
-    if diagnosis.verdict != "leak":
-        return None if bound is None or not math.isfinite(bound) else (bound, None, bound)
-    if leak is None or not math.isfinite(leak):
-        return None
-    low, high = diagnosis.leak_interval_lpm or (leak, leak)
-    return leak, low if math.isfinite(low) else 0.0, high
+    if diagnosis.leak_lpm is not None and diagnosis.leak_interval_lpm is not None:
+        return diagnosis.leak_lpm, *diagnosis.leak_interval_lpm
+    bound = diagnosis.bound_lpm
+    return None if bound is None else (bound, None, bound)
 
 
 def _format_dates(ordered: Sequence[Judged]) -> list[str]:

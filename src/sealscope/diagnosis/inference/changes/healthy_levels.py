@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates, size_penalty
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -54,11 +54,10 @@ MOTION, LOW = "drift", "low"
 DRIFT_KEYS = tuple(f"{kind}_{side}{suffix}" for kind in (MOTION, LOW) for side in "AB" for suffix in ("", "_error"))
 #: Name of the observable of the zeros of both sensors, and keys of p_A - p_B of connected chambers and of its error.
 ZEROS, ZERO_KEYS = "drift of p_A - p_B", ("connected_difference", "connected_difference_error")
-#: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_log_frictions`).
+#: Quantile, over healthy recordings, of the size of a friction of the wrong sign over its error (`_compare_friction`).
 UPPER_QUARTILE = 0.75
-#: Keys of two estimates of the friction in a recording's summary, each with the key of its standard error. The second
-#: one is made without loads that change slowly.
-FRICTION_KEYS = (("friction_pressure", "friction_error"), ("friction_beside_loads", "friction_beside_loads_error"))
+#: Keys of the friction and of its standard error in a recording's summary.
+FRICTION_KEYS = ("friction_pressure", "friction_error")
 
 
 class HealthyLevels:
@@ -113,29 +112,8 @@ def _read_drifts(summary: Summary, kind: str) -> dict[str, Estimate]:
 def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable | None:
     """Test whether the friction of a recording, as a pressure difference, is higher than in healthy recordings.
 
-    Of up to two estimates of the friction (`FRICTION_KEYS`), the one whose logarithm scatters less between the healthy
-    recordings is compared. Return None if this estimate is not usable in the judged recording, or if neither estimate
-    is usable in `MIN_HEALTHY` healthy recordings.
-    """
-    prior = CHANGES.healthy
-    estimates = [_log_frictions(judged, healthy, *keys) for keys in FRICTION_KEYS]
-    comparable = [(judged_log, logs) for judged_log, logs in estimates if len(logs) >= MIN_HEALTHY]
-    if not comparable:
-        return None
-    judged_log, healthy_logs = min(comparable, key=lambda estimate: np.std([log.value for log in estimate[1]], ddof=1))
-    if judged_log is None:
-        return None
-    scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
-    return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
-
-
-def _log_frictions(
-    judged: Summary, healthy: Sequence[Summary], key: str, error_key: str
-) -> tuple[Estimate | None, list[Estimate]]:
-    """Compute the logarithm of the friction in the judged recording and in the healthy ones, with standard errors.
-
-    `key`, `error_key`: keys of friction and standard error [Pa] in the summaries. If the judged recording or all
-    healthy ones lack these keys, the result is None and an empty list.
+    The logarithms of the friction are compared. Return None if the judged friction is not usable, or fewer than
+    `MIN_HEALTHY` healthy ones.
 
     - The sign that stands for friction against the motion depends on which channel measured the motion. It is the sign
       of the sum of friction / error over the healthy recordings.
@@ -143,12 +121,13 @@ def _log_frictions(
       upper quartile of abs(friction) / error over the healthy recordings, counted as 0 where the sign is right.
     - The standard error of a logarithm is error / friction and `healthy.friction_error` (`priors.toml`), added in
       quadrature.
-    - A friction is usable if it has the right sign and exceeds its error; otherwise the judged one is None, and a
-      healthy one is left out.
+    - A friction is usable if it has the right sign and exceeds its error.
     """
-    known = [summary for summary in healthy if {key, error_key} <= set(summary)]
-    if not known or not {key, error_key} <= set(judged):
-        return None, []
+    key, error_key = FRICTION_KEYS
+    prior = CHANGES.healthy
+    known = [summary for summary in healthy if set(FRICTION_KEYS) <= set(summary)]
+    if not known or not set(FRICTION_KEYS) <= set(judged):
+        return None
     ratios = np.array([float(summary[key]) / max(float(summary[error_key]), TINY) for summary in known])
     sign = float(np.sign(ratios.sum()))
     inflation = max(1.0, float(np.quantile(np.maximum(-sign * ratios, 0.0), UPPER_QUARTILE)))
@@ -158,9 +137,14 @@ def _log_frictions(
         pressure, error = sign * float(summary[key]), inflation * float(summary[error_key])
         if not pressure > error:
             return None
-        return Estimate(float(np.log(pressure)), float(np.hypot(CHANGES.healthy.friction_error, error / pressure)))
+        return Estimate(float(np.log(pressure)), float(np.hypot(prior.friction_error, error / pressure)))
 
-    return log_friction(judged), [friction for summary in known if (friction := log_friction(summary)) is not None]
+    healthy_logs = [friction for summary in known if (friction := log_friction(summary)) is not None]
+    judged_log = log_friction(judged)
+    if judged_log is None:
+        return None
+    scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
+    return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
 
 
 def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float) -> Iterator[Observable]:
@@ -215,10 +199,8 @@ def _compare_zeros(judged: Summary, healthy: Sequence[Summary]) -> Observable | 
 def _estimate_levels(recording: Recording) -> Summary | None:
     """Estimate friction, drifts and spectra of a recording (`HealthyLevels.learn`); None if none can be estimated."""
     levels = dict[str, float]()
-    for keys, without_slow_changes in zip(FRICTION_KEYS, (False, True), strict=True):
-        fit = fit_difference(recording, without_slow_changes=without_slow_changes)
-        if fit is not None:
-            levels |= dict(zip(keys, (fit.friction, fit.friction_error), strict=True))
+    if (fit := fit_difference(recording)) is not None:
+        levels |= dict(zip(FRICTION_KEYS, (fit.friction, fit.friction_error), strict=True))
     if (motion := select_motion(recording)) is not None:
         # residuals may be correlated within a stroke
         drifts = {

@@ -5,8 +5,7 @@ A pressure, or p_A - p_B, is fitted by
     p = level(x) + half sign(v) + b v + c dv/dt [+ drift t/T],
 
 with position x, speed v, and the time t over the recording's duration T. The level is linear in the position between
-`KNOTS` values. The drift is fitted only on request: few strokes do not distinguish it from friction. Loads that change
-slowly, as work does, are removed on request (`remove_slow_changes`), and friction reverses faster. The fit is
+`KNOTS` values. The drift is fitted only on request: few strokes do not distinguish it from friction. The fit is
 iteratively reweighted least squares with redescending weights, so that contact with a workpiece hardly counts. Called
 for friction and drifts (`healthy_levels`) and for the oil's viscosity (`volumes`).
 
@@ -212,36 +211,16 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
     return np.asarray(np.where(is_undetermined, np.inf, errors)[list(columns)])
 
 
-def remove_slow_changes(motion: Motion, design: Array, values: Array, t: Array) -> tuple[Array, Array]:
-    """Remove changes slower than a time tau from the columns of a design matrix and from the values.
-
-    With the times t_k of the samples in `motion`, each column y of `design`, and y = `values`, becomes
-
-        (y_k - r_k y_(k-1)) / sqrt(1 - r_k^2),    r_k = exp(-(t_k - t_(k-1)) / tau),
-
-    as if the residuals were an Ornstein-Uhlenbeck process, whose innovations are independent. `t`: times of all samples
-    of the recording [s]; tau: `healthy.load_seconds` of `priors.toml`. The results have one row less.
-    """
-    correlation = np.exp(-np.diff(t[motion.rows]) / CHANGES.healthy.load_seconds)
-    scale = 1.0 / np.sqrt(1.0 - correlation**2)
-    rows = np.column_stack([design, values])
-    innovations = (rows[1:] - correlation[:, None] * rows[:-1]) * scale[:, None]
-    return innovations[:, :-1], innovations[:, -1]
-
-
-def fit_difference(recording: Recording, *, without_slow_changes: bool = False) -> Resistance | None:
+def fit_difference(recording: Recording) -> Resistance | None:
     """Fit p_A - p_B in motion by friction, which reverses with the motion, and a viscous pressure drop (`Resistance`).
 
-    `without_slow_changes`: first remove loads that change slowly (`remove_slow_changes`), and with them most of the
-    viscous drop of a steady motion. The result is None if too few samples are in motion (`select_motion`), or if a
-    value or its error is not finite.
+    The result is None if too few samples are in motion (`select_motion`), or if a value or its error is not finite.
     """
-    key = ("motion fit of p_A - p_B", without_slow_changes)
-    return compute_once(recording, key, lambda recording: _fit_difference(recording, without_slow_changes))
+    return compute_once(recording, ("motion fit of p_A - p_B",), _fit_difference)
 
 
 @np.errstate(all="ignore")
-def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resistance | None:
+def _fit_difference(recording: Recording) -> Resistance | None:
     """Fit p_A - p_B in motion by friction and a viscous drop (`fit_difference`)."""
     motion = select_motion(recording)
     if motion is None:
@@ -249,8 +228,6 @@ def _fit_difference(recording: Recording, without_slow_changes: bool) -> Resista
     difference = recording["p_A"][motion.rows] - recording["p_B"][motion.rows]
     # columns without the time: sign of the speed (DIRECTION), speed over `top_speed` (SPEED), ...
     design = np.delete(motion.design, TIME, axis=1)
-    if without_slow_changes:
-        design, difference = remove_slow_changes(motion, design, difference, recording.t)
     # residuals may be correlated within a part
     friction, drop = fit_robustly(design, difference, [DIRECTION, SPEED], equal_parts(len(difference)))
     fit = Resistance(*friction, drop.value / motion.top_speed, drop.deviation / motion.top_speed, motion.top_speed)

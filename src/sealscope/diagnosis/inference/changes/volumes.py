@@ -50,7 +50,7 @@ OUTSIDE = "loss to the outside"
 #: Observable of the offset of the flow's sensor.
 FLOW_ZERO = "zero of the flow"
 #: Exponents of the flow of leaks in p_A - p_B, by the name of the observable.
-_LEAK_EXPONENTS = {LEAK: 1.0, ORIFICE: 0.5} | {f"{LEAK} of exponent {e:g}": e for e in EXPONENTS if e < 1.0}
+_LEAK_EXPONENTS = {LEAK: 1.0, ORIFICE: 0.5} | {f"leak of exponent {e:g}": e for e in EXPONENTS if e < 1.0}
 #: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
@@ -183,7 +183,7 @@ def _step_hypotheses(
     leak = information(recorded, columns, first.leak)
     for exponent, shape in apparent_conductances(recorded, columns).items():
         if exponent < 1.0:  # 1 is the laminar leak, tested above
-            yield f"{LEAK} of exponent {exponent:g}", (1.0,), leak, shape
+            yield f"leak of exponent {exponent:g}", (1.0,), leak, shape
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
     motion = information(_insert_fitted_motion(recorded, columns, scale), columns, scale)
     yield SCALE, (1.0, -1.0), motion._replace(level=np.inf), None  # without the prior on the orifice's leak

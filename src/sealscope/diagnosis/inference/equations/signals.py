@@ -32,6 +32,29 @@ class RestLimits(NamedTuple):
     shortest: float = MIN_REST
 
 
+class LoweringLimits(NamedTuple):
+    """Limits of flow, speed and load of a piston that moves past the resting pump (`balance.flag_lowering`).
+
+    - `pump`: flow below which the pump rests [m^3/s];
+    - `creep`: speed of the piston [m/s] up to which it creeps by a leak while it carries `load`, abs(p_A - p_B) [Pa];
+    - `noise`: speed of the piston that its sensor may show at rest [m/s];
+    - `time`: time in which the pump turned [s], by which the limits of several parts of a stream are averaged.
+    """
+
+    pump: float
+    creep: float
+    load: float
+    noise: float
+    time: float
+
+    def average_with(self, other: LoweringLimits) -> LoweringLimits:
+        """Average the limits of two parts of a stream by the times in which the pump turned (equal if never)."""
+        time = self.time + other.time
+        share = other.time / time if time > 0.0 else 0.5
+        means = [(1.0 - share) * mine + share * theirs for mine, theirs in zip(self, other, strict=True)]
+        return LoweringLimits(*means)._replace(time=time)
+
+
 class Signals:
     """Samples (n,) of recorded channels by name, in SI units, and signals derived from them.
 

@@ -109,7 +109,7 @@ class Equation(NamedTuple):
 
 
 #: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
-LEAK, ORIFICE = "laminar leak", "leak through an orifice"
+LEAK, ORIFICE = "leak through a gap", "leak through an orifice"
 #: Free air in both chambers together, instead of one term for each chamber.
 AIR = "free air"
 #: The pump's leakage, driven by the pressures at its ports.
