@@ -149,7 +149,7 @@ def test_a_machine_that_is_known_tells_a_leak_from_its_gain_and_its_oil(lpm: flo
     judged = record(102, **({"leak": f"{lpm} L/min"} if lpm else {}))
     leak = detector.observe(judged, healthy).leak
     true_rise = lpm * LITRE_PER_MINUTE / float(np.mean(np.abs(judged["p_A"] - judged["p_B"])))
-    assert leak.rise.value == pytest.approx(true_rise, rel=0.15, abs=5e-13)
+    assert leak.rise.value == pytest.approx(true_rise, rel=0.1, abs=7e-13)
     assert lpm * LITRE_PER_MINUTE < leak.bound_flow
     flow, half = leak.rise_flow.value, WITHIN_95 * math.hypot(leak.rise_flow.deviation, 0.17 * leak.rise_flow.value)
     assert flow - half <= lpm * LITRE_PER_MINUTE <= flow + half

@@ -12,7 +12,8 @@ Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (i
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -481,14 +482,14 @@ class Follower:
         return segment.block_sums(fit)
 
 
-def fit_jointly(follower: Follower, blocks: Sequence[Recording], noise: float) -> Joint:
+def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterable[Array], noise: float) -> Joint:
     """Fit the parameters in all K consecutive blocks of a recording together.
 
-    `follower`: filter at the first sample; `noise`: variance of the noise [Pa^2]. The model is linearised step by step,
-    first about the parameters with which the filter begins. If that explains the recording no further than to a change
-    within it, the fit from the parameters that the filter tracks through the blocks is tried as well.
+    `follower`: filter at the first sample; `noise`: variance of the noise [Pa^2]. From each of the `starts`, parameters
+    (K, p), the model is linearised step by step, until a fit explains the recording but for its noise. Returns the best
+    fit.
     """
-    states, start = follower.states, np.tile(follower.theta, (len(blocks), 1))
+    states, n_samples = follower.states, sum(len(block) for block in blocks)
     seconds = float(np.mean([block.duration for block in blocks]))
 
     def linearise(theta: Array) -> Joint:
@@ -511,12 +512,16 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], noise: float) -
                 fraction *= _SMALLER_STEP
         return joint
 
-    fits = [converge(linearise(start))]
-    if not is_explained(fits[0].cost(noise), sum(len(block) for block in blocks)):
-        follower.theta, follower.states, follower.last = start[0], states, math.nan
-        tracked = Joint.fit([follower.update(block) for block in blocks], follower.priors, seconds, G)
-        fits.append(converge(tracked))
-    return fits[int(np.argmin(np.nan_to_num([fit.cost(noise) for fit in fits], nan=np.inf)))]
+    best: tuple[float, Joint] | None = None
+    for start in starts:
+        joint = converge(linearise(start))
+        cost = joint.cost(noise)
+        if best is None or not best[0] <= cost:  # also if the earlier cost is not a number
+            best = cost, joint
+        if is_explained(best[0], n_samples):
+            break
+    assert best is not None
+    return best[1]
 
 
 class Fit(NamedTuple):
@@ -535,14 +540,27 @@ def fit_response(
     None to fit it once by the priors of the rig; `is_healthy`: true if the machine is known to be healthy.
     """
 
+    def starts(follower: Follower, blocks: Sequence[Recording]) -> Iterator[Array]:
+        """Yield parameters (K, p) that the fit starts from.
+
+        They are those with which the filter begins, those that it tracks through the blocks, as a leak may begin, and
+        for a known machine those that describe the recording by itself.
+        """
+        begin = copy(follower)
+        yield np.tile(begin.theta, (len(blocks), 1))
+        yield np.array([begin.update(block).theta for block in blocks])
+        by_itself = fit_response(recording, rig) if known is not None else None
+        if by_itself is not None and by_itself.law == follower.machine.law:
+            yield by_itself.joint.fitted
+
     def compute_fit(recording: Recording) -> Fit | None:
-        """Track the parameters through all blocks, then fit these together; None if that fails or explains little."""
+        """Fit all blocks together; None if that fails or explains little."""
         edges = block_edges(recording).tolist()
         with np.errstate(over="ignore", invalid="ignore"):
             try:
                 follower = Follower.fit_start(recording, rig, known, is_healthy=is_healthy)
                 blocks = [recording.samples(slice(first, end)) for first, end in pairwise(edges)]
-                joint = fit_jointly(follower, blocks, noise_variance(recording))
+                joint = fit_jointly(follower, blocks, starts(follower, blocks), noise_variance(recording))
             except np.linalg.LinAlgError:
                 return None
         is_finite = np.all(np.isfinite(joint.mean)) and np.all(np.isfinite(joint.covariance))
