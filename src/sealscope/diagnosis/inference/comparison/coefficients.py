@@ -23,31 +23,20 @@ from sealscope.signals.smoothing import TINY
 
 
 class ComparedColumns(Protocol):
-    """Columns of Gram matrices that are compared between recordings, with their priors, such as `ColumnRoles`."""
+    """Columns of Gram matrices that are compared between recordings, with their priors, such as `ColumnRoles`.
 
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of the coefficients; that of a laminar leak is `terms.LEAK`."""
+    - `names`: names of the coefficients; that of a laminar leak is `terms.LEAK`;
+    - `compared`: columns whose coefficients are fitted; `leak`, `left`: columns of the leak and of the left side;
+    - `healthy_conductance`: standard deviation of a healthy machine's leak [m^3/(s Pa)], infinite if unknown;
+    - `between_deviation`: prior standard deviations of differences between recordings, infinite without a prior.
+    """
 
-    @property
-    def compared(self) -> Sequence[int]:
-        """Columns whose coefficients are fitted."""
-
-    @property
-    def leak(self) -> int:
-        """Column of the leak."""
-
-    @property
-    def left(self) -> int:
-        """Column of the left side."""
-
-    @property
-    def healthy_conductance(self) -> float:
-        """Standard deviation of a healthy machine's leak [m^3/(s Pa)], infinite if unknown."""
-
-    @property
-    def between_deviation(self) -> Array:
-        """Prior standard deviations of differences between recordings, infinite without a prior."""
+    names: tuple[str, ...]
+    compared: tuple[int, ...]
+    leak: int
+    left: int
+    healthy_conductance: float
+    between_deviation: Array
 
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
         """Compute the prior precisions of differences between recordings."""

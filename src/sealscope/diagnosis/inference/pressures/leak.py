@@ -64,11 +64,10 @@ class ResponseColumns:
     `between` (p,): standard deviations of the parameters' differences between recordings of one machine.
     """
 
-    compared, unshared, hold_leak = tuple(range(len(PARAMETERS))), (), None
-    leak, left, healthy_conductance = G, len(PARAMETERS), np.inf
-    names = tuple(LEAK if k == G else name for k, name in enumerate(PARAMETERS))
-
     def __init__(self, between: Array) -> None:
+        self.names = tuple(LEAK if k == G else name for k, name in enumerate(PARAMETERS))
+        self.compared = tuple(range(len(PARAMETERS)))
+        self.leak, self.left, self.healthy_conductance = G, len(PARAMETERS), math.inf
         self.between_deviation = between
 
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
