@@ -40,7 +40,8 @@ class ConductancePriors(PriorTable):
 
     wander: float  # [m^3/(s Pa)] its change in 90 s, a standard deviation
     level: float  # [m^3/(s Pa)] its standard deviation between recordings of one machine
-    orifice: float  # mean flow through an orifice, over that of the laminar leak with the same effect on the pressures
+    # mean flow of a leak by any law, over that of the laminar leak with the same effect: mean, standard deviation
+    law: tuple[float, float]
 
 
 class FrictionLaw(PriorTable):

@@ -26,8 +26,9 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Mean flow of an orifice over that of a laminar leak of the same fitted conductance.
-ORIFICE_RATIO: float = PRESSURE.conductance.orifice
+#: Mean flow of a leak over that of a laminar one of the same fitted conductance: mean, standard deviation and largest.
+_LAW_RATIO, _LAW_DEVIATION = PRESSURE.conductance.law
+MAX_LAW_RATIO = _LAW_RATIO + WITHIN_95 * _LAW_DEVIATION
 
 
 def conductance_scale_error() -> float:
@@ -138,15 +139,12 @@ class ResponseLeak(LeakMeasure):
     def _flow_of(self, conductance: Estimate) -> Estimate:
         """Compute the mean flow [m^3/s] of a leak at the recording's mean abs(p_A - p_B).
 
-        The law of the leak is not known: an orifice of the same fitted conductance has `ORIFICE_RATIO` times the flow
-        of a laminar leak. The result is the mean of the two, which count as the ends of a 95 % interval in its error.
+        The law of the leak is not known (`conductance.law` of `priors.toml`).
         """
         size, deviation = conductance
-        # flow over that of a laminar leak: between 1 and `ORIFICE_RATIO`
-        mean_ratio, half_range = 0.5 * (ORIFICE_RATIO + 1.0), 0.5 * (ORIFICE_RATIO - 1.0)
-        law_deviation = half_range * abs(size) / WITHIN_95
         unit = self.flow_per_conductance
-        return Estimate(mean_ratio * size * unit, float(np.hypot(mean_ratio * deviation, law_deviation)) * unit)
+        error = float(np.hypot(_LAW_RATIO * deviation, _LAW_DEVIATION * size))
+        return Estimate(_LAW_RATIO * size * unit, error * unit)
 
     @property
     def flow_per_conductance(self) -> float:
@@ -178,14 +176,13 @@ class ResponseLeak(LeakMeasure):
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
         With healthy recordings the bound is on the leakage above theirs, otherwise on a leak that begins within the
-        recording. An orifice is assumed, which has the largest flow for a fitted conductance, and the largest usual
-        scale.
+        recording. The law is that with the largest flow for a fitted conductance, and the scale the largest usual one.
         """
         test = self.step if self.rise is None else self.rise
         if test is None:
             return np.inf
         max_scale = 1.0 + WITHIN_95 * conductance_scale_error()
-        return test.bound() * ORIFICE_RATIO * self.flow_per_conductance * max_scale
+        return test.bound() * MAX_LAW_RATIO * self.flow_per_conductance * max_scale
 
     @property
     def step_rise(self) -> LeakRise | None:
@@ -223,14 +220,14 @@ class ResponseLeak(LeakMeasure):
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before `onset_s` [s].
 
-        The flow is midway between those of a laminar leak and of an orifice. Return None without an onset or a step
+        Return None without an onset or a step
         test, or if the rig's file does not state the machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None
         time = self.information.time
         growth = fit_history(self.information, self.step, with_step=True).relative_to(time < onset_s)
-        unit = self.pressure * 0.5 * (1.0 + ORIFICE_RATIO) / LITRE_PER_MINUTE  # [L/min] per conductance
+        unit = self.pressure * _LAW_RATIO / LITRE_PER_MINUTE  # [L/min] per conductance
         value = growth.mean * unit
         half_width = WITHIN_95 * np.sqrt(np.maximum(np.diag(growth.covariance), 0.0)) * unit
         return LeakCourse(time, value, value - half_width, value + half_width)
