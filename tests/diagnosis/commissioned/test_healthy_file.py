@@ -213,6 +213,8 @@ HOSTILE = {
     "summaries/volume balance/flow": (-1.0, "flow"),
     "summaries/volume balance/stroke": (packed([0.2, 0.1]), "stroke must hold the lower and the upper end"),
     "summaries/volume balance/start_s": (1e18, "start_s"),
+    "summaries/pressure response/law": ("coulomb", "law must be stribeck or bristles, got 'coulomb'"),
+    "summaries/pressure response/sums": (packed([1.0]), "sums must be of the shape (1, 16, 16), got (1,)"),
     "summaries/rms change/duty": (packed([1.0, 2.0]), "levels and duty must be of the shapes (10,) and (4,)"),
     "summaries/rms change/duty ": (packed([1.0, 2.0, 3.0, 1e9]), "must be logarithms"),
     "about/noise": ({"p_A": "x"}, "noise: p_A"),

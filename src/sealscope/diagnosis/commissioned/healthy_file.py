@@ -157,6 +157,21 @@ def _check_levels(summary: Any) -> Any:
     return summary
 
 
+def _check_response(summary: Any) -> Any:
+    """Return the `summary` by a pressure response if it is consistent; raise ValueError otherwise.
+
+    `law` is a law of friction; the array `sums` (1, p + 1, p + 1) holds the likelihood of p parameters (`Joint.sums`).
+    """
+    from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS
+
+    if summary.law not in LAWS:
+        raise ValueError(f"law must be {' or '.join(LAWS)}, got {summary.law!r}")
+    size = len(PARAMETERS) + 1
+    if summary.sums.shape != (1, size, size):
+        raise ValueError(f"sums must be of the shape (1, {size}, {size}), got {summary.sums.shape}")
+    return summary
+
+
 def _check_octaves(values: Any) -> Any:
     """Return the spectra of a pair of channels in octaves if they are valid; raise ValueError otherwise.
 
@@ -211,15 +226,18 @@ _SIGNAL_NUMBERS = (*FRICTION_KEYS, *DRIFT_KEYS, *ZERO_KEYS)
 _SUMMARIES = {
     VOLUME_BALANCE: (Annotated[_BALANCE, AfterValidator(_check_sums)], None),
     PRESSURE_RESPONSE: (
-        table_type(
-            "allow",
-            level=_Number,
-            error=(_Magnitude, None),
-            flow=(_Magnitude, None),
-            pressure=(_Magnitude, None),
-            start_s=(_Time, None),
-            oil_degC=(_Number, None),
-        ),
+        Annotated[
+            table_type(
+                "allow",
+                law=str,
+                sums=_Array,
+                flow=_Magnitude,
+                pressure=_Magnitude,
+                start_s=(_Time, None),
+                oil_degC=(_Number, None),
+            ),
+            AfterValidator(_check_response),
+        ],
         None,
     ),
     RMS_CHANGE: (Annotated[_RMS, AfterValidator(_check_levels)], None),

@@ -41,17 +41,15 @@ class PressureResponse:
         return measure_leak(recording, self.rig)
 
     def learn(self, recording: Recording) -> Summary | None:
-        """Summarise a healthy recording by its leakage and conditions; None if the leakage cannot be measured.
+        """Summarise a healthy recording by what it tells of the machine; None if its response cannot be fitted.
 
-        - `level`, `error`: mean conductance past the piston and its standard error [m^3/(s Pa)];
         - `law`: law of friction that describes the recording;
         - the fields of `recording_sums.RecordingSums` that are known.
         """
         leak = measure_leak(recording, self.rig, is_healthy=True)
         if leak is None:
             return None
-        level = {"level": leak.level.value, "error": leak.level.deviation, "law": leak.law}
-        summary = level | leak.conditions._asdict()
+        summary = {"law": leak.law, **leak.conditions._asdict()}
         return {name: value for name, value in summary.items() if value is not None}
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
@@ -74,7 +72,7 @@ class PressureResponse:
 
 
 def _restore(summaries: Iterable[Summary]) -> list[HealthyResponse]:
-    """Return healthy recordings from their summaries; those of old files, which lack the parameters, are left out."""
+    """Return healthy recordings from their summaries."""
     return [
         HealthyResponse(
             summary["law"],
@@ -87,7 +85,6 @@ def _restore(summaries: Iterable[Summary]) -> list[HealthyResponse]:
             ),
         )
         for summary in summaries
-        if "sums" in summary
     ]
 
 

@@ -580,8 +580,8 @@ def measure_leak(
     """Measure the leakage of a recording by the response of its pressures.
 
     `healthy`: healthy recordings of the machine, which tell all of it but the leakage; `is_healthy`: true if this
-    recording is one of these. Return None if a requirement is
-    not met (`find_unmet_requirement`), or if no parameters describe the response.
+    recording is one of these. Return None if a requirement is not met (`find_unmet_requirement`), or if no parameters
+    describe the response.
     """
     if find_unmet_requirement(recording, rig) is not None:
         return None
