@@ -13,6 +13,7 @@ import sealscope as ss
 from sealscope.diagnosis.inference.onset import WITHIN_95, Information
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.fit import Priors
+from sealscope.diagnosis.inference.pressures.leak import HealthyResponse
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
     C_C,
     F_C,
@@ -115,7 +116,7 @@ def test_sums_of_recordings_give_the_posterior_of_their_machine() -> None:
     mean, deviation = np.array([1.4, 5.0]), np.array([0.1, 3.0])
     gram = np.diag([*deviation**-2.0, 1.0])
     gram[:2, 2] = gram[2, :2] = mean * deviation**-2.0
-    known = priors.of_machine([gram, gram], tested=1)
+    known = priors.condition_on([gram, gram], tested=1)
     variance = deviation**2 + np.array([between[0], 0.0]) ** 2  # of each recording's parameters about the machine's
     precision = width**-2.0 + 2.0 / variance
     np.testing.assert_allclose(known.centre, (centre * width**-2.0 + 2.0 * mean / variance) / precision)
@@ -153,6 +154,17 @@ def test_a_machine_that_is_known_tells_a_leak_from_its_gain_and_its_oil(lpm: flo
     assert lpm * LITRE_PER_MINUTE < leak.bound_flow
     flow, half = leak.rise_flow.value, WITHIN_95 * math.hypot(leak.rise_flow.deviation, 0.17 * leak.rise_flow.value)
     assert flow - half <= lpm * LITRE_PER_MINUTE <= flow + half
+
+
+def test_the_law_of_most_healthy_recordings_is_that_of_the_machine() -> None:
+    """One healthy recording that another law of friction describes takes the others nothing away."""
+    recordings = [ss.simulate(command="3 sin(4t)", duration=20.0, seed=seed) for seed in (1, 2, 3)]
+    *healthy, judged = [measure_leak(recording, THESIS, is_healthy=True) for recording in recordings]
+    known = [HealthyResponse(leak.law, leak.conditions) for leak in healthy]
+    other = HealthyResponse("bristles", judged.conditions)
+    assert {leak.law for leak in healthy} == {"stribeck"}
+    with_other, without = (measure_leak(recordings[2], THESIS, responses) for responses in ([*known, other], known))
+    assert with_other.rise.value == without.rise.value
 
 
 @pytest.fixture(scope="module")

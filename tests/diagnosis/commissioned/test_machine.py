@@ -312,7 +312,7 @@ def test_a_file_is_whole_at_whichever_access_its_writer_is_killed(machine, tmp_p
 
 
 HOSTILE = {
-    "format = 2": ("format = 1", "machine.format"),
+    "format = 3": ("format = 2", "machine.format"),
     'name = "actuator7"': ("name = 7", "machine.name"),
     'summary = "': ('summary = "g', "healthy[1].summary"),
     'file = "run1.nc"': ("file = 3", "healthy[1].file"),

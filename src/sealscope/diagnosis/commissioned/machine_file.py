@@ -50,7 +50,7 @@ from sealscope.storage.plain_values import convert_type
 from sealscope.storage.toml_file import parse_toml, read_toml
 
 #: Format that this version writes and reads.
-_FORMAT = 2
+_FORMAT = 3
 #: Names in [machine] that are written anew with each change.
 _REWRITTEN = ("sealscope", "written", "summaries")
 #: Summaries that no machine's file refers to are kept as long as all summaries are smaller than this [bytes].

@@ -3,7 +3,8 @@
 The blocks are cut as in a recording (`inference.balance.BlockStream`). All coefficients of the balance but the leak's
 are estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which
 lie in parallel; `sequential` tests it for a step. In an open circuit valves cut the pump off at rest (`regimes`): the
-pump's own leakage is free in each block, and the conductance is that of the piston, from rests under load.
+pump's own leakage is free in each block, and the conductance is that of the piston, from rests under load; a flow whose
+sign had to be restored shows only both together.
 """
 
 from __future__ import annotations
@@ -140,7 +141,7 @@ class LiveBalance(SavedAttributes):
     method = "volumes"
     data = VOLUMES
     states_level = True
-    min_internal_fraction = orifice_factor = 1.0  # the leak is surely internal, and its flow measured, whatever its law
+    min_internal_fraction = max_law_ratio = 1.0  # the leak is surely internal, and its flow measured, whatever its law
     block_seconds = BLOCK_SECONDS
     has_begun = True
     SAVED = ("_precision", "_moving", "_waiting", "_n_meanings", "_rate", "_signals")
@@ -157,8 +158,6 @@ class LiveBalance(SavedAttributes):
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)
-        has_pump = rig.circuit.pump_moves_piston and not rig.circuit.feeds_one_chamber
-        self.cause: Cause = "piston or pump leak" if has_pump else "piston leak"
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column
         self._column_orders, self._models = [], list[Coefficients]()
@@ -292,6 +291,12 @@ class LiveBalance(SavedAttributes):
     def _relative_motion(self, block: Blocks) -> float:
         """Compute the mean square of the volume that the machine moves in a block, relative to earlier blocks."""
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
+
+    @property
+    def cause(self) -> Cause:
+        """Cause of a leak, as precise as the conductance shows it."""
+        shows_pump = self._circuit.pump_moves_piston and not self._has_own_leakage
+        return "piston or pump leak" if shows_pump else "piston leak"
 
     @property
     def _has_own_leakage(self) -> bool:

@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressures.detector import RESPONSE, score_response_steps
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint
-from sealscope.diagnosis.inference.pressures.leak import MAX_LAW_RATIO, conductance_scale_error, states_flow
+from sealscope.diagnosis.inference.pressures.leak import HIGH_LAW_RATIO, conductance_scale_error, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import LAWS, PARAMETERS, G
 from sealscope.diagnosis.inference.pressures.response import Follower, parameter_information
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
@@ -63,8 +63,8 @@ class PressureEstimator(SavedAttributes):
     states_level = False  # True if the level of the conductance is stated
     cause: Cause = "piston, pump or external leak"
     size_error = conductance_scale_error()  # relative standard error of changes of the conductance
-    # flow of a leak through an orifice over that of a laminar leak with the same estimated conductance
-    orifice_factor: float = MAX_LAW_RATIO
+    # flow of a leak of any law over that of a laminar leak with the same estimated conductance, upper limit
+    max_law_ratio: float = HIGH_LAW_RATIO
     min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)

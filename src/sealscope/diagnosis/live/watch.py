@@ -224,7 +224,7 @@ class Watch:
             score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
             test, cause = LiveRise(STEP, score), estimator.cause
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
-            max_flow = estimator.orifice_factor * self._detector.bound() * pressure
+            max_flow = estimator.max_law_ratio * self._detector.bound() * pressure
             bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
         flow = Estimate(test.size * pressure, test.deviation * pressure)  # mean increase of the leakage
         return LeakMeasure(
@@ -236,7 +236,7 @@ class Watch:
             rise_flow=flow,
             rise_onset=test.interval,
             flow_per_conductance=pressure,
-            flow_factors=(estimator.min_internal_fraction, estimator.orifice_factor),
+            flow_factors=(estimator.min_internal_fraction, estimator.max_law_ratio),
             bound_flow=bound,
             pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
             lpm_per_flow=1.0 / LITRE_PER_MINUTE if self._states_litres else None,
@@ -579,7 +579,7 @@ class Watch:
         leak = mean_flow((blocks["g"] - reference.value) * lpm, errors)
         half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
         low = min_fraction * (leak.value + (reference.value - reference.high) * mean_lpm - half_width)
-        high = estimator.orifice_factor * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
+        high = estimator.max_law_ratio * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
         return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:

@@ -58,7 +58,7 @@ class PressureResponse:
         The leakage is compared with that of the healthy recordings in `baseline`. If it cannot be measured or a leak
         would not show, the report states only the reason (`lack`).
         """
-        leak = measure_leak(recording, self.rig, _restore(healthy_summaries(self, baseline)))
+        leak = measure_leak(recording, self.rig, _restore_responses(healthy_summaries(self, baseline)))
         if leak is None:
             return Observed(
                 self.name, lack="the pressures do not respond to the command as those of a pump-driven piston do"
@@ -71,7 +71,7 @@ class PressureResponse:
         return Observed(self.name, observables, leak, share=float(is_known.mean()), judged_until=float(judged_until))
 
 
-def _restore(summaries: Iterable[Summary]) -> list[HealthyResponse]:
+def _restore_responses(summaries: Iterable[Summary]) -> list[HealthyResponse]:
     """Return healthy recordings from their summaries."""
     return [
         HealthyResponse(

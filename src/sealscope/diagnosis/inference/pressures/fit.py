@@ -85,8 +85,8 @@ class Priors:
         """The prior as the Gram matrix (p + 1, p + 1) of a recording (`Joint.sums`)."""
         return _gram_of_normal(self.normal.precision, self.normal.precision @ (self.centre / self.unit), self.unit)
 
-    def sums_of_machine(self, sums: Array, tested: int) -> Array:
-        """Return the likelihood of a machine's parameters by one of its recordings, as Gram matrix (p + 1, p + 1).
+    def machine_likelihood(self, sums: Array, tested: int) -> Array:
+        """Return the likelihood of a machine's parameters given one recording, as a Gram matrix (p + 1, p + 1).
 
         `sums` (p + 1, p + 1): likelihood of the recording's parameters (`Joint.sums`), which differ from those of the
         machine by `between`, but for that with the index `tested`.
@@ -96,15 +96,15 @@ class Priors:
         matrix = rows[:, differing] * self.between[differing] + np.eye(len(differing))
         return np.asarray(sums - rows.T @ np.linalg.solve(matrix, rows))
 
-    def of_machine(self, recordings: Sequence[Array], tested: int) -> Priors:
+    def condition_on(self, recordings: Sequence[Array], tested: int) -> Priors:
         """Return the prior of a further recording of a machine, of which healthy `recordings` are known.
 
-        `recordings`: their likelihoods (`Joint.sums`), (p + 1, p + 1) each. The parameters of a recording differ from
-        those of the machine by `between`; in the further one, that with the index `tested` by any amount that a block
-        may add to it, as `wander` states.
+        `recordings`: their likelihoods (`Joint.sums`), (p + 1, p + 1) each. The parameters of the further recording
+        differ from those of the machine with the standard deviations `between`, but that with the index `tested` with
+        its `wander`.
         """
         units = np.append(self.unit, 1.0)
-        likelihoods = [self.sums_of_machine(sums, tested) for sums in recordings]
+        likelihoods = [self.machine_likelihood(sums, tested) for sums in recordings]
         gram = (np.sum(likelihoods, axis=0) + self.sums) * units * units[:, None]
         covariance = np.asarray(np.linalg.inv(gram[:-1, :-1]))
         centre = covariance @ gram[:-1, -1] * self.unit
@@ -165,7 +165,8 @@ class Joint:
     `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p): fitted
     deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): prior precision
     of the same deviations; `variance`: variance of the residual [Pa^2]; `squares`: sum of squares of the residual at
-    `theta` [Pa^2]; `gain`: decrease of -2 log posterior from `theta` to the fitted parameters in the linearised model.
+    `theta` [Pa^2]; `samples`: number of known samples; `gain`: decrease of -2 log posterior from `theta` to the fitted
+    parameters in the linearised model.
     """
 
     priors: Priors
@@ -175,6 +176,7 @@ class Joint:
     prior_precision: Array
     variance: float
     squares: float
+    samples: float
     gain: float
 
     @property
@@ -209,7 +211,8 @@ class Joint:
             variance, inflation = _estimate_noise(blocks, mean, parameter)
         covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
         squares = sum(float(block.gram[0, 0]) for block in blocks)
-        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares, float(vector @ mean))
+        samples = sum(block.samples for block in blocks)
+        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares, samples, float(vector @ mean))
 
     def sums(self, parameter: int, step: float) -> Array:
         """Compute the likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1).
@@ -217,7 +220,7 @@ class Joint:
         It is that of a regression with a column for each parameter, in the parameter's unit, and the left side: the
         precision of the averages, and its products with them. The prior of the fit is removed. `parameter`: index of
         the tested parameter, which in place of the prior's random walk has one with the standard deviation `step` from
-        block to block.
+        block to block, so that it is nearly constant.
         """
         normal, unit, (n_blocks, n_parameters) = self.priors.normal, self.priors.unit, self.theta.shape
         indices = slice(parameter, None, n_parameters)  # the tested parameter in all blocks

@@ -26,9 +26,9 @@ from sealscope.units import LITRE_PER_MINUTE
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
 
-#: Mean flow of a leak over that of a laminar one of the same fitted conductance: mean, standard deviation and largest.
+#: Mean flow of a leak over that of a laminar one of the same fitted conductance: mean, deviation and upper limit.
 _LAW_RATIO, _LAW_DEVIATION = PRESSURE.conductance.law
-MAX_LAW_RATIO = _LAW_RATIO + WITHIN_95 * _LAW_DEVIATION
+HIGH_LAW_RATIO = _LAW_RATIO + WITHIN_95 * _LAW_DEVIATION
 
 
 def conductance_scale_error() -> float:
@@ -153,13 +153,13 @@ class ResponseLeak(LeakMeasure):
 
     @cached_property
     def rise(self) -> Rise | None:
-        """Excess of the mean conductance [m^3/(s Pa)] over that of the healthy recordings; None without these."""
+        """Excess of a constant conductance [m^3/(s Pa)] over that of the healthy recordings; None without these."""
         if not self.healthy:
             return None
         # parameters that no recording tells are those of the rig
         prior = self.priors.sums / len(self.healthy)
         healthy = [
-            response.recording._replace(sums=(self.priors.sums_of_machine(response.sums, G) + prior)[None])
+            response.recording._replace(sums=(self.priors.machine_likelihood(response.sums, G) + prior)[None])
             for response in self.healthy
         ]
         return rise(
@@ -175,14 +175,12 @@ class ResponseLeak(LeakMeasure):
     def bound_flow(self) -> float:
         """95 % upper bound of the mean flow [m^3/s] of a leak; infinite if nothing was tested.
 
-        With healthy recordings the bound is on the leakage above theirs, otherwise on a leak that begins within the
-        recording. The law is that with the largest flow for a fitted conductance, and the scale the largest usual one.
+        It bounds a leak that begins within the recording and, with healthy recordings, the leakage above theirs, for
+        the upper limits of the ratio of the leak's law and of the scale.
         """
-        test = self.step if self.rise is None else self.rise
-        if test is None:
-            return np.inf
+        bounds = [test.bound() for test in (self.step, self.rise) if test is not None]
         max_scale = 1.0 + WITHIN_95 * conductance_scale_error()
-        return test.bound() * MAX_LAW_RATIO * self.flow_per_conductance * max_scale
+        return max(bounds, default=np.inf) * HIGH_LAW_RATIO * self.flow_per_conductance * max_scale
 
     @property
     def step_rise(self) -> LeakRise | None:
@@ -220,8 +218,7 @@ class ResponseLeak(LeakMeasure):
     def history(self, onset_s: float | None) -> LeakCourse | None:
         """Compute the leakage over time [L/min], with its 95 % interval, relative to its mean before `onset_s` [s].
 
-        Return None without an onset or a step
-        test, or if the rig's file does not state the machine's sizes.
+        Return None without an onset or a step test, or if the rig's file does not state the machine's sizes.
         """
         if onset_s is None or self.step is None or not self.stated:
             return None

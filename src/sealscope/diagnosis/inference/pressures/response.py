@@ -2,7 +2,8 @@
 
 One call of the simulation (`reduced_rig`) gives a whole Jacobian: it simulates in parallel the parameters, and the
 parameters with each of them increased in turn. An iterated Kalman filter tracks the parameters from block to block
-(`Follower`), both live and over a recording. Over a recording all blocks are then fitted together (`fit.Joint`).
+(`Follower`), both live and over a recording. Over a recording all blocks are then fitted together (`fit.Joint`). What
+healthy recordings tell of a machine is the prior of the next (`KnownMachine`).
 Friction follows Stribeck's law, or LuGre's if Stribeck's does not explain the beginning of the recording and LuGre's
 fits better.
 
@@ -12,6 +13,7 @@ Source: B. M. Bell and F. W. Cathey, IEEE Trans. Autom. Control 38 (1993) 294 (i
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
@@ -64,6 +66,8 @@ _POSITIVE, _MIN = [GAIN, K_OIL, F_C, K_BRK, C_C], 1e-9
 _N_STEPS, _MIN_GAIN = 12, 5.0
 #: Fractions of a Gauss-Newton step that are tried together.
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
+#: Number of conductances from which the fit to a known machine starts.
+_N_CONDUCTANCES = 3
 #: Joint fit of all blocks: maximum number of Gauss-Newton steps; factor on a step after a failed one, and its minimum.
 _N_JOINT_STEPS, _SMALLER_STEP, _SMALLEST_STEP = 20, 0.3, 0.05
 
@@ -95,8 +99,8 @@ def is_explained(cost: float, n_samples: float) -> bool:
 def noise_variance(recording: Recording) -> float:
     """Estimate the variance of the noise of p_A - p_B [Pa^2], at least 1, as it is a divisor.
 
-    The noise of p_A - p_B is that of p_A + p_B without what both readings share. p_A - p_B also rings. The squares of
-    the coefficients (1, -3, 3, -1) of a third difference have the sum 20.
+    p_A - p_B and p_A + p_B have the same noise but for what the readings share. The smaller estimate is used, since
+    p_A - p_B also rings. The squares of the coefficients (1, -3, 3, -1) of a third difference have the sum 20.
     """
     total, difference = recording["p_A"] + recording["p_B"], recording["p_A"] - recording["p_B"]
     return max(float(np.diff([total, difference], 3).var(axis=1).min()) / 20.0, 1.0)
@@ -289,7 +293,7 @@ def fit_from_conductances(segment: Segment, noise: float) -> Linearisation:
     """
     sets = np.tile(segment.priors.centre, (SINGLE_WIDTH, 1))
     sets[1:, G] = _geometric_grid(*PRESSURE.jump["G"], count=SINGLE_WIDTH - 1)
-    best_starts = sets[segment.residual_squares(sets).argsort()[: SINGLE_WIDTH // 5]]
+    best_starts = sets[segment.residual_squares(sets).argsort()[:_N_CONDUCTANCES]]
     return fit_from_starts(segment, best_starts, noise, n_best=2)
 
 
@@ -366,7 +370,8 @@ class Follower:
                 follower, fit = bristles, bristles_fit
         follower.theta, follower.variance = fit.theta, segment.residual_variance(float(fit.squares[0]))
         follower._converge_on_beginning(recording)
-        # the filter lets the conductance wander as far as a leak takes it, be it into a wrong minimum (`fit_jointly`)
+        # the filter lets the conductance wander as far as a leak takes it, be it into a wrong minimum: a faster pump
+        # that feeds a leak fits nearly as well
         if follower.theta[G] > follower.priors.centre[G] + follower.priors.width[G]:
             follower.theta = fit.theta
         return follower
@@ -386,7 +391,7 @@ class Follower:
 
     def at_rate(self, rig: Rig, rate: float) -> Follower:
         """Make a filter for samples of the same machine at another `rate` [Hz] that continues as after a gap."""
-        follower = Follower(rig, rate, self.sense, self.machine.law)
+        follower = Follower(rig, rate, self.sense, self.machine.law, self.priors)
         follower.theta, follower.covariance = self.theta, self.covariance
         follower.variance, follower.states = self.variance, self.states
         return follower
@@ -487,9 +492,9 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
 
     `follower`: filter at the first sample; `noise`: variance of the noise [Pa^2]. From each of the `starts`, parameters
     (K, p), the model is linearised step by step, until a fit explains the recording but for its noise. Returns the best
-    fit.
+    fit; raises LinAlgError if there is none.
     """
-    states, n_samples = follower.states, sum(len(block) for block in blocks)
+    states = follower.states
     seconds = float(np.mean([block.duration for block in blocks]))
 
     def linearise(theta: Array) -> Joint:
@@ -512,16 +517,20 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
                 fraction *= _SMALLER_STEP
         return joint
 
-    best: tuple[float, Joint] | None = None
+    best_cost, best = math.inf, None
     for start in starts:
-        joint = converge(linearise(start))
-        cost = joint.cost(noise)
-        if best is None or not best[0] <= cost:  # also if the earlier cost is not a number
-            best = cost, joint
-        if is_explained(best[0], n_samples):
+        try:
+            joint = converge(linearise(start))
+        except np.linalg.LinAlgError:
+            continue
+        cost = float(np.nan_to_num(joint.cost(noise), nan=np.inf))
+        if cost < best_cost:
+            best_cost, best = cost, joint
+        if is_explained(best_cost, joint.samples):
             break
-    assert best is not None
-    return best[1]
+    if best is None:
+        raise np.linalg.LinAlgError("no start leads to a fit")
+    return best
 
 
 class Fit(NamedTuple):
@@ -551,7 +560,7 @@ def fit_response(
         yield np.array([begin.update(block).theta for block in blocks])
         by_itself = fit_response(recording, rig) if known is not None else None
         if by_itself is not None and by_itself.law == follower.machine.law:
-            yield by_itself.joint.fitted
+            yield limit_step(by_itself.joint.fitted, by_itself.joint.theta)
 
     def compute_fit(recording: Recording) -> Fit | None:
         """Fit all blocks together; None if that fails or explains little."""
@@ -585,12 +594,15 @@ def measure_leak(
     """
     if find_unmet_requirement(recording, rig) is not None:
         return None
-    known = None
+    fit = None
     if healthy:
-        law = healthy[-1].law  # that of the latest
+        law, _ = Counter(response.law for response in healthy).most_common(1)[0]
         healthy = [response for response in healthy if response.law == law]
-        known = KnownMachine(law, response_priors(rig, law).of_machine([response.sums for response in healthy], G))
-    fit = fit_response(recording, rig, known, is_healthy=is_healthy)
+        priors = response_priors(rig, law).condition_on([response.sums for response in healthy], G)
+        priors = replace(priors, centre=limit_step(priors.centre, priors.centre))
+        fit = fit_response(recording, rig, KnownMachine(law, priors))
+    if fit is None:  # no healthy recordings, or the recording is like none of them
+        fit, healthy = fit_response(recording, rig, is_healthy=is_healthy), ()
     if fit is None:
         return None
     joint, law = fit
