@@ -83,6 +83,7 @@ class RailPriors(PriorTable):
 
     samples: int  # fewest samples at the rail
     crowd: float  # smallest ratio of these samples to those at any of the values next to it
+    zero: float  # [Pa] highest reading at a transducer's zero, where its range begins
     jump: float  # [quantisation steps] smallest jump to or from it
     run: int  # [samples] length of a run from which a smaller jump suffices
     long_jump: float  # [quantisation steps] smallest jump to or from such a long run

@@ -226,7 +226,7 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         return findings
     stuck = find_stuck(readings)
     may_be_clipped = is_pressure or name == "q_leak"  # q_leak at the high end only: without flow it reads 0
-    for rail in find_rails(readings, stuck, low_end=is_pressure) if may_be_clipped else ():
+    for rail in find_rails(readings, unit, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {format_value(rail.value)}: clipped"
         add("clipped", rail.samples, int(present[rail.first]), text)
@@ -321,16 +321,18 @@ class Rail(NamedTuple):
     first: int  # index of the first of them
 
 
-def is_mostly_clipped(values: Array) -> bool:
+def is_mostly_clipped(values: Array, unit: str) -> bool:
     """Test whether more than half of the finite values (n,) are clipped, as in a chamber that drains to the tank."""
     finite = values[np.isfinite(values)]
-    return sum(rail.samples for rail in find_rails(finite)) > len(finite) / 2
+    return sum(rail.samples for rail in find_rails(finite, unit)) > len(finite) / 2
 
 
-def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
+def find_rails(values: Array, unit: str, stuck: NDArray[np.intp] | None = None, low_end: bool = True) -> list[Rail]:
     """Find the ends of the range of a channel's finite values (n,) at which they are clipped.
 
-    With `low_end` False only the high end is examined. An end is clipped in two cases:
+    With `low_end` False only the high end is examined. The low end of a pressure, in the `unit` Pa, lies at the
+    transducer's zero (`rail.zero` of `priors.toml`): a chamber at the charge pressure, read in coarse steps, is not
+    clipped. An end is clipped in two cases:
 
     - Five samples or more have this value, over five times as many as any of the five nearest values, and the signal
       enters or leaves the longest run of them (3 or more) by a jump of more than 3.5 quantisation steps, or 1.5 for a
@@ -353,7 +355,7 @@ def find_rails(values: Array, stuck: NDArray[np.intp] | None = None, low_end: bo
     rails = []
     # index of the end among the distinct values, and slice of the five nearest ones
     for side, index, nearest in (("high", -1, slice(-6, -1)), ("low", 0, slice(1, 6))):
-        if side == "low" and not low_end:
+        if side == "low" and (not low_end or (unit == "Pa" and distinct[0] > _RAIL.zero)):
             continue
         runs = find_runs(values == distinct[index])
         first, length = runs[np.argmax(runs[:, 1])]  # the longest

@@ -655,7 +655,10 @@ def bridged_samples(recording: Recording, names: Collection[str]) -> dict[str, A
     for name, values in recording.channels.items():
         if name in names:
             # rails: values at which the pressure transducer clips
-            rails = [rail.value for rail in find_rails(values[np.isfinite(values)])] if name.startswith("p_") else []
+            rails = list[float]()
+            if name.startswith("p_"):
+                finite = values[np.isfinite(values)]
+                rails = [rail.value for rail in find_rails(finite, recording.units[name])]
             samples[name] = np.where(np.isin(values, rails), np.nan, values) if rails else values
             is_clipped |= bool(rails)
     if is_clipped and {"p_A", "p_B"} <= samples.keys():

@@ -74,7 +74,7 @@ def column_names(chambers: Sequence[str]) -> list[str]:
 def judged_chambers(recording: Recording) -> tuple[str, ...]:
     """Name the recorded chamber pressures that are not mostly clipped; all of them if none would be left."""
     chambers = chambers_of(recording)
-    return tuple(name for name in chambers if not is_mostly_clipped(recording[name])) or chambers
+    return tuple(name for name in chambers if not is_mostly_clipped(recording[name], recording.units[name])) or chambers
 
 
 def measure_levels(recording: Recording) -> tuple[Array, Array]:

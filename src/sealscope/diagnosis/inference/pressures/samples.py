@@ -43,7 +43,8 @@ def find_unmet_requirement(recording: Recording, rig: Rig) -> str | None:
             return f"{name} is constant or has missing samples"
         if not np.max(np.abs(recording[name])) < MAX_READING:
             return f"{name} is not plausible: it exceeds {MAX_READING:g} {recording.units[name]}"
-        if name != "u" and is_mostly_clipped(recording[name]):  # a command at its limit is still known
+        # a command at its limit is still known
+        if name != "u" and is_mostly_clipped(recording[name], recording.units[name]):
             return f"{name} is mostly clipped at an end of its range"
     return None
 
