@@ -173,6 +173,7 @@ class HeldOilPriors(PriorTable):
     independent: float  # number of independent readings of one side in a hold
     misfit: float  # fraction of the compressed volume that this model of the oil does not describe
     from_start: float  # fraction of the leaks that exist from the start of a recording
+    gain: float  # relative difference between the gains of two pressure sensors
     charge: float  # above the charge pressure by this fraction of it and `resolved`, no check valve feeds a side
     tank: float  # [Pa] gauge pressure in a line to the tank, a standard deviation
     open: float  # probability that the side without the load is open to the charge line

@@ -7,6 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.laws import compare_laws
@@ -215,24 +216,35 @@ class BalanceLeak(LeakMeasure):
 
     @cached_property
     def _hold_laws(self) -> Array:
-        """Leak past the piston, fitted to holds, under k laws of flow (`HeldChambers.law_fits`), (4, k).
+        """Leak past the piston, fitted to holds, under k laws of flow, (4, k).
 
         The rows are the probability of each law, with the sum 1; the mean flow [m^3/s] after the onset for a
-        coefficient of 1; and the fitted mean flow and its standard deviation [m^3/s]. The first law is laminar without
-        growth.
+        coefficient of 1; and the fitted mean flow and its standard deviation [m^3/s]. Each of
+        `HeldChambers.law_fits`, of which the first is laminar without growth, is repeated for each piston area of
+        `HeldChambers.area_variants`.
         """
-        chambers, recording, rows = self.balance.chambers, self.balance.recording, []
-        assert chambers is not None
+        assert self.balance.chambers is not None
+        variants = self.balance.chambers.area_variants()
+        return np.hstack([self._fit_hold_laws(variant, probability) for probability, variant in variants])
+
+    def _fit_hold_laws(self, chambers: HeldChambers, probability: float) -> Array:
+        """Compute the columns of `_hold_laws` for one piston area, with its `probability`.
+
+        The deviations include the uncertain starts of the holds (`HeldChambers.start_error`).
+        """
+        recording, rows = self.balance.recording, []
         best_log_weight = max(fit.log_weight for fit in chambers.law_fits)
         for leak, fit, log_weight in chambers.law_fits:
             after_onset = recording.t >= leak.onset
-            pressure = np.abs((recording["p_A"] - recording["p_B"])[after_onset] - leak.offset)
-            growth = growth_factor(recording.t[after_onset], leak.growth, leak.onset, chambers.end)
+            t = recording.t[after_onset]
+            difference = (recording["p_A"] - recording["p_B"])[after_onset]
+            pressure = np.abs(chambers.pressure_difference(t, difference, leak.offset))
+            growth = growth_factor(t, leak.growth, leak.onset, chambers.end)
             unit_flow = float(np.nanmean(pressure**leak.exponent * growth))
-            deviation = np.hypot(fit.deviation, fit.by_oil)
+            deviation = np.linalg.norm([fit.deviation, fit.by_oil, chambers.start_error(leak) * fit.value])
             rows.append((np.exp(log_weight - best_log_weight), unit_flow, fit.value * unit_flow, deviation * unit_flow))
         laws = np.array(rows).T
-        laws[0] /= laws[0].sum()
+        laws[0] *= probability / laws[0].sum()
         return laws
 
     def _rise_laws(self) -> list[tuple[float, float]]:

@@ -349,11 +349,11 @@ class RecordedBalance:
         # the dead volumes are beyond the motion of all recordings
         lows, highs = zip(stroke, self.known_stroke or stroke, strict=True)
         low, high = min(lows), max(highs)
-        area_A, area_B = self._signed_areas()
+        (area_A, deviation_A), (area_B, deviation_B) = self._signed_areas()
         max_area_ratio: float = INFERENCE.held_oil.unlike
         if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
             return None
-        return CylinderSides(area_A, area_B, low, high)
+        return CylinderSides(area_A, area_B, low, high, deviation_A, deviation_B)
 
     @property
     def recorded_stroke(self) -> tuple[float, float] | None:
@@ -365,14 +365,15 @@ class RecordedBalance:
         low, high = np.quantile(x, (END_QUANTILE, 1.0 - END_QUANTILE))
         return float(low), float(high)
 
-    def _signed_areas(self) -> list[float]:
+    def _signed_areas(self) -> list[tuple[float, float]]:
         """Estimate the piston areas of A and B [m^2], as measured with the assumed displacement of the pump.
 
-        The areas are negative if the position x is reversed, and zero if nothing moves. Areas in the rig's file are
-        used if they are stated and can be scaled to the flows of the balance. Otherwise the area of a side is the mean
-        coefficient of its motions (`motions_of_side`), weighted by the sums of squares of the columns. The main side is
-        the one with more motion in which it surely carries the load. The other area is corrected for motion that may
-        belong to the main side (`log_area_ratio`).
+        Returns for either side the area and the standard deviation of the logarithm of its magnitude. The areas are
+        negative if the position x is reversed, and zero if nothing moves. Areas in the rig's file are used if they are
+        stated and can be scaled to the flows of the balance. Otherwise the area of a side is the mean coefficient of
+        its motions (`motions_of_side`), weighted by the sums of squares of the columns. The main side is the one with
+        more motion in which it surely carries the load. The other area is corrected for motion that may belong to the
+        main side (`log_area_ratio`).
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
@@ -388,14 +389,16 @@ class RecordedBalance:
         shares = self._loaded_shares()
         main = int(np.argmax(np.array(energies) * shares))  # index of the main side: 0 for A, 1 for B
         other = 1 - main
+        deviation: float = INFERENCE.size.area
         if self.rig.states("cylinder.A_A", "cylinder.A_B") and self.size.stated:
             sign, cylinder = float(np.sign(areas[main])), self.rig.cylinder
-            return [sign * area / self.size.scale for area in (cylinder.A_A, cylinder.A_B)]
+            return [(sign * area / self.size.scale, deviation) for area in (cylinder.A_A, cylinder.A_B)]
         measured = areas[other] / areas[main] if areas[main] else 0.0  # 0: no information
         # the side that carries the largest load is more probably the one without a rod
         highest = [float(np.nanquantile(self.recording[name], 1.0 - END_QUANTILE)) for name in ("p_A", "p_B")]
         log_ratio = log_area_ratio(measured, shares[other], is_larger=highest[other] > highest[main])
-        sides = [areas[main], areas[main] * float(np.exp(log_ratio))]
+        other_area, other_deviation = areas[main] * np.exp(log_ratio.value), np.hypot(deviation, log_ratio.deviation)
+        sides = [(areas[main], deviation), (float(other_area), float(other_deviation))]
         return sides if main == 0 else sides[::-1]
 
     def _loaded_shares(self) -> tuple[float, float]:
@@ -558,8 +561,8 @@ class RecordedBalance:
         return fit_history(total, test, with_step=test is not None and test.chance < RAREST)
 
 
-def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> float:
-    """Estimate the logarithm r of the ratio of two piston areas, first side over second.
+def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> Estimate:
+    """Estimate the logarithm r of the ratio of two piston areas, first side over second, with its standard deviation.
 
     `measured`: fitted ratio, without information if it is not positive; the area of the second side is well known. Only
     a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the second side.
@@ -580,7 +583,9 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
         misfit = (np.log(measured) - np.outer(shares, ratios)) / INFERENCE.size.area
         log_weights = log_weights + np.log(share_weights)[:, None] - 0.5 * misfit**2
     weights = np.exp(log_weights - log_weights.max()).sum(axis=0)
-    return float(weights @ ratios / weights.sum())
+    weights /= weights.sum()
+    value = float(weights @ ratios)
+    return Estimate(value, float(np.sqrt(weights @ (ratios - value) ** 2)))
 
 
 class _Area(NamedTuple):

@@ -71,6 +71,8 @@ from sealscope.units import P_ATM
 
 #: Coarse grid of offsets of p_A - p_B [standard deviations of the prior], and number of points of the refined grid.
 OFFSET_GRID, N_REFINED = np.array([0.0, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0, 16.0]), 17
+#: Values of a normal variable of mean 0 and variance 1, and their weights, of Gauss-Hermite quadrature.
+AREA_NODES, AREA_WEIGHTS = (0.0, 3.0**0.5, -(3.0**0.5)), (2.0 / 3.0, 1.0 / 6.0, 1.0 / 6.0)
 #: Supplies of the sides with a smaller log prior are not tried.
 MIN_LOG_PRIOR = -30.0
 #: Number of evenly spaced onsets within a hold.
@@ -92,6 +94,24 @@ class HeldChambers:
     begin: float
     end: float
     charge: float
+
+    def area_variants(self) -> list[tuple[float, HeldChambers]]:
+        """Return this estimator with three areas of the less certain side, each with its probability.
+
+        The areas are the Gauss-Hermite quadrature of the normal distribution of the area's logarithm. How well one fits
+        the holds does not count: errors by delays of the sensors repeat from hold to hold. If both areas are known
+        (`size.area` in `priors.toml`), there is only this estimator.
+        """
+        sides = self.sides
+        deviation = max(sides.deviation_A, sides.deviation_B)
+        if deviation <= INFERENCE.size.area:
+            return [(1.0, self)]
+        name = "area_A" if sides.deviation_A > sides.deviation_B else "area_B"
+        variants = []
+        for node, probability in zip(AREA_NODES, AREA_WEIGHTS, strict=True):
+            area = getattr(sides, name) * math.exp(node * deviation)
+            variants.append((probability, replace(self, sides=sides._replace(**{name: area}))))
+        return variants
 
     @property
     def n_readings(self) -> float:
@@ -197,11 +217,12 @@ class HeldChambers:
     def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
         """Compute the flow past the piston in each hold for a `leak` with a coefficient of 1.
 
-        With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`.
+        With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`. The sensor offset z
+        in a hold may differ from the recording's (`LockedHold.driving_pressure`).
         """
         flows = []
         for hold in self.holds:
-            difference = hold.difference - leak.offset
+            difference = hold.driving_pressure(leak.offset)
             flow = np.sign(difference) * np.abs(difference) ** leak.exponent
             flow *= growth_factor(hold.t, leak.growth, leak.onset, self.end)
             flows.append(np.array([flow, -flow]))
@@ -211,6 +232,19 @@ class HeldChambers:
         """Set `flows` (2, n) out of A and B, for each hold of n samples, to 0 while a side is not closed."""
         is_closed = self._closed_flags(supplies)
         return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
+
+    def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
+        """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
+
+        It is the `offset` [Pa] of the recording or, from the start of a hold to the end of its rest, that of the hold
+        (`LockedHold.offset_in_hold`). Pressures that a leak has equalised then differ by 0.
+        """
+        prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
+        for hold in self.holds:
+            # `hold.t` leaves out the end of the rest, in which the valves open and over which the flow was averaged
+            begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
+            offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
+        return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
         """Compute the flow [Pa] out of A (or B, if not `is_A`) to the outside for a conductance of 1.
@@ -228,7 +262,12 @@ class HeldChambers:
         The other chamber has no flow, since check valves or a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
-        return UnitLeak([flow_of_side(np.maximum(sign * hold.difference, 0.0), is_A) for hold in self.holds])
+        flows = []
+        for hold in self.holds:
+            hold_offset, *_ = hold.offset_in_hold(0.0)  # 0: the offset of the recording is not known here
+            flow = np.maximum(sign * (hold.p_A - hold.p_B - hold_offset), 0.0)
+            flows.append(flow_of_side(flow, is_A))
+        return UnitLeak(flows)
 
     @cached_property
     def _fits_without_leak(self) -> dict[SideSupplies, LeakRegression]:
@@ -244,8 +283,32 @@ class HeldChambers:
         return fit._replace(log_likelihood=fit.log_likelihood + self._conditions_log_prior(leak))
 
     def _conditions_log_prior(self, leak: PistonLeak) -> float:
-        """Compute the log prior of a leak's supplies and sensor offset, up to a constant."""
-        return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * float(offset_cost(leak.offset))
+        """Compute the log prior of a leak's supplies and sensor offset, up to a constant.
+
+        A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the
+        recording's, in standard deviations (`LockedHold.offset_in_hold`).
+        """
+        offset_costs = [float(offset_cost(leak.offset)), *(hold.offset_in_hold(leak.offset)[1] for hold in self.holds)]
+        return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * sum(offset_costs)
+
+    def start_error(self, leak: PistonLeak) -> float:
+        """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
+
+        The coefficient is the volume that has left a chamber, over the time integral of the flow u of a leak with a
+        coefficient of 1 without growth. The time at which the valves shut is known to within s = `held_oil.settles`
+        (`priors.toml`), and a large leak equalises the pressures about as fast. With the largest flow u_0 in the first
+        interval of each hold, the error is
+
+                    s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
+        """
+        start_flows, integrals = [0.0], [0.0]
+        for hold in self.holds:
+            is_after = hold.t >= leak.onset
+            unit_flow = np.where(is_after, np.abs(hold.driving_pressure(leak.offset)) ** leak.exponent, 0.0)
+            start_flows.append(float(unit_flow[: hold.edges[1]].max()))
+            integrals.append(float(np.trapezoid(unit_flow, hold.t)))
+        time_error: float = INFERENCE.held_oil.settles
+        return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
     def leaks_since(self, onset: float) -> Array | None:
         """Estimate the conductances of three leaks and their deviations, (6,), in the order of `HeldLeaks`.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -66,6 +67,37 @@ class LockedHold:
         centred = np.asarray(readings - readings[first:].mean(axis=0))
         centred[:first] = 0.0
         return centred
+
+    def offset_in_hold(self, offset: float) -> tuple[float, float, bool]:
+        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
+
+        If the two sensors differ in gain, the offset of a hold is normal about `offset`, with a standard deviation s of
+        `held_oil.gain` (`priors.toml`) times the higher pressure at the end of the hold. The more probable of two cases
+        is assumed: a leak has equalised the pressures, and the recorded p_A - p_B at the end is the offset of the hold;
+        or a load causes p_A - p_B, equally probable up to the higher pressure, and the offset is `offset`.
+
+        Returns the offset of the hold, ((offset of the hold - `offset`) / s)^2, and True in the first case.
+        """
+        last_A, last_B = (float(p[self.edges[-2] :].mean()) for p in (self.p_A, self.p_B))
+        pressure, difference = max(last_A, last_B), last_A - last_B
+        deviation = INFERENCE.held_oil.gain * pressure
+        cost = ((difference - offset) / deviation) ** 2
+        # log densities of `difference` in the two cases
+        is_equalised = -0.5 * cost - math.log(deviation * math.sqrt(2.0 * math.pi)) > -math.log(pressure)
+        return (difference, cost, True) if is_equalised else (offset, 0.0, False)
+
+    def driving_pressure(self, offset: float) -> Array:
+        """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
+
+        Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
+        exceed that of the large difference before. In such holds d is multiplied by d^2 / (d^2 +
+        `held_oil.resolved`^2).
+        """
+        offset_here, _, is_equalised = self.offset_in_hold(offset)
+        difference = np.asarray(self.difference - offset_here)
+        if is_equalised:
+            difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
+        return difference
 
     def steepest_time(self) -> float:
         """Find the start [s] of the window in which p_A - p_B changes most.

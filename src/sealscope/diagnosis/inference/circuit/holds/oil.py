@@ -35,12 +35,15 @@ class CylinderSides(NamedTuple):
     """Piston areas of both sides [m^2], and ends `low` and `high` of the recorded stroke [m].
 
     The areas are measured with the pump's assumed displacement; they are negative if the position x is reversed.
+    `deviation_A`, `deviation_B`: standard deviations of the logarithms of their magnitudes.
     """
 
     area_A: float
     area_B: float
     low: float
     high: float
+    deviation_A: float = 0.0
+    deviation_B: float = 0.0
 
 
 class OilRegression(NamedTuple):
