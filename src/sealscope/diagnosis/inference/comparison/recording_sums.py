@@ -27,10 +27,6 @@ class Resistance(NamedTuple):
     top_speed: float
 
 
-#: `RecordingSums.sums` of a recording whose leakage is measured by itself.
-NO_SUMS = np.empty((0, 0, 0))
-
-
 class RecordingSums(NamedTuple):
     """Summary of one recording, for the comparison with other recordings of the same machine.
 
