@@ -197,6 +197,18 @@ def test_a_step_has_its_size_and_its_onset_within_their_intervals():
     assert np.mean(onset) > 0.85
 
 
+def test_a_large_step_beside_warming_oil_is_not_dated_back():
+    """A filter without a walk lags behind the trend, and its terms of M explain the step by an onset long before."""
+    random = np.random.default_rng(1)
+    detector, unit = StepDetector(), 8e-15
+    for k in range(640):
+        g = 1.2e-12 + 4.6e-16 * k + 5e-15 * np.sin(0.05 * k) + (3.5e-13 if k >= 637 else 0.0)
+        detector.take(3.0 * k, 3.0 * k + 3.0, g + unit * random.standard_normal(), unit)
+    rise = detector.rise()
+    assert 3.0 * 636 <= rise.interval.low <= 3.0 * 637 <= rise.interval.high <= 3.0 * 638
+    assert rise.size == pytest.approx(3.5e-13, rel=0.1)
+
+
 def test_units_change_nothing():
     values = walk(np.random.default_rng(8), 100, 0.1)
     values[70:] += 8.0

@@ -146,7 +146,7 @@ def test_without_samples_or_a_file_it_says_so(tmp_path, commissioned):
     (tmp_path / "gone" / "press.toml").write_text("[machine]\nformat = 1\n")
     service.actuators.apply_mark(NAME, "valid")
     assert said_by(service.actuators).startswith(
-        "press.toml: mark not stored: machine.format must be 2, got 1: commission it anew"
+        "press.toml: mark not stored: machine.format must be 3, got 1: commission it anew"
     )
 
 

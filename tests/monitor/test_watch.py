@@ -194,7 +194,7 @@ def test_warm_oil_and_another_duty_are_no_leak():
 def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
     place = {"version": 1, "known_s": 0.0, "hours": 8.0, "lpm": None}
     duty = {"duty_low": (0.0, 0.0), "duty_high": (0.0, 0.0)}
-    scatter = {"deviation": 5e-14, "count": 600}
+    scatter = {"deviation": 5e-14, "count": 600, "short_term_deviation": 5e-14}
     baseline = WatchBaseline(level=2e-13, low=1e-13, high=3e-13, **place, **duty, **scatter)
     onset = Interval(1e5, 0.0, 1e5)
     rise = find_level_rise(baseline, onset, 6e-13, 1e-15, 1e-6)
@@ -203,6 +203,32 @@ def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
     assert rise.size - 1.96 * rise.deviation <= 2e-13  # the oil may be as warm as it gets, or as cold as it was
     assert rise.size + 1.96 * rise.deviation >= 5e-13
     assert find_level_rise(baseline, onset, 3.9e-13, 1e-15, 1e-6) is None
+    # oil that warmed scatters the groups of blocks, but not successive ones
+    warmed = replace(baseline, deviation=1.5e-13, short_term_deviation=1e-15)
+    assert find_level_rise(warmed, onset, 4.5e-13, 1e-15, 1e-6) is not None
+    assert find_level_rise(replace(warmed, short_term_deviation=1e-13), onset, 4.5e-13, 1e-15, 1e-6) is None
+    assert find_level_rise(replace(warmed, high=6e-13), onset, 4.5e-13, 1e-15, 1e-6) is None
+
+
+def test_a_leak_to_the_outside_is_stated_as_what_leaves_its_chamber():
+    """At first it may be one past the piston, of half the flow."""
+    recording = ss.simulate(
+        command="3 sin(4t)",
+        duration=150.0,
+        seed=11,
+        set={"makeup.check_valves": "present", "p_charge": "0.33 MPa"},
+        fault="rod seal A 0.0042 L/min from 90 s",
+    )
+    watch = ss.watch("thesis", learn_hours=80.0 / 3600.0)
+    estimate = watch.update(recording)[-1]
+    assert watch.leak.cause == "external leak"
+    leaves = 0.0042 * float(recording.between(90.0, 150.0)["p_A"].mean()) / 0.33e6
+    for lpm, (low, high) in (
+        (estimate.leak_lpm, estimate.leak_interval_lpm),
+        (watch.leak.leak_lpm, watch.leak.leak_interval_lpm),
+    ):
+        assert low <= leaves <= high
+        assert lpm == pytest.approx(leaves, rel=0.2)
 
 
 def test_a_machine_at_standstill_is_not_judged():

@@ -184,8 +184,14 @@ class AlarmJudge:
         elif updated.level == "warning" and self.error >= settings.debounce_blocks:
             updated, event = updated.with_level("error"), "error"
         if leak is not None:
-            by_chance, interval = allowed_rate * leak.rarity, estimate.leak_interval_lpm
-            updated = replace(updated, leak_lpm=lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
+            updated = replace(
+                updated,
+                leak_lpm=lpm,
+                leak_interval_lpm=estimate.leak_interval_lpm,
+                cause=leak.cause,
+                next_check=state_of(_CONDITIONS[updated.level], leak.cause).action,
+                by_chance_per_1000_h=allowed_rate * leak.rarity,
+            )
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:

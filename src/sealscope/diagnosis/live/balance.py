@@ -76,7 +76,7 @@ class BlockConductance(NamedTuple):
     g: float
     sd: float
     total: float  # conductance with the latest estimates of the other coefficients [m^3/(s Pa)]
-    offset: float  # standard error that is common to all blocks, due to other coefficients and sizes [m^3/(s Pa)]
+    offset: float  # standard error that is common to all blocks, due to the other coefficients [m^3/(s Pa)]
     pressure: float  # mean of abs(p_A - p_B) [Pa]
     pump_flow: float  # mean absolute flow that moves the piston [m^3/s]
 
@@ -343,8 +343,7 @@ class LiveBalance(SavedAttributes):
             g=total - weighted_shift / precision,
             sd=precision**-0.5,
             total=total,
-            # errors of the other coefficients, and of the machine's sizes
-            offset=math.hypot(math.sqrt(weighted_variance) / precision, self.size_error * total),
+            offset=math.sqrt(weighted_variance) / precision,
             pressure=float(block.mean_pressure()[0]),
             pump_flow=float(block.flow[0]),
         )

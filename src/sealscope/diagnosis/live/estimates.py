@@ -150,6 +150,9 @@ class WatchBaseline(HealthyLevel):
         The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
     duty_low, duty_high : Duty
         Minimum and maximum over the blocks, of either quantity.
+    short_term_deviation : float
+        Standard deviation of a group of blocks, by the differences of successive groups [m^3/(s Pa)]. Oil that warms
+        adds to `deviation`, but hardly to this.
     """
 
     version: int
@@ -157,6 +160,7 @@ class WatchBaseline(HealthyLevel):
     lpm: float | None
     duty_low: Duty
     duty_high: Duty
+    short_term_deviation: float
 
 
 def find_level_rise(
@@ -169,7 +173,8 @@ def find_level_rise(
 
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, at least two, given their scatter (Student's t with Welch's degrees of
-      freedom).
+      freedom). If they are those of a baseline, whose course shows how much of the scatter slow changes of the oil may
+      be, the first test with the rest of the scatter is enough (`_unexplained_scatter`).
     """
     from scipy.special import ndtr, ndtri
 
@@ -181,7 +186,11 @@ def find_level_rise(
     degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
     degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal
     rise = Rise(g - healthy.level, deviation=math.sqrt(variance), degrees_of_freedom=degrees_of_freedom)
-    chance = max(float(ndtr((max_healthy - g) / deviation)), rise.chance)
+    scatter_chance = rise.chance
+    if isinstance(healthy, WatchBaseline):
+        unexplained = math.hypot(deviation, _unexplained_scatter(healthy, max_healthy))
+        scatter_chance = min(scatter_chance, float(ndtr((max_healthy - g) / unexplained)))
+    chance = max(float(ndtr((max_healthy - g) / deviation)), scatter_chance)
     if chance >= probability:
         return None
     # the present healthy conductance may be anywhere from the lowest healthy mean to `max_healthy`
@@ -189,6 +198,16 @@ def find_level_rise(
     size = g - max(healthy.level, 0.0)
     score = -float(ndtri(max(chance, 1e-300)))  # finite for a chance of 0
     return LiveRise(LEVEL, score, onset, size, deviation=math.hypot(deviation, healthy_sd))
+
+
+def _unexplained_scatter(baseline: WatchBaseline, max_healthy: float) -> float:
+    """Compute the scatter of the ceiling `max_healthy` that no oil explains [m^3/(s Pa)].
+
+    Oil explains slow changes between the lowest group of blocks of the `baseline` and `max_healthy`, but neither what
+    differs between successive groups, an error of the lowest group, nor higher groups.
+    """
+    excess = max(baseline.high - max_healthy, 0.0)
+    return math.hypot(INFERENCE.oil.warmest * baseline.short_term_deviation, excess)
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
@@ -239,6 +258,9 @@ class BaselineLearning:
     # mean of the group means, and sum of their squared deviations from it
     mean: float = 0.0
     squares: float = 0.0
+    # last group mean, and sum of the squared differences of successive ones
+    last: float | None = None
+    square_differences: float = 0.0
     # smallest and largest group mean
     low: float | None = None
     high: float | None = None
@@ -259,6 +281,8 @@ class BaselineLearning:
             self.group = []
             self.low = mean if self.low is None else min(self.low, mean)
             self.high = mean if self.high is None else max(self.high, mean)
+            self.square_differences += 0.0 if self.last is None else (mean - self.last) ** 2
+            self.last = mean
             # Welford's recursion of mean and sum of squared deviations
             self.count += 1
             difference = mean - self.mean
@@ -271,8 +295,17 @@ class BaselineLearning:
         level = self.total / self.blocks
         lpm = level * (self.flow / self.blocks) if states_lpm else None
         # standard deviation between the `count` groups of blocks
-        deviation = math.sqrt(self.squares / (self.count - 1)) if self.count > 1 else 0.0
+        deviation, short_term = 0.0, 0.0
+        if self.count > 1:
+            deviation = math.sqrt(self.squares / (self.count - 1))
+            short_term = math.sqrt(0.5 * self.square_differences / (self.count - 1))  # J. von Neumann's estimate
         healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)
         return WatchBaseline(
-            **vars(healthy), version=version, hours=hours, lpm=lpm, duty_low=self.duty_low, duty_high=self.duty_high
+            **vars(healthy),
+            version=version,
+            hours=hours,
+            lpm=lpm,
+            duty_low=self.duty_low,
+            duty_high=self.duty_high,
+            short_term_deviation=short_term,
         )

@@ -63,8 +63,9 @@ _SELECT_EVERY = 8
 #: of the next block), a, b, T, and log pi_j minus the log likelihood of the blocks before the onset (`_add_onsets`).
 _FOLLOWED, _A, _B, _T, _LOG_PRIOR = range(5)
 _N_ROWS = _LOG_PRIOR + 1
-#: Columns of the onsets: n of the innovations in T, number of the block, time, and begin of the block [s].
-_N, _BLOCK, _TIME, _BLOCK_BEGIN = range(4)
+#: Columns of the onsets: n of the innovations in T, number of the block, time, begin of the block [s], and log evidence
+#: of the blocks before it (`StepDetector._log_evidence`).
+_N, _BLOCK, _TIME, _BLOCK_BEGIN, _EVIDENCE = range(5)
 
 
 class StepDetector(SavedAttributes):
@@ -78,7 +79,8 @@ class StepDetector(SavedAttributes):
     - `_log_weights`: log probability of each q,
     - `_log_variances`: sum of log S over all innovations,
     - `_sums` (5, q, j): rows `_FOLLOWED` to `_LOG_PRIOR` for each onset j,
-    - `_onsets` (j, 4): columns `_N` to `_BLOCK_BEGIN` for each onset,
+    - `_onsets` (j, 5): columns `_N` to `_EVIDENCE` for each onset,
+    - `_log_evidence`: log probability density of all innovations since `forget` without a step, where q may change,
     - `_unit`: standard deviation of the first block, the unit in which estimates are stored,
     - `_blocks`: number of blocks,
     - `_end`: end of the last block [s], minus infinity after `forget`.
@@ -86,7 +88,7 @@ class StepDetector(SavedAttributes):
 
     SAVED = (
         *("_level", "_level_variance", "_squares", "_log_weights", "_log_variances", "_sums", "_onsets"),
-        *("_unit", "_count", "_blocks", "_end"),
+        *("_unit", "_count", "_blocks", "_end", "_log_evidence"),
     )
 
     def __init__(self) -> None:
@@ -97,8 +99,8 @@ class StepDetector(SavedAttributes):
 
     def forget(self) -> None:
         """Drop the evidence of all blocks so far, and keep the learned noise and random walk."""
-        self._end = -np.inf
-        self._sums, self._onsets = np.zeros((_N_ROWS, len(WALKS), 0)), np.zeros((0, 4))
+        self._end, self._log_evidence = -np.inf, 0.0
+        self._sums, self._onsets = np.zeros((_N_ROWS, len(WALKS), 0)), np.zeros((0, _EVIDENCE + 1))
 
     def is_representable(self, g: float, deviation: float) -> bool:
         """Return True if an estimate `g` and its standard `deviation` > 0 can be squared without overflow."""
@@ -121,13 +123,15 @@ class StepDetector(SavedAttributes):
         level_variance = self._level_variance + WALKS * max(elapsed_blocks, 1.0)  # 1: should blocks overlap
         e, S = g - self._level, level_variance + variance  # innovation and its variance
         gain = level_variance / S
+        square = e**2 / S
         may_begin = self._count >= _N_WARM
         if may_begin:
-            self._add_onsets(begin, end)
+            log_prior = self._log_walk_prior()
+            self._add_onsets(begin, end, log_prior)
+            self._log_evidence += float(np.logaddexp.reduce((log_prior + self._log_density(S, square)).ravel()))
         f = 1.0 - self._sums[_FOLLOWED]
         if may_begin:  # a step that begins in this block (the last onsets) acts in a part of the block
             f[:, -len(PARTS) :] = PARTS
-        square = e**2 / S
         self._sums[_FOLLOWED] += gain * f
         self._sums[_A] += f / S * e
         self._sums[_B] += f / S * f
@@ -154,17 +158,35 @@ class StepDetector(SavedAttributes):
         self._count = MEMORY * self._count + 1.0
         self._log_variances = self._log_variances + np.log(variance)
 
-    def _add_onsets(self, begin: float, end: float) -> None:
-        """Add possible onsets of a step, one for each of `PARTS`, in the block from `begin` to `end` [s]."""
-        # the random walk's variance may change at each block; after a change all `WALKS` are equally likely
-        log_prior = np.logaddexp(np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS)))
+    def _log_walk_prior(self) -> Array:
+        """Compute log pi (q, 1) for the next block: the walk may change, and then all `WALKS` are equally likely."""
+        stays, changes = np.log1p(-_PRIORS.changes) + self._log_weights, np.log(_PRIORS.changes / len(WALKS))
+        return np.asarray(np.logaddexp(stays, changes))
+
+    def _log_density(self, variance: Array, square: Array) -> Array:
+        """Compute the log density (q, 1) of a block's innovation given the earlier ones, Student's t with n = `_count`.
+
+        `variance` (q, 1) is S and `square` (q, 1) is e^2 / S.
+        """
+        n = self._count
+        scale = _log_normalisation(n + 1.0) - _log_normalisation(n)
+        return np.asarray(
+            scale - 0.5 * np.log(variance * self._squares) - 0.5 * (n + 1.0) * np.log1p(square / self._squares)
+        )
+
+    def _add_onsets(self, begin: float, end: float, log_prior: Array) -> None:
+        """Add possible onsets of a step, one for each of `PARTS`, in the block from `begin` to `end` [s].
+
+        `log_prior` (q, 1) is log pi_j.
+        """
         # T begins with its value before the onset; the log likelihood until then is subtracted from the log prior, so
         # that only later innovations count in `_log_likelihoods`
         sums = np.zeros((_N_ROWS, len(WALKS), len(PARTS)))
         sums[_T] = self._squares
         sums[_LOG_PRIOR] = log_prior + 0.5 * (self._count * np.log(self._squares) + self._log_variances)
-        # number of innovations so far, number of the block, onset [s], and beginning of the block [s]
-        onsets = np.array([[self._count, self._blocks, end - part * (end - begin), begin] for part in PARTS])
+        onsets = np.array(
+            [[self._count, self._blocks, end - part * (end - begin), begin, self._log_evidence] for part in PARTS]
+        )
         self._sums = np.concatenate([self._sums, sums], axis=2)
         self._onsets = np.concatenate([self._onsets, onsets])
         if self._blocks % _SELECT_EVERY == 0:
@@ -213,11 +235,16 @@ class StepDetector(SavedAttributes):
         return np.asarray(np.where(self._sums[_A] > 0.0, self._step_log_ratios(), -np.inf) + likelihoods - total)
 
     def rise(self) -> LiveRise:
-        """Estimate the onset [s] and the size of a rise, as posterior means over `SIZES`, `WALKS` and onsets."""
-        terms = self._log_terms()
-        log_evidence = float(np.logaddexp.reduce(terms.ravel()))
-        weights = np.exp(terms - log_evidence)  # posterior probabilities (v, q, j)
+        """Estimate the onset [s] and the size of a rise, as posterior means over `SIZES`, `WALKS` and onsets.
+
+        Onset j has the likelihood of all innovations: that of those before j without a step (`_log_evidence`), and that
+        of the others with a step. The terms of M cannot be compared between onsets, as their denominators differ.
+        """
         a, b, T = self._sums[_A : _T + 1]
+        n, n_since = self._onsets[:, _N], self._blocks - self._onsets[:, _BLOCK] + 1.0
+        log_before = self._onsets[:, _EVIDENCE] + _log_normalisation(n) - _log_normalisation(n - n_since)
+        log_weights = np.where(a > 0.0, self._step_log_ratios(), -np.inf) + self._log_likelihoods() + log_before
+        weights = np.exp(log_weights - np.logaddexp.reduce(log_weights.ravel()))  # posterior probabilities (v, q, j)
         # mean and variance of the size's posterior, Student's t, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
         sizes = a / precision
@@ -237,7 +264,7 @@ class StepDetector(SavedAttributes):
         interval = Interval(
             float(onset_probabilities @ times), float(earliest) - resolution, float(latest) + resolution
         )
-        return LiveRise(STEP, 2.0 * log_evidence, interval, self._unit * size, self._unit * deviation)
+        return LiveRise(STEP, 2.0 * self.log_e(), interval, self._unit * size, self._unit * deviation)
 
     def bound(self) -> float:
         """Compute the 95 % upper bound of an undetected rise of the coefficient, in the coefficient's unit.
@@ -275,13 +302,20 @@ class StepDetector(SavedAttributes):
             raise InputError(f"saved state's onsets must be {len(self._onsets)}, got {self._sums.shape[2]}")
 
 
+def _log_normalisation(n: Any) -> Any:
+    """Compute log Gamma(n/2) - n/2 log(pi): its difference between two n is the log factor of Student's t."""
+    from scipy.special import gammaln
+
+    return gammaln(0.5 * n) - 0.5 * n * np.log(np.pi)
+
+
 def _select_onsets(block: int, onsets: Array) -> NDArray[np.bool_]:
     """Select the possible onsets of a step to keep, as flags (j,): all of the last `RECENT` blocks, and fewer of older.
 
     Older onsets are kept only at the start of a block, on a grid of blocks that becomes coarser with age, up to the age
-    `HORIZON`. `block` is the present block's number; `onsets` (j, 4) is as in `StepDetector`.
+    `HORIZON`. `block` is the present block's number; `onsets` (j, 5) is as in `StepDetector`.
     """
-    _, onset_block, time, block_begin = onsets.T
+    _, onset_block, time, block_begin, _ = onsets.T
     age = block - onset_block
     n_doublings = np.ceil(np.log2(np.maximum(age / RECENT, 1.0)))
     spacing = 2.0 * 2.0**n_doublings  # blocks; RECENT/4 onsets in each doubling of age

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 #: Name of the watch as a detector (`Evidence.detector`).
 WATCH = "watch"
 #: Version of the format of the saved state.
-STATE_VERSION = 20
+STATE_VERSION = 21
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
@@ -212,8 +212,8 @@ class Watch:
         """Describe the detected leak or, without one, the present score and the bound of the test for a step.
 
         The score is limited to just below the threshold, which a healthy machine exceeds with the `probability`. Flows
-        are those of a laminar leak, conductance times mean pressure; `flow_factors` are the ratios of the smallest and
-        the largest possible flow to these.
+        are those of a laminar leak, conductance times mean pressure, and for a leak to the outside usually more;
+        `flow_factors` are the ratios of the smallest and the largest possible flow to these.
         """
         leak, estimator = self.leak, self._used_estimator
         if leak is not None:  # the verdict on a detected leak uses neither a bound nor the pump's flow
@@ -226,7 +226,9 @@ class Watch:
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
             max_flow = estimator.max_law_ratio * self._detector.bound() * pressure
             bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
-        flow = Estimate(test.size * pressure, test.deviation * pressure)  # mean increase of the leakage
+        least, usual, most = self._flow_ratios()
+        # mean increase of the leakage
+        flow = Estimate(usual * test.size * pressure, usual * test.deviation * pressure)
         return LeakMeasure(
             provider=WATCH,
             cause=cause,
@@ -236,12 +238,19 @@ class Watch:
             rise_flow=flow,
             rise_onset=test.interval,
             flow_per_conductance=pressure,
-            flow_factors=(estimator.min_internal_fraction, estimator.max_law_ratio),
+            flow_factors=(least / usual, most / usual),
             bound_flow=bound,
             pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
             lpm_per_flow=1.0 / LITRE_PER_MINUTE if self._states_litres else None,
             size_deviation=estimator.size_error,
         )
+
+    def _flow_ratios(self) -> tuple[float, float, float]:
+        """Return the smallest, usual and largest ratio of a leak's flow to the increase of the estimated leakage."""
+        if self.leak is not None and self.leak.cause == OUTSIDE:
+            return _PRIORS.outside
+        estimator = self._used_estimator
+        return estimator.min_internal_fraction, 1.0, estimator.max_law_ratio
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Process the next samples; the estimates do not depend on how the samples are divided into calls.
@@ -394,13 +403,16 @@ class Watch:
     def _test_step(self, block: BlockConductance) -> bool:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak. While the
-        baseline is learned, the evidence of a step in the healthy machine is stored in `_null`. Returns True if a step
-        was found that a leak does not explain, or that cannot be explained yet.
+        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak, which may
+        turn out to be one to the outside. While the baseline is learned, the evidence of a step in the healthy
+        machine is stored in `_null`. Returns True if a step was found that a leak does not explain, or that cannot be
+        explained yet.
         """
         leak = self.leak
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
+        if leak is not None and leak.cause != OUTSIDE:
+            leak = self._look_outside(leak, block)
         log_threshold = self._null.log_threshold(self._false_alarm_probability(STEP, block.end - block.begin))
         min_log_e = log_threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
         is_learning = leak is None and self.baseline is None
@@ -411,7 +423,6 @@ class Watch:
                 self._null.add(log_e)
             return False
         rise = self._detector.rise()
-        cause = None if leak is None else leak.cause
         if leak is None:
             explanation = self._explain(rise, block)
             if not explanation.is_leak:
@@ -420,9 +431,32 @@ class Watch:
                     self._null.add(log_e)
                 return True
             cause = OUTSIDE if explanation.is_outside else None
+        else:
+            cause = leak.cause
         reason = f"the leakage conductance rises at {clock_text(rise.interval.value)} beyond its random walk"
         self._raise_leak(rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
         return False
+
+    def _look_outside(self, leak: WatchedLeak, block: BlockConductance) -> WatchedLeak:
+        """Give the detected `leak` the cause `OUTSIDE` if the blocks up to `block` show it, once with the last of them.
+
+        These are the `outside` blocks since its onset (`priors.toml`).
+        """
+        if self._count_since(leak.estimate.interval) == _EXPLANATION.outside:
+            explanation = self._weigh_events(leak.estimate.interval, block, is_settled=True)
+            if explanation is not None and explanation.is_outside:
+                self.leak = leak = self._with_flow(replace(leak, cause=OUTSIDE))
+        return leak
+
+    def _count_since(self, onset: Interval) -> int:
+        """Return the number of stored blocks that end after the latest time of an onset."""
+        return int(np.count_nonzero(self._compared["end"] > onset.high))
+
+    def _weigh_events(self, onset: Interval, block: BlockConductance, *, is_settled: bool) -> RiseExplanation | None:
+        """Find the cause of a rise at `onset` by the blocks up to `block`; None if they are no longer stored."""
+        with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
+            observables = self._used_estimator.observables(self._since, block.end, onset.value)
+        return None if observables is None else explain_rise(observables, self._used_estimator.data, onset, is_settled)
 
     def _explain(self, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
@@ -432,19 +466,17 @@ class Watch:
         If other events explain the rise and enough blocks have followed, the tests restart and the estimator learns
         anew.
         """
-        n_since = int(np.count_nonzero(self._compared["end"] > rise.interval.high))  # blocks since the onset
+        n_since = self._count_since(rise.interval)
         if n_since < _EXPLANATION.shows:
             return UNKNOWN
         if rise.interval.value < self._since + _EXPLANATION.start * (block.end - block.begin):
             self._samples.count("changes that are no leak: a start")
             self._forget()
             return UNKNOWN
-        with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
-            observables = self._used_estimator.observables(self._since, block.end, rise.interval.value)
-        if observables is None:
-            return RiseExplanation(is_leak=True)
         is_settled = n_since >= _EXPLANATION.settles
-        explanation = explain_rise(observables, self._used_estimator.data, rise.interval, is_settled)
+        explanation = self._weigh_events(rise.interval, block, is_settled=is_settled)
+        if explanation is None:
+            return RiseExplanation(is_leak=True)
         if explanation.other_events and is_settled:
             self._samples.count(f"changes that are no leak: {explanation.other_events}")
             self._used_estimator.relearn(rise.interval.high)
@@ -455,7 +487,8 @@ class Watch:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
         The blocks are weighted by their precisions. The mean is compared with the baseline or, before there is one,
-        with healthy recordings if the estimator states levels. Without either, nothing is tested.
+        with healthy recordings if the estimator states levels. Without either, nothing is tested. An error of the
+        machine's sizes scales both alike, and does not count.
         """
         healthy: HealthyLevel | None = self.baseline
         if healthy is None and self._used_estimator.states_level:
@@ -528,8 +561,13 @@ class Watch:
             score=rise.score,
             threshold=threshold,
         )
-        evidence = self.evidence  # states the flow of the new `self.leak`
-        self.leak = replace(self.leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
+        self.leak = self._with_flow(self.leak)
+
+    def _with_flow(self, leak: WatchedLeak) -> WatchedLeak:
+        """Compute the flow of a detected leak from its rise and cause."""
+        self.leak = leak  # `evidence` states its flow
+        evidence = self.evidence
+        return replace(leak, leak_lpm=evidence.leak_lpm, leak_interval_lpm=evidence.leak_interval_lpm)
 
     def _blocks_of_leak(self, leak: WatchedLeak) -> NDArray[Any]:
         """Return the stored blocks that begin after the latest possible onset of the leak; if none, the last block."""
@@ -549,12 +587,11 @@ class Watch:
     def _add_flows(self, estimate: BlockEstimate, blocks: NDArray[Any]) -> BlockEstimate:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
-        `blocks` (n,) have the fields of `BlockConductance`; `offset` includes the errors of the machine's sizes. The
-        leak is the flow above that of the baseline or, after an alarm, above that before the onset. It is left out if
-        there is neither a baseline nor an alarm. The total is left out if the estimator states only changes, and both
-        flows are left out without L/min. The limits of the leak are those above the highest and the lowest reference
-        level, minus and plus a half-width, times the smallest and the largest ratio of a true to the estimated leak;
-        both at least 0.
+        `blocks` (n,) have the fields of `BlockConductance`. The leak is the flow above that of the baseline or, after
+        an alarm, above that before the onset. It is left out if there is neither a baseline nor an alarm. The total is
+        left out if the estimator states only changes, and both flows are left out without L/min. The limits of the leak
+        are those above the highest and the lowest reference level, minus and plus a half-width, times the smallest and
+        the largest ratio of a true to the estimated leak; both at least 0.
         """
         if not self._states_litres:
             return estimate
@@ -565,22 +602,23 @@ class Watch:
         errors = blocks["sd"] * lpm * math.sqrt(self._detector.noise)
         if estimator.states_level:
             total = mean_flow(blocks["total"] * lpm, errors)
-            half_width = WITHIN_95 * math.hypot(total.deviation, float(np.mean(blocks["offset"] * lpm)))
+            offset = float(np.mean(blocks["offset"] * lpm))
+            half_width = WITHIN_95 * math.hypot(total.deviation, offset, estimator.size_error * total.value)
             interval = max(0.0, total.value - half_width), max(0.0, total.value + half_width)
             estimate = replace(estimate, total_lpm=total.value, total_interval_lpm=interval)
         if self.leak is not None:
             reference, reference_sd = level_before_leak(self.leak, estimate.t), self.leak.rise_sd
-            min_fraction = estimator.min_internal_fraction  # the rest may flow to the outside
+            least, usual, most = self._flow_ratios()
         elif self.baseline is not None:
             reference = Interval(self.baseline.level, self.baseline.low, self.baseline.high)
-            reference_sd, min_fraction = 0.0, 1.0
+            reference_sd, least, usual, most = 0.0, 1.0, 1.0, estimator.max_law_ratio
         else:
             return estimate
         leak = mean_flow((blocks["g"] - reference.value) * lpm, errors)
         half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
-        low = min_fraction * (leak.value + (reference.value - reference.high) * mean_lpm - half_width)
-        high = estimator.max_law_ratio * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
-        return replace(estimate, leak_lpm=leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
+        low = least * (leak.value + (reference.value - reference.high) * mean_lpm - half_width)
+        high = most * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
+        return replace(estimate, leak_lpm=usual * leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))
 
     def state(self) -> dict[str, Any]:
         """Return the state of the watch as plain values for JSON, for `from_state`."""

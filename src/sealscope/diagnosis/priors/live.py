@@ -52,6 +52,8 @@ class WatchPriors(PriorTable):
     pause: float  # [s] longest pause across which blocks are compared
     margin: float  # pressure and flow may exceed the range of the baseline by this logarithm
     damped: float  # the pressure may fall below the range by this logarithm, as a leak lowers it
+    # least, usual and largest ratio of what a leak to the outside loses to what the volume balance shows of it
+    outside: tuple[float, float, float]
     inside: float  # smallest part of a leak inside the actuator, over its flow as estimated from the pressures
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
@@ -75,6 +77,7 @@ class RiseExplanationPriors(PriorTable):
     rare: float  # largest p-value (probability in a healthy machine) of a change that shows in the blocks
     start: int  # [blocks] time after a pause within which an increase is due to the start of the machine
     settles: int  # number of blocks since the onset after which the explanation is final
+    outside: int  # [blocks] number since the onset after which a leak may turn out to be one to the outside
 
 
 class LiveResponse(PriorTable):
