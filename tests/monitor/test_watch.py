@@ -205,9 +205,9 @@ def test_a_level_is_stated_with_what_warm_oil_may_have_of_it():
     assert find_level_rise(baseline, onset, 3.9e-13, 1e-15, 1e-6) is None
     # oil that warmed scatters the groups of blocks, but not successive ones
     warmed = replace(baseline, deviation=1.5e-13, short_term_deviation=1e-15)
-    assert find_level_rise(warmed, onset, 4.5e-13, 1e-15, 1e-6) is not None
-    assert find_level_rise(replace(warmed, short_term_deviation=1e-13), onset, 4.5e-13, 1e-15, 1e-6) is None
-    assert find_level_rise(replace(warmed, high=6e-13), onset, 4.5e-13, 1e-15, 1e-6) is None
+    assert find_level_rise(warmed, onset, 6.5e-13, 1e-15, 1e-6) is not None
+    assert find_level_rise(replace(warmed, short_term_deviation=1e-13), onset, 6.5e-13, 1e-15, 1e-6) is None
+    assert find_level_rise(replace(warmed, high=6e-13), onset, 6.5e-13, 1e-15, 1e-6) is None
 
 
 def test_a_leak_to_the_outside_is_stated_as_what_leaves_its_chamber():

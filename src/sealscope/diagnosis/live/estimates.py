@@ -203,11 +203,13 @@ def find_level_rise(
 def _unexplained_scatter(baseline: WatchBaseline, max_healthy: float) -> float:
     """Compute the scatter of the ceiling `max_healthy` that no oil explains [m^3/(s Pa)].
 
-    Oil explains slow changes between the lowest group of blocks of the `baseline` and `max_healthy`, but neither what
-    differs between successive groups, an error of the lowest group, nor higher groups.
+    Oil explains slow changes between the lowest group of blocks of the `baseline` and `max_healthy`. It explains
+    neither differences of successive groups, an error of the lowest group, nor higher groups, nor what the leakage of a
+    healthy pump differs by from day to day.
     """
     excess = max(baseline.high - max_healthy, 0.0)
-    return math.hypot(INFERENCE.oil.warmest * baseline.short_term_deviation, excess)
+    daily = INFERENCE.held_oil.pump_session * max_healthy
+    return math.hypot(INFERENCE.oil.warmest * baseline.short_term_deviation, excess, daily)
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
