@@ -150,9 +150,9 @@ class WatchBaseline(HealthyLevel):
         The mean conductance `level` as a flow at the mean pressure difference [L/min], None if it cannot be stated.
     duty_low, duty_high : Duty
         Minimum and maximum over the blocks, of either quantity.
-    short_term_deviation : float
+    short_term_deviation : float or None
         Standard deviation of a group of blocks, by the differences of successive groups [m^3/(s Pa)]. Oil that warms
-        adds to `deviation`, but hardly to this.
+        adds to `deviation`, but hardly to this. None if errors of the estimates change slowly as well.
     """
 
     version: int
@@ -160,7 +160,7 @@ class WatchBaseline(HealthyLevel):
     lpm: float | None
     duty_low: Duty
     duty_high: Duty
-    short_term_deviation: float
+    short_term_deviation: float | None
 
 
 def find_level_rise(
@@ -187,8 +187,8 @@ def find_level_rise(
     degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal
     rise = Rise(g - healthy.level, deviation=math.sqrt(variance), degrees_of_freedom=degrees_of_freedom)
     scatter_chance = rise.chance
-    if isinstance(healthy, WatchBaseline):
-        unexplained = math.hypot(deviation, _unexplained_scatter(healthy, max_healthy))
+    if isinstance(healthy, WatchBaseline) and healthy.short_term_deviation is not None:
+        unexplained = math.hypot(deviation, _unexplained_scatter(healthy, healthy.short_term_deviation, max_healthy))
         scatter_chance = min(scatter_chance, float(ndtr((max_healthy - g) / unexplained)))
     chance = max(float(ndtr((max_healthy - g) / deviation)), scatter_chance)
     if chance >= probability:
@@ -200,16 +200,16 @@ def find_level_rise(
     return LiveRise(LEVEL, score, onset, size, deviation=math.hypot(deviation, healthy_sd))
 
 
-def _unexplained_scatter(baseline: WatchBaseline, max_healthy: float) -> float:
+def _unexplained_scatter(healthy: HealthyLevel, short_term_deviation: float, max_healthy: float) -> float:
     """Compute the scatter of the ceiling `max_healthy` that no oil explains [m^3/(s Pa)].
 
-    Oil explains slow changes between the lowest group of blocks of the `baseline` and `max_healthy`. It explains
-    neither differences of successive groups, an error of the lowest group, nor higher groups, nor what the leakage of a
-    healthy pump differs by from day to day.
+    Oil explains slow changes between the lowest `healthy` group of blocks and `max_healthy`. It explains neither the
+    differences of successive groups, which the lowest group has as an error, nor higher groups, nor the day-to-day
+    differences of a pump's leakage.
     """
-    excess = max(baseline.high - max_healthy, 0.0)
+    excess = max(healthy.high - max_healthy, 0.0)
     daily = INFERENCE.held_oil.pump_session * max_healthy
-    return math.hypot(INFERENCE.oil.warmest * baseline.short_term_deviation, excess, daily)
+    return math.hypot(INFERENCE.oil.warmest * short_term_deviation, excess, daily)
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
@@ -291,16 +291,22 @@ class BaselineLearning:
             self.mean += difference / self.count
             self.squares += difference * (mean - self.mean)
 
-    def freeze(self, version: int, end: float, hours: float, *, states_lpm: bool) -> WatchBaseline:
-        """Compute the baseline from the sums over at least `GROUP` blocks, the last of which ends at `end` [s]."""
+    def freeze(
+        self, version: int, end: float, hours: float, *, states_level: bool, states_litres: bool
+    ) -> WatchBaseline:
+        """Compute the baseline from the sums over at least `GROUP` blocks, the last of which ends at `end` [s].
+
+        `states_level`: true if the estimates have no errors that change slowly; `states_litres`: flows are in L/min.
+        """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
-        lpm = level * (self.flow / self.blocks) if states_lpm else None
+        lpm = level * (self.flow / self.blocks) if states_level and states_litres else None
         # standard deviation between the `count` groups of blocks
-        deviation, short_term = 0.0, 0.0
+        deviation, short_term = 0.0, None
         if self.count > 1:
             deviation = math.sqrt(self.squares / (self.count - 1))
-            short_term = math.sqrt(0.5 * self.square_differences / (self.count - 1))  # J. von Neumann's estimate
+            if states_level:
+                short_term = math.sqrt(0.5 * self.square_differences / (self.count - 1))  # J. von Neumann's estimate
         healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)
         return WatchBaseline(
             **vars(healthy),

@@ -396,8 +396,8 @@ class Watch:
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
-            states_lpm = self._states_litres and self._used_estimator.states_level
-            self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, states_lpm=states_lpm)
+            stated = {"states_level": self._used_estimator.states_level, "states_litres": self._states_litres}
+            self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, **stated)
             self._learning = BaselineLearning()
 
     def _test_step(self, block: BlockConductance) -> bool:
