@@ -68,7 +68,7 @@ class PressureEstimator(SavedAttributes):
     min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
-    SAVED = ("_samples", "_held", "_end", "_has_paused", "_settling", "_misfits", "_rows", "_signals")
+    SAVED = ("_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -76,7 +76,6 @@ class PressureEstimator(SavedAttributes):
         self._follower: Follower | None = None
         self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan if not stuck
         self._end = math.nan  # end of the last block to which the model was fitted [s]
-        self._has_paused = False  # True if a long pause precedes the samples, so that the model is fitted anew
         self._settling = _SETTLING  # number of next blocks in which the simulated states still depend on their start
         self._misfits = 0  # number of successive blocks that the model does not describe
         self._rows = np.empty((0, 0))  # one row per block: sums from which the leakage of the last blocks is estimated
@@ -91,46 +90,37 @@ class PressureEstimator(SavedAttributes):
         """Process the next samples, and yield the result of each block that they complete.
 
         Before the first block, after a long pause and once the fit was lost, the model is fitted to `response.begins`
-        (`priors.toml`) seconds of samples, from several starts: the filter alone may settle in a wrong minimum. If
-        these samples cannot be used, the reason is yielded, and the fit is tried again with their second half and as
-        many new ones. Samples before a gap that do not fill a block are dropped.
+        (`priors.toml`) seconds of samples, from several starts: the filter alone, which may have wandered along with
+        the oil, would stay in a wrong minimum. If these samples cannot be used, the reason is yielded, and the fit is
+        tried again with their second half and as many new ones. Samples before a gap that do not fill a block are
+        dropped.
         """
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
             self._samples = self._samples[:, :0]
-            self._has_paused = not self._is_short_gap(float(run.t[0]) - self._end, run.rate)
+            if not self._is_short_gap(float(run.t[0]) - self._end, run.rate):
+                self._follower = None
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
         # numbers of samples: for the first fit, and in a block
         n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
         is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
-        while (self._follower is None or self._has_paused) and not is_slow and samples.shape[1] >= n_first:
-            beginning = _make_recording(samples[:, :n_first], run.rate)
-            if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
-                samples = samples[:, n_first // 2 :]
-                counter = f"half minutes before the first block: {reason}"  # half of a minute, `response.begins`
-                yield NotJudged(float(run.t[-1]), status="", counter=counter)
+        while samples.shape[1] >= (n_first if self._follower is None and not is_slow else n_block):
+            if self._follower is None and not is_slow:
+                beginning = _make_recording(samples[:, :n_first], run.rate)
+                if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
+                    samples = samples[:, n_first // 2 :]
+                    counter = f"half minutes before the first block: {reason}"  # half of a minute, `response.begins`
+                    yield NotJudged(float(run.t[-1]), status="", counter=counter)
+                else:
+                    self._follower = Follower.fit_start(beginning, self._rig)
+                    self._end, self._settling = float(beginning.t[0]), _SETTLING
+            elif self._remove_holds(samples, n_block, run.rate):
+                block = _make_recording(samples[:, :n_block], run.rate)
+                samples = samples[:, n_block:]
+                yield self._estimate_block(block)
             else:
-                self._start(beginning)
-        while ((self._follower is not None and not self._has_paused) or is_slow) and samples.shape[1] >= n_block:
-            if not self._remove_holds(samples, n_block, run.rate):
                 break
-            block = _make_recording(samples[:, :n_block], run.rate)
-            samples = samples[:, n_block:]
-            yield self._estimate_block(block)
         self._samples = samples.copy()
-
-    def _start(self, beginning: Recording) -> None:
-        """Fit the model to the first samples, or to the `beginning` after a pause, of a machine that is known by then.
-
-        The filter continues with the priors of the rig, by which jumps of the parameters are judged.
-        """
-        earlier = self._follower
-        if earlier is None:
-            self._follower = Follower.fit_start(beginning, self._rig)
-        else:
-            self._follower = Follower.fit_start(beginning, self._rig, earlier.machine_after_pause())
-            self._follower.priors = earlier.priors
-        self._end, self._settling, self._has_paused = float(beginning.t[0]), _SETTLING, False
 
     def _remove_holds(self, samples: Array, n_block: int, rate: float) -> bool:
         """Set stuck pressure readings in the first `n_block` columns of `samples` (time, p_A, p_B, command) to nan.
@@ -184,14 +174,14 @@ class PressureEstimator(SavedAttributes):
         """
         self._misfits += 1
         if self._misfits >= _PRIORS.lost or not np.isfinite(follower.theta).all():
-            self._follower, self._misfits, self._settling = None, 0, _SETTLING
+            self._follower, self._misfits = None, 0
             return NotJudged.with_count(end, "not described by the model", restarts=True)
         self._settling = self._settling if is_settling else _RESUMING
         status = "settling" if is_settling else "not described by the model"
         return NotJudged.with_count(end, status, restarts=restarts)
 
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
-        """Prepare the fit for a block that follows after a `gap` [s], or with another sampling `rate` [Hz].
+        """Prepare the fit for a block that follows after a short `gap` [s], or with another sampling `rate` [Hz].
 
         Returns the fit to use, and True if this and later blocks cannot be compared with earlier ones.
         """
@@ -200,14 +190,13 @@ class PressureEstimator(SavedAttributes):
             follower = follower.at_rate(self._rig, rate)
         elif abs(gap) < 0.5 / rate:
             return follower, False
-        is_short = self._is_short_gap(gap, rate)
-        follower.interrupt(max(gap, 0.0) if is_short else math.inf)
-        self._settling = max(self._settling, _RESUMING if is_short else _SETTLING)
-        return follower, has_other_rate or not is_short
+        follower.interrupt(max(gap, 0.0))
+        self._settling = max(self._settling, _RESUMING)
+        return follower, has_other_rate
 
     @staticmethod
     def _is_short_gap(gap: float, rate: float) -> bool:
-        """Return True if the fit continues after a `gap` [s] between samples; nan, before the first block, is long."""
+        """Return True if the fit continues after a `gap` [s] between samples, False for nan, before the first block."""
         return -1.0 / rate <= gap <= _PAUSE  # a rounded clock may be set back by a sample
 
     def _follow(self, follower: Follower, block: Recording, is_settling: bool) -> bool:

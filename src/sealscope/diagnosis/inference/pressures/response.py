@@ -405,19 +405,6 @@ class Follower:
         self.covariance = self.covariance + np.diag(added_variance)
         self.last = math.nan
 
-    def machine_after_pause(self) -> KnownMachine:
-        """Return what the filter knows of the machine at the next start: all but the leakage, as of another recording.
-
-        Parameters differ from the present ones with the standard deviations `between` of the priors. The conductance
-        has its own prior again.
-        """
-        is_kept = np.arange(len(self.theta)) != G
-        covariance = np.where(np.outer(is_kept, is_kept), self.covariance, 0.0)
-        added = np.where(is_kept, self.priors.between / self.priors.unit, np.sqrt(self.priors.variance)) ** 2
-        centre = np.where(is_kept, self.theta, self.priors.centre)
-        priors = replace(self.priors, centre=centre, covariance=covariance + np.diag(added))
-        return KnownMachine(self.machine.law, priors)
-
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit; at the start or after a gap, change `last` and `states`.
 
