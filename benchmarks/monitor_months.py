@@ -28,7 +28,6 @@ over all rows with the same settings is printed. Rows of other sources (`source`
 from __future__ import annotations
 
 import argparse
-import csv
 import math
 import time
 from collections import Counter
@@ -36,10 +35,10 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import gammaincinv
+from stored_rows import StoredRows
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.compiled import source_hash
 from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.joining import SampleRun
@@ -59,7 +58,7 @@ OUTSIDE_S = 1200.0
 CHARGES, NOISES = (0.24, 0.3, 0.36), (1.0, 1.6)
 NOISE_PSI = {"p_A": 0.92829, "p_B": 1.26445}
 COLUMNS = (
-    *("source", "seed", "actuator", "rate", "days", "minutes_a_day", "kind"),
+    *("seed", "actuator", "kind"),
     *("operating_hours", "false_alarms", "by_test", "delay_h", "delay_watched_h", "test", "cause"),
     *("true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm"),
 )
@@ -258,17 +257,11 @@ def main() -> None:
     parser.add_argument("--stop-after", type=float, default=8.0, help="no actuator is begun after so many minutes")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    source = source_hash(Path(ss.__file__).parent)
-    same: dict[str, float | str] = {
-        "source": source,
-        "rate": chosen.rate,
-        "days": chosen.days,
-        "minutes_a_day": chosen.minutes_a_day,
-    }
-    keep_rows_of(source)
+    settings = {"rate": chosen.rate, "days": chosen.days, "minutes_a_day": chosen.minutes_a_day}
+    stored = StoredRows(RESULTS, COLUMNS, **settings)
     with threadpool_limits(limits=1):
-        watch_all(chosen, same)
-    rows = [row for row in rows_of_results() if is_same(row, same)]
+        watch_all(chosen, stored)
+    rows = stored.select()
     hours = sum(float(row["operating_hours"]) for row in rows)
     false = sum(int(row["false_alarms"]) for row in rows)
     low = float(gammaincinv(false, 0.025)) if false else 0.0
@@ -279,30 +272,9 @@ def main() -> None:
     )
 
 
-def keep_rows_of(source: str) -> None:
-    """Drop the rows of other sources."""
-    rows = [row for row in rows_of_results() if row.get("source") == source] if RESULTS.exists() else []
-    with RESULTS.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-
-
-def is_same(row: dict[str, str], settings: dict[str, float | str]) -> bool:
-    """Return whether a row has these settings."""
-    return all(row[name] == str(value) for name, value in settings.items())
-
-
-def rows_of_results() -> list[dict[str, str]]:
-    """Return the rows that are written."""
-    with RESULTS.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def watch_all(chosen: argparse.Namespace, same: dict[str, float | str]) -> None:
+def watch_all(chosen: argparse.Namespace, stored: StoredRows) -> None:
     """Watch the actuators that no row tells of yet."""
-    done = {(int(row["seed"]), int(row["actuator"])) for row in rows_of_results() if is_same(row, same)}
-    left = [number for number in range(chosen.actuators) if (chosen.seed, number) not in done]
+    left = [number for number in range(chosen.actuators) if not stored.select(seed=chosen.seed, actuator=number)]
     if not left:
         return
     began = time.monotonic()
@@ -310,15 +282,8 @@ def watch_all(chosen: argparse.Namespace, same: dict[str, float | str]) -> None:
     for number in left:
         if time.monotonic() - began > 60.0 * chosen.stop_after:
             break
-        row = {
-            "seed": chosen.seed,
-            "actuator": number,
-            **same,
-            **Life(recording, made, chosen, number).lived(),
-        }
-        with RESULTS.open("a", newline="") as file:
-            csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n").writerow(row)
-        print(row, flush=True)
+        life = Life(recording, made, chosen, number)
+        stored.add({"seed": chosen.seed, "actuator": number, **life.lived()})
 
 
 if __name__ == "__main__":

@@ -24,7 +24,6 @@ missing, and the sums over all rows are printed.
 from __future__ import annotations
 
 import argparse
-import csv
 import json
 import math
 import time
@@ -32,6 +31,7 @@ from pathlib import Path
 
 import numpy as np
 from scipy.special import gammaincinv
+from stored_rows import StoredRows
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
@@ -51,7 +51,7 @@ LEAKS = {
     GROWTH: {"leak": f"0.05 L/min growing from {ONSET_S} s to {ONSET_S + 3600.0} s"},
 }
 COLUMNS = (
-    *("seed", "machine", "command", "kind", "rate", "hours", "judged_hours", "false_alarms", "by_test", "delay_s"),
+    *("seed", "machine", "command", "kind", "rate", "judged_hours", "false_alarms", "by_test", "delay_s"),
     *("test", "true_lpm", "stated_lpm", "stated_low_lpm", "stated_high_lpm", "counters"),
 )
 PSI = 6894.757
@@ -165,7 +165,6 @@ def healthy(
     row = {
         "kind": "healthy",
         "rate": HEALTHY_RATE,
-        "hours": f"{pieces * seconds / 3600.0:g}",
         "judged_hours": f"{judged * watch.block_seconds / 3600.0:.2f}",
         "false_alarms": len(alarms),
         "by_test": " ".join(alarms),
@@ -174,12 +173,12 @@ def healthy(
     return row, state, then
 
 
-def leaking(state: str, machine: Machine, kind: str, hours: str) -> dict[str, object]:
+def leaking(state: str, machine: Machine, kind: str) -> dict[str, object]:
     """Return the row of a leak."""
     watch = ss.Watch.from_state(json.loads(state))
     duration = ONSET_S + (1800.0 if kind in SIZES else 3600.0)
     recording = machine.piece(duration, **LEAKS[kind])
-    row: dict[str, object] = {"kind": kind, "rate": LEAKING_RATE, "hours": hours, "false_alarms": 0}
+    row: dict[str, object] = {"kind": kind, "rate": LEAKING_RATE, "false_alarms": 0}
     onset = float(recording.t[0]) + ONSET_S
     for first in range(0, len(recording), 500):
         estimates = watch.update(recording.samples(slice(first, first + 500)))
@@ -197,19 +196,6 @@ def leaking(state: str, machine: Machine, kind: str, hours: str) -> dict[str, ob
     return {**row, "counters": json.dumps(watch.counters)}
 
 
-def rows_of_results() -> list[dict[str, str]]:
-    """Return the rows that are written."""
-    with RESULTS.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def write(row: dict[str, object]) -> None:
-    """Write a row."""
-    with RESULTS.open("a", newline="") as file:
-        csv.DictWriter(file, COLUMNS, restval="", lineterminator="\n").writerow(row)
-    print(row, flush=True)
-
-
 def main() -> None:
     """Watch, write rows, and print the sums."""
     import copy
@@ -222,36 +208,37 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--stop-after", type=float, default=20.0, help="no machine is begun after so many minutes")
     chosen = parser.parse_args()
-    if not RESULTS.exists():
-        RESULTS.write_text(",".join(COLUMNS) + "\n")
-    hours = f"{chosen.pieces * chosen.piece_minutes / 60.0:g}"
+    stored = StoredRows(
+        RESULTS,
+        COLUMNS,
+        pieces=chosen.pieces,
+        piece_minutes=chosen.piece_minutes,
+        learn_hours=chosen.learn_hours,
+    )
     began = time.monotonic()
     with threadpool_limits(limits=1):
         for number in range(chosen.machines):
-            same = (str(chosen.seed), str(number), hours)
-            if any((row["seed"], row["machine"], row["hours"]) == same for row in rows_of_results()):
+            if stored.select(seed=chosen.seed, machine=number):
                 continue
             if time.monotonic() - began > 60.0 * chosen.stop_after:
                 break
             machine = Machine(chosen.seed, number)
             place = {"seed": chosen.seed, "machine": number, "command": machine.command}
             row, state, then = healthy(machine, chosen.pieces, 60.0 * chosen.piece_minutes, chosen.learn_hours)
-            write({**place, **row})
-            for kind in LEAKS:
-                write({**place, **leaking(state, copy.deepcopy(then), kind, hours)})
-    summarise()
+            rows = [row, *(leaking(state, copy.deepcopy(then), kind) for kind in LEAKS)]
+            for row in rows:
+                stored.add({**place, **row})
+    summarise(stored.select(), chosen.pieces * chosen.piece_minutes / 60.0)
 
 
-def summarise() -> None:
-    """Print the sums."""
-    rows = rows_of_results()
+def summarise(rows: list[dict[str, str]], hours: float) -> None:
+    """Print the sums over machines of so many hours each."""
     mine = [row for row in rows if row["kind"] == "healthy"]
     judged, false = sum(float(row["judged_hours"]) for row in mine), sum(int(row["false_alarms"]) for row in mine)
     low = float(gammaincinv(false, 0.025)) if false else 0.0
     high = float(gammaincinv(false + 1, 0.975))
-    hours = sum(float(row["hours"]) for row in mine)
     print(
-        f"{len(mine)} machines, {hours:g} h, {judged:.1f} h judged: {false} false alarms, "
+        f"{len(mine)} machines, {len(mine) * hours:g} h, {judged:.1f} h judged: {false} false alarms, "
         f"{1000 * false / judged:.1f} per 1000 h (95 %: {1000 * low / judged:.1f} to {1000 * high / judged:.1f}), "
         f"stated {HEALTHY_RATE:g}"
     )
