@@ -45,6 +45,15 @@ def through(
     return happened
 
 
+def test_the_cause_of_an_alarm_follows_that_of_the_leak():
+    judge = AlarmJudge("a")
+    through(judge, [0.003, 0.003])
+    check = judge.alarm.next_check
+    through(judge, [0.003], replace(LEAK, cause="external leak"))
+    assert judge.alarm.cause == "external leak"
+    assert judge.alarm.next_check != check
+
+
 def test_one_block_is_no_alarm_two_are():
     judge = AlarmJudge("a")
     assert through(judge, [0.003, 0.001, 0.003, 0.001]) == []

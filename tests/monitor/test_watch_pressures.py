@@ -118,6 +118,24 @@ def test_a_short_gap_is_bridged_and_after_a_pause_nothing_before_counts(learned:
     assert watch.counters["gap"] == 2
 
 
+@pytest.mark.slow
+def test_a_leak_to_the_outside_is_stated_as_what_leaves_its_chamber():
+    """The response shows it as a leak past the piston of two to four times its flow."""
+    recording = ss.simulate(
+        command="3 sin(4t)",
+        duration=400.0,
+        seed=5,
+        set={"makeup.check_valves": "present", "p_charge": "0.3 MPa"},
+        fault="rod seal A 0.0042 L/min from 330 s",
+    )
+    watch = ss.watch("thesis", learn_hours=0.04)
+    estimate = watch.update(recording.only(("p_A", "p_B", "u")))[-1]
+    assert watch.leak.cause == "external leak"
+    leaves = 0.0042 * float(recording.between(330.0, 400.0)["p_A"].mean()) / 0.3e6
+    for low, high in (estimate.leak_interval_lpm, watch.leak.leak_interval_lpm):
+        assert low <= leaves <= high < 4.0 * leaves
+
+
 def test_another_duty_and_a_lost_machine_are_not_judged(learned: str):
     watch = Watch.from_state(json.loads(learned))
     half = part(500, 560)

@@ -141,7 +141,8 @@ class LiveBalance(SavedAttributes):
     method = "volumes"
     data = VOLUMES
     states_level = True
-    min_internal_fraction = max_law_ratio = 1.0  # the leak is surely internal, and its flow measured, whatever its law
+    min_law_ratio = max_law_ratio = 1.0  # the flow of a leak past the piston is measured, whatever its law
+    outside_ratios: tuple[float, float, float] = LIVE.watch.outside
     block_seconds = BLOCK_SECONDS
     has_begun = True
     SAVED = ("_precision", "_moving", "_waiting", "_n_meanings", "_rate", "_signals")

@@ -63,9 +63,11 @@ class PressureEstimator(SavedAttributes):
     states_level = False  # True if the level of the conductance is stated
     cause: Cause = "piston, pump or external leak"
     size_error = conductance_scale_error()  # relative standard error of changes of the conductance
-    # flow of a leak of any law over that of a laminar leak with the same estimated conductance, upper limit
+    # limits of the flow of any leak over that of a laminar one past the piston with the same estimated conductance
     max_law_ratio: float = HIGH_LAW_RATIO
-    min_internal_fraction: float = LIVE.watch.inside  # smallest fraction of an estimated leak inside the actuator
+    # least, usual and largest ratio of the flow of a leak to the outside to the estimated one
+    outside_ratios: tuple[float, float, float] = LIVE.watch.outside_by_pressures
+    min_law_ratio: float = outside_ratios[0]  # the leak may be one to the outside
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
     SAVED = ("_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")

@@ -247,10 +247,10 @@ class Watch:
 
     def _flow_ratios(self) -> tuple[float, float, float]:
         """Return the smallest, usual and largest ratio of a leak's flow to the increase of the estimated leakage."""
-        if self.leak is not None and self.leak.cause == OUTSIDE:
-            return _PRIORS.outside
         estimator = self._used_estimator
-        return estimator.min_internal_fraction, 1.0, estimator.max_law_ratio
+        if self.leak is not None and self.leak.cause == OUTSIDE:
+            return estimator.outside_ratios
+        return estimator.min_law_ratio, 1.0, estimator.max_law_ratio
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Process the next samples; the estimates do not depend on how the samples are divided into calls.

@@ -52,9 +52,10 @@ class WatchPriors(PriorTable):
     pause: float  # [s] longest pause across which blocks are compared
     margin: float  # pressure and flow may exceed the range of the baseline by this logarithm
     damped: float  # the pressure may fall below the range by this logarithm, as a leak lowers it
-    # least, usual and largest ratio of what a leak to the outside loses to what the volume balance shows of it
+    # least, usual and largest ratio of what a leak to the outside loses to what the volume balance, or the response of
+    # the pressures, shows of it
     outside: tuple[float, float, float]
-    inside: float  # smallest part of a leak inside the actuator, over its flow as estimated from the pressures
+    outside_by_pressures: tuple[float, float, float]
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
     step: float  # fraction of the false alarms for the test for a step
