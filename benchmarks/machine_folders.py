@@ -67,9 +67,9 @@ def judge(machine: Path, into: Path) -> None:
 
 def outcomes(machine: Path, verdicts: Path) -> Iterator[tuple[str, bool]]:
     """Yield rows of the table with True or False for each recording that counts in them."""
-    stated = {Path(v["file"]).name: v for v in map(json.loads, verdicts.read_text().splitlines())}
+    stated = {"/".join(Path(v["file"]).parts[-2:]): v for v in map(json.loads, verdicts.read_text().splitlines())}
     for name, truth in json.loads((machine / "truth.json").read_text())["files"].items():
-        verdict: dict[str, Any] | None = stated.get(Path(name).name)
+        verdict: dict[str, Any] | None = stated.get(name)
         if verdict is None:
             yield "recordings without a verdict", True
             continue

@@ -16,6 +16,7 @@ import shutil
 import tempfile
 from collections import defaultdict
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -53,15 +54,16 @@ class Monitor:
         return Monitor(folder, self._machine, self._rate)
 
     def watch(self, recording: ss.Recording, day: int) -> Alarm | None:
-        """Watch a recording as the session of a day, and return the alarm that is active then."""
+        """Watch a recording as the session of a day, and return an alarm that it raises."""
         clock = 1.7e9 + DAY_S * day
         recording = replace(recording, t=clock + recording.t - recording.t[0])
-        size = max(1, round(MESSAGE_S * recording.rate))
+        size, raised = max(1, round(MESSAGE_S * recording.rate)), None
         for first in range(0, len(recording), size):
             block = SourceBlock(NAME, f"{day}-{first}", recording.samples(slice(first, first + size)))
             self.actuators.process_blocks([block])
-        alarm = self.actuators._actuator(NAME).judge.alarm
-        return alarm if alarm is not None and alarm.active else None
+            alarm = self.actuators._actuator(NAME).judge.alarm
+            raised = raised or (alarm if alarm is not None and alarm.active else None)
+        return raised
 
 
 def outcomes(machine: Path, folder: Path, rate: float, sessions: int) -> Iterator[tuple[str, float]]:
@@ -82,7 +84,8 @@ def outcomes(machine: Path, folder: Path, rate: float, sessions: int) -> Iterato
         yield HOURS, recording.duration / 3600.0
         yield "healthy sessions: alarms", float(alarm is not None)
         if alarm is not None:
-            monitor.actuators.apply_mark(NAME, "invalid", text="nothing was found")
+            with suppress(ss.InputError):  # it may be over
+                monitor.actuators.apply_mark(NAME, "invalid", text="nothing was found")
         day += 1
     for number, (name, own) in enumerate(truth["files"].items()):
         if own["fault"] == "none":
@@ -115,7 +118,7 @@ def main() -> None:
                 for name, value in outcomes(machine, Path(folder), chosen.rate, chosen.sessions):
                     rows[name].append(value)
     print(f"{sum(rows.pop(HOURS)):.1f} healthy hours")
-    print(f"sessions until an alarm, mean: {np.mean(rows.pop(SESSIONS)):.1f}")
+    print(f"sessions until an alarm, mean: {np.mean(rows.pop(SESSIONS, [np.nan])):.1f}")
     for name, values in rows.items():
         print(f"{name}: {sum(values):g} of {len(values)}")
 

@@ -18,7 +18,7 @@ cannot tell 1 from 0. An alarm is dismissed as a person would. Before the last p
 L/min, 0.0042 L/min past a rod seal to the outside, and a growth from 0 to 0.05 L/min in an hour.
 
 Each machine is a row, and each leak, of `results/monitor_pressures.csv`; a second call goes on with those that are
-missing, and the sums over all rows are printed.
+missing, and the sums over all rows of these settings are printed.
 """
 
 from __future__ import annotations

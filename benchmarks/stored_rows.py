@@ -1,8 +1,13 @@
-"""Rows of a long benchmark in a CSV file, so that a second call goes on; rows of other sources are dropped."""
+"""Rows of a long benchmark in a CSV file, so that a second call goes on; rows of other sources are dropped.
+
+A source is a hash of the package's compiled sources and of the benchmark's script.
+"""
 
 from __future__ import annotations
 
 import csv
+import hashlib
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -15,16 +20,19 @@ class StoredRows:
 
     def __init__(self, path: Path, columns: Sequence[str], **settings: object) -> None:
         self._path, self._columns = path, ("source", *settings, *columns)
-        source = source_hash(Path(ss.__file__).parent)[:12]
+        script = hashlib.sha256(Path(sys.argv[0]).read_bytes()).hexdigest()
+        source = source_hash(Path(ss.__file__).parent)[:12] + script[:4]
         self._settings = {"source": source} | {name: str(value) for name, value in settings.items()}
         kept = [row for row in self._read() if row.get("source") == source] if path.exists() else []
-        with path.open("w", newline="") as file:
+        part = path.with_suffix(".part")
+        with part.open("w", newline="") as file:
             writer = self._writer(file)
             writer.writeheader()
             writer.writerows(kept)
+        part.replace(path)
 
     def _writer(self, file: object) -> csv.DictWriter[str]:
-        return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")  # type: ignore[arg-type]
+        return csv.DictWriter(file, self._columns, restval="", extrasaction="ignore", lineterminator="\n")  # type: ignore[arg-type]
 
     def _read(self) -> list[dict[str, str]]:
         with self._path.open(newline="") as file:

@@ -197,6 +197,20 @@ def test_a_step_has_its_size_and_its_onset_within_their_intervals():
     assert np.mean(onset) > 0.85
 
 
+def test_an_onset_that_was_thinned_out_lies_within_the_interval():
+    """Steps so small that they are found after a while, when fewer onsets are kept."""
+    random = np.random.default_rng(3)
+    held = []
+    for _ in range(12):
+        detector, at = StepDetector(), 100.0 + random.uniform(0.0, 64.0)
+        for k in range(260):
+            step = 1.3 * np.clip(k + 1.0 - at, 0.0, 1.0)
+            detector.take(3.0 * k, 3.0 * k + 3.0, random.standard_normal() + step, 1.0)
+        rise = detector.rise()
+        held.append(rise.interval.low <= 3.0 * at <= rise.interval.high)
+    assert np.mean(held) > 0.8
+
+
 def test_a_large_step_beside_warming_oil_is_not_dated_back():
     """A filter without a walk lags behind the trend, and its terms of M explain the step by an onset long before."""
     random = np.random.default_rng(1)

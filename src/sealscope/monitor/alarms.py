@@ -120,6 +120,7 @@ class AlarmJudge:
     below: int = 0  # ... and below the threshold at which the alarm ends
     over_s: float | None = None  # time at which the last alarm ended, or was last changed after its end [s]
     evidence: float = 0.0  # of a leak, from the recordings of a stream (`add_evidence`)
+    cause: str = ""  # of the leak that the detector has found, "" without one
 
     def update(
         self,
@@ -144,6 +145,8 @@ class AlarmJudge:
         if not estimate.judged:
             return None
         lpm = estimate.leak_lpm
+        cause_before, self.cause = self.cause, "" if leak is None else leak.cause
+        has_other_cause = cause_before not in ("", self.cause)
         is_warning = leak is not None and (lpm is None or lpm >= settings.warning_lpm)
         is_error = leak is not None and lpm is not None and lpm >= (settings.error_lpm or math.inf)
         self.above = self.above + 1 if is_warning or is_error else 0
@@ -184,14 +187,11 @@ class AlarmJudge:
         elif updated.level == "warning" and self.error >= settings.debounce_blocks:
             updated, event = updated.with_level("error"), "error"
         if leak is not None:
-            updated = replace(
-                updated,
-                leak_lpm=lpm,
-                leak_interval_lpm=estimate.leak_interval_lpm,
-                cause=leak.cause,
-                next_check=state_of(_CONDITIONS[updated.level], leak.cause).action,
-                by_chance_per_1000_h=allowed_rate * leak.rarity,
-            )
+            by_chance, interval = allowed_rate * leak.rarity, estimate.leak_interval_lpm
+            updated = replace(updated, leak_lpm=lpm, leak_interval_lpm=interval, by_chance_per_1000_h=by_chance)
+            if has_other_cause:  # the detector found the cause once more
+                action = state_of(_CONDITIONS[updated.level], leak.cause).action
+                updated = replace(updated, cause=leak.cause, evidence=leak.reason, next_check=action)
         return self._set_alarm(updated), event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
@@ -256,6 +256,7 @@ class AlarmJudge:
             "leak_lpm": lpm,
             "leak_interval_lpm": verdict.leak_interval_lpm,
             "evidence": f"{verdict.file}: {verdict.reason}",
+            "cause": verdict.cause or ("" if alarm is None else alarm.cause),
             "next_check": verdict.state["action"],
             "by_chance_per_1000_h": by_chance,
         }
@@ -275,7 +276,7 @@ class AlarmJudge:
             min_onset_s = min(earlier.end_s, min_onset_s)
         interval = verdict.onset_interval_s or (min_onset_s, onset_s)
         findings |= {"raised_s": verdict.end_s, "onset_s": onset_s, "onset_interval_s": interval}
-        return self._raise_alarm(cause=verdict.cause, baseline=baseline_version, **findings), "raised"
+        return self._raise_alarm(baseline=baseline_version, **findings), "raised"
 
     def _set_alarm(self, alarm: Alarm) -> Alarm:
         """Store a changed alarm as the open alarm, or forget it if it is closed or invalid; return the changed alarm.

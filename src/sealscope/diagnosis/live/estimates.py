@@ -42,7 +42,8 @@ class BlockEstimate:
     total_lpm, total_interval_lpm : float and pair of floats, or None
         Flow past pump and piston together, and its interval [L/min].
     leak_lpm, leak_interval_lpm : float and pair of floats, or None
-        Increase of that flow over the healthy machine, and its interval [L/min].
+        Leak: increase of that flow over the healthy machine, or of a leak to the outside what leaves the chamber, and
+        its interval [L/min].
     """
 
     number: int
@@ -81,6 +82,8 @@ class WatchedLeak:
         Test that detected the leak, "step" or "level", its score and threshold (`rise.LiveRise`).
     cause, reason : str
         Path of the leaking oil, and reason for the alarm in one line.
+    is_settled : bool
+        True if the `cause` rests on enough blocks after the onset to tell a leak to the outside.
     """
 
     raised_s: float
@@ -97,6 +100,7 @@ class WatchedLeak:
     reason: str
     score: float
     threshold: float
+    is_settled: bool = False
 
     @property
     def estimate(self) -> LiveRise:
@@ -174,23 +178,20 @@ def find_level_rise(
     - g against the lowest healthy mean, increased for the warmest oil (normal distribution),
     - g against the average of the healthy means, at least two, given their scatter (Student's t with Welch's degrees of
       freedom). If they are those of a baseline, whose course shows how much of the scatter slow changes of the oil may
-      be, the first test with the rest of the scatter is enough (`_unexplained_scatter`).
+      be, the first test with the rest of the scatter is enough, too (`_unexplained_scatter`; twice the smaller p-value
+      of both counts).
     """
     from scipy.special import ndtr, ndtri
 
     if healthy.count < 2:
         return None
     max_healthy = INFERENCE.oil.warmest * max(healthy.low, 0.0)
-    scatter = healthy.deviation**2 * (1.0 + 1.0 / healthy.count)  # variance of one more healthy mean about the average
-    variance = deviation**2 + scatter
-    degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter, np.finfo(float).tiny)) ** 2
-    degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal
-    rise = Rise(g - healthy.level, deviation=math.sqrt(variance), degrees_of_freedom=degrees_of_freedom)
-    scatter_chance = rise.chance
+    # one more healthy mean scatters about the average
+    chance = _rise_above(healthy.level, healthy.deviation * math.sqrt(1.0 + 1.0 / healthy.count), healthy, g, deviation)
     if isinstance(healthy, WatchBaseline) and healthy.short_term_deviation is not None:
-        unexplained = math.hypot(deviation, _unexplained_scatter(healthy, healthy.short_term_deviation, max_healthy))
-        scatter_chance = min(scatter_chance, float(ndtr((max_healthy - g) / unexplained)))
-    chance = max(float(ndtr((max_healthy - g) / deviation)), scatter_chance)
+        scatter = _unexplained_scatter(healthy, healthy.short_term_deviation, max_healthy)
+        chance = min(1.0, 2.0 * min(chance, _rise_above(max_healthy, scatter, healthy, g, deviation)))
+    chance = max(float(ndtr((max_healthy - g) / deviation)), chance)
     if chance >= probability:
         return None
     # the present healthy conductance may be anywhere from the lowest healthy mean to `max_healthy`
@@ -198,6 +199,17 @@ def find_level_rise(
     size = g - max(healthy.level, 0.0)
     score = -float(ndtri(max(chance, 1e-300)))  # finite for a chance of 0
     return LiveRise(LEVEL, score, onset, size, deviation=math.hypot(deviation, healthy_sd))
+
+
+def _rise_above(limit: float, scatter: float, healthy: HealthyLevel, g: float, deviation: float) -> float:
+    """Compute the p-value of a mean `g` above a `limit`, which has the standard deviation `scatter` by `healthy` means.
+
+    `deviation`: standard error of `g`. All are in m^3/(s Pa).
+    """
+    variance = deviation**2 + scatter**2
+    degrees_of_freedom = (healthy.count - 1) * (variance / max(scatter**2, np.finfo(float).tiny)) ** 2
+    degrees_of_freedom = min(degrees_of_freedom, 1e9)  # beyond it Student's t is normal
+    return Rise(g - limit, deviation=math.sqrt(variance), degrees_of_freedom=degrees_of_freedom).chance
 
 
 def _unexplained_scatter(healthy: HealthyLevel, short_term_deviation: float, max_healthy: float) -> float:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import RESPONSE, score_response_steps
 from sealscope.diagnosis.inference.pressures.fit import Block, Joint
 from sealscope.diagnosis.inference.pressures.leak import HIGH_LAW_RATIO, conductance_scale_error, states_flow
@@ -51,7 +52,7 @@ _END, _SAMPLES = 0, 1
 _THETA = slice(2, 2 + len(PARAMETERS))
 _GRAM = slice(_THETA.stop, _THETA.stop + _N_SUMS**2)
 _SCORES = slice(_GRAM.stop, None)
-#: Largest standard deviation of a conductance that is resolved [m^3/(s Pa)]: that of its prior.
+#: Standard deviation of the prior of the conductance [m^3/(s Pa)], below which an estimate is resolved in any case.
 _MAX_SD: float = PRESSURE.response["G"][1]
 
 
@@ -70,7 +71,7 @@ class PressureEstimator(SavedAttributes):
     min_law_ratio: float = outside_ratios[0]  # the leak may be one to the outside
     block_seconds: float = _PRIORS.seconds
     states_flow = staticmethod(states_flow)
-    SAVED = ("_samples", "_held", "_end", "_settling", "_misfits", "_rows", "_signals")
+    SAVED = ("_samples", "_held", "_end", "_restarts", "_settling", "_misfits", "_rows", "_signals")
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -78,6 +79,7 @@ class PressureEstimator(SavedAttributes):
         self._follower: Follower | None = None
         self._held = np.full(len(_PRESSURES), math.nan)  # values that stuck pressure readings repeat, nan if not stuck
         self._end = math.nan  # end of the last block to which the model was fitted [s]
+        self._restarts = False  # True if the next block is the first after a fit: no comparison with earlier blocks
         self._settling = _SETTLING  # number of next blocks in which the simulated states still depend on their start
         self._misfits = 0  # number of successive blocks that the model does not describe
         self._rows = np.empty((0, 0))  # one row per block: sums from which the leakage of the last blocks is estimated
@@ -100,13 +102,15 @@ class PressureEstimator(SavedAttributes):
         if not run.follows:
             self._held[:] = math.nan  # no reading is stuck so far
             self._samples = self._samples[:, :0]
-            if not self._is_short_gap(float(run.t[0]) - self._end, run.rate):
-                self._follower = None
         samples = np.hstack([self._samples, [run.t, *(run.channels[name] for name in _READ)]])
         # numbers of samples: for the first fit, and in a block
         n_first, n_block = (round(seconds * run.rate) for seconds in (_PRIORS.begins, self.block_seconds))
         is_slow = run.rate < _MIN_RATE  # blocks are refused without a fit
-        while samples.shape[1] >= (n_first if self._follower is None and not is_slow else n_block):
+        while samples.shape[1]:
+            if not (is_slow or self._is_short_gap(float(samples[0, 0]) - self._end, run.rate)):
+                self._follower = None
+            if samples.shape[1] < (n_first if self._follower is None and not is_slow else n_block):
+                break
             if self._follower is None and not is_slow:
                 beginning = _make_recording(samples[:, :n_first], run.rate)
                 if reason := find_unmet_requirement(beginning, self._rig) or describe_hold(beginning):
@@ -115,7 +119,7 @@ class PressureEstimator(SavedAttributes):
                     yield NotJudged(float(run.t[-1]), status="", counter=counter)
                 else:
                     self._follower = Follower.fit_start(beginning, self._rig)
-                    self._end, self._settling = float(beginning.t[0]), _SETTLING
+                    self._end, self._settling, self._restarts = float(beginning.t[0]), _SETTLING, True
             elif self._remove_holds(samples, n_block, run.rate):
                 block = _make_recording(samples[:, :n_block], run.rate)
                 samples = samples[:, n_block:]
@@ -147,7 +151,8 @@ class PressureEstimator(SavedAttributes):
             return NotJudged.with_count(end, f"sampled at less than {_MIN_RATE:g} Hz")
         if not all(np.isfinite(block[name]).all() for name in _READ):
             return NotJudged.with_count(end, "missing values")
-        follower, restarts = self._resume(self._follower, begin - self._end, block.rate)
+        follower, has_other_rate = self._resume(self._follower, begin - self._end, block.rate)
+        restarts, self._restarts = has_other_rate or self._restarts, False
         self._follower, self._end = follower, end
         is_settling = self._settling > 0
         self._settling = max(self._settling - 1, 0)
@@ -158,7 +163,7 @@ class PressureEstimator(SavedAttributes):
             return NotJudged.with_count(end, "settling", restarts=restarts)
         # G: index of the conductance; the covariance is in units of the priors
         g, sd = float(follower.theta[G]), math.sqrt(follower.covariance[G, G]) * float(follower.priors.unit[G])
-        if sd > _MAX_SD:
+        if sd > _MAX_SD and WITHIN_95 * sd > abs(g):  # a large leak is known well enough if it is surely no 0
             status = "conductance not resolved" if is_moving(block["u"]) else "at standstill"
             return NotJudged.with_count(end, status, restarts=restarts)
         pressure = float(np.mean(np.abs(block["p_A"] - block["p_B"])))
@@ -185,7 +190,7 @@ class PressureEstimator(SavedAttributes):
     def _resume(self, follower: Follower, gap: float, rate: float) -> tuple[Follower, bool]:
         """Prepare the fit for a block that follows after a short `gap` [s], or with another sampling `rate` [Hz].
 
-        Returns the fit to use, and True if this and later blocks cannot be compared with earlier ones.
+        Returns the fit to use, and True if the rate is another, so that blocks cannot be compared with earlier ones.
         """
         has_other_rate = follower.machine.rate != rate
         if has_other_rate:

@@ -238,12 +238,18 @@ class StepDetector(SavedAttributes):
         """Estimate the onset [s] and the size of a rise, as posterior means over `SIZES`, `WALKS` and onsets.
 
         Onset j has the likelihood of all innovations: that of those before j without a step (`_log_evidence`), and that
-        of the others with a step. The terms of M cannot be compared between onsets, as their denominators differ.
+        of the others with a step. The terms of M cannot be compared between onsets, as their denominators differ. Each
+        onset stands for the time up to its neighbours, as old ones are thinned out.
         """
         a, b, T = self._sums[_A : _T + 1]
         n, n_since = self._onsets[:, _N], self._blocks - self._onsets[:, _BLOCK] + 1.0
         log_before = self._onsets[:, _EVIDENCE] + _log_normalisation(n) - _log_normalisation(n - n_since)
-        log_weights = np.where(a > 0.0, self._step_log_ratios(), -np.inf) + self._log_likelihoods() + log_before
+        times = self._onsets[:, _TIME]
+        order = np.argsort(times, kind="stable")
+        spacing = np.empty_like(times)
+        spacing[order] = np.maximum(np.gradient(times[order]), np.finfo(float).tiny)  # of the onsets [s]
+        log_weights = np.where(a > 0.0, self._step_log_ratios(), -np.inf) + self._log_likelihoods()
+        log_weights += log_before + np.log(spacing)
         weights = np.exp(log_weights - np.logaddexp.reduce(log_weights.ravel()))  # posterior probabilities (v, q, j)
         # mean and variance of the size's posterior, Student's t, for each v, q and j
         precision = b + 1.0 / SIZES[:, None, None]
@@ -253,16 +259,13 @@ class StepDetector(SavedAttributes):
         size = float((weights * sizes).sum())
         deviation = float(np.sqrt((weights * (variances + (sizes - size) ** 2)).sum()))
         onset_probabilities = weights.sum(axis=(0, 1))
-        times, block_begins = self._onsets[:, _TIME], self._onsets[:, _BLOCK_BEGIN]
-        order = np.argsort(times, kind="stable")
         # an index may be one too high by rounding of the cumulative sum
         indices = np.searchsorted(np.cumsum(onset_probabilities[order]), [0.025, 0.975]).clip(max=len(order) - 1)
-        earliest, latest = times[order][indices]
-        # the last onsets (one for each of `PARTS`) are in one block; the latest of them comes first
-        latest_in_block = float((times - block_begins)[-len(PARTS)])  # time after the beginning of the block [s]
-        resolution = latest_in_block / len(PARTS)  # about the distance between neighbouring onsets
+        first, last = order[indices]
         interval = Interval(
-            float(onset_probabilities @ times), float(earliest) - resolution, float(latest) + resolution
+            float(onset_probabilities @ times),
+            float(times[first] - spacing[first]),
+            float(times[last] + spacing[last]),
         )
         return LiveRise(STEP, 2.0 * self.log_e(), interval, self._unit * size, self._unit * deviation)
 

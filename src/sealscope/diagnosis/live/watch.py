@@ -403,16 +403,16 @@ class Watch:
     def _test_step(self, block: BlockConductance) -> bool:
         """Test for a step of the conductance up to `block`, and raise the alarm if a leak explains the step.
 
-        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak, which may
-        turn out to be one to the outside. While the baseline is learned, the evidence of a step in the healthy
-        machine is stored in `_null`. Returns True if a step was found that a leak does not explain, or that cannot be
-        explained yet.
+        For `RECENT` blocks after the alarm, a step with a higher score replaces onset and size of the leak; its cause
+        is found once more when enough blocks have followed. While the baseline is learned, the evidence of a step in
+        the healthy machine is stored in `_null`. Returns True if a step was found that a leak does not explain, or that
+        cannot be explained yet.
         """
         leak = self.leak
+        if leak is not None and leak.test == STEP and not leak.is_settled:
+            leak = self._settle_cause(leak, block)
         if leak is not None and (leak.test != STEP or block.end - leak.raised_s > RECENT * self.block_seconds):
             return False
-        if leak is not None and leak.cause != OUTSIDE:
-            leak = self._look_outside(leak, block)
         log_threshold = self._null.log_threshold(self._false_alarm_probability(STEP, block.end - block.begin))
         min_log_e = log_threshold if leak is None else 0.5 * leak.score  # a score is twice the log e-value
         is_learning = leak is None and self.baseline is None
@@ -437,16 +437,18 @@ class Watch:
         self._raise_leak(rise, block, threshold=2.0 * log_threshold, reason=reason, cause=cause)
         return False
 
-    def _look_outside(self, leak: WatchedLeak, block: BlockConductance) -> WatchedLeak:
-        """Give the detected `leak` the cause `OUTSIDE` if the blocks up to `block` show it, once with the last of them.
+    def _settle_cause(self, leak: WatchedLeak, block: BlockConductance) -> WatchedLeak:
+        """Find the cause of the detected `leak` once more, when enough blocks up to `block` have followed its onset.
 
-        These are the `outside` blocks since its onset (`priors.toml`).
+        These are the `outside` blocks (`priors.toml`) from which on a leak to the outside surely shows.
         """
-        if self._count_since(leak.estimate.interval) == _EXPLANATION.outside:
-            explanation = self._weigh_events(leak.estimate.interval, block, is_settled=True)
-            if explanation is not None and explanation.is_outside:
-                self.leak = leak = self._with_flow(replace(leak, cause=OUTSIDE))
-        return leak
+        if self._count_since(leak.estimate.interval) < _EXPLANATION.outside:
+            return leak
+        explanation = self._weigh_events(leak.estimate.interval, block, is_settled=True)
+        if explanation is not None and explanation.is_leak:
+            leak = replace(leak, cause=OUTSIDE if explanation.is_outside else self._used_estimator.cause)
+        self.leak = self._with_flow(replace(leak, is_settled=True))
+        return self.leak
 
     def _count_since(self, onset: Interval) -> int:
         """Return the number of stored blocks that end after the latest time of an onset."""
@@ -560,6 +562,7 @@ class Watch:
             reason="; ".join(filter(None, texts)),
             score=rise.score,
             threshold=threshold,
+            is_settled=self.leak is not None and self.leak.is_settled,
         )
         self.leak = self._with_flow(self.leak)
 
