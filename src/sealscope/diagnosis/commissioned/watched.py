@@ -118,11 +118,14 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     """Estimate the leakage conductance of pump and piston together in a recording [m^3/(s Pa)] from its summary.
 
     The result is None without a summary by the balance, for a rig with no or several balances (servo valve), for one
-    whose stream leaves the pump's leakage out (open circuit), if the summary has other terms than the rig's balance, or
-    if the fit fails.
+    whose stream leaves the pump's leakage out (open circuit), if valves shut the pump off at rest, where the recording
+    shows the piston alone and a stream shows nothing, if the summary has other terms than the rig's balance, or if the
+    fit fails.
     """
     summary, balances = recording.summaries.get(VOLUME_BALANCE), equations(rig, frozenset(recording.units))
     if summary is None or len(balances) != 1 or rig.circuit.feeds_one_chamber:
+        return None
+    if float(summary.get("held_odds", -np.inf)) > 0.0:
         return None
     roles = ColumnRoles(balances[0])
     gram = np.asarray(summary["sums"], dtype=float)[0]  # Gram matrix of the only balance

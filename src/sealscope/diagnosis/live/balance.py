@@ -141,7 +141,7 @@ class LiveBalance(SavedAttributes):
     method = "volumes"
     data = VOLUMES
     states_level = True
-    min_law_ratio = max_law_ratio = 1.0  # the flow of a leak past the piston is measured, whatever its law
+    min_law_ratio = max_law_ratio = 1.0  # limits of a leak's flow beside its error, `leak_error`
     outside_ratios: tuple[float, float, float] = LIVE.watch.outside
     block_seconds = BLOCK_SECONDS
     has_begun = True
@@ -158,7 +158,8 @@ class LiveBalance(SavedAttributes):
         needed_names = {"x", "p_A", "p_B", *pump_names[:1]}  # the pump's angle, or else its speed
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
-        self.size_error = size_error(rig)
+        self.size_error = size_error(rig)  # relative standard error of all flows, and that of a leak's flow
+        self.leak_error = math.hypot(self.size_error, LIVE.watch.law)
         self._roles = tuple(map(ColumnRoles, self._balances))
         self._n_columns = self._roles[0].left + 1  # the left side is the last column
         self._column_orders, self._models = [], list[Coefficients]()

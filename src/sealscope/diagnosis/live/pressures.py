@@ -63,7 +63,7 @@ class PressureEstimator(SavedAttributes):
     data = RESPONSE  # kind of data (`Observable.data`) from which the conductance is estimated
     states_level = False  # True if the level of the conductance is stated
     cause: Cause = "piston, pump or external leak"
-    size_error = conductance_scale_error()  # relative standard error of changes of the conductance
+    size_error = leak_error = conductance_scale_error()  # relative standard error of changes of the conductance
     # limits of the flow of any leak over that of a laminar one past the piston with the same estimated conductance
     max_law_ratio: float = HIGH_LAW_RATIO
     # least, usual and largest ratio of the flow of a leak to the outside to the estimated one

@@ -225,7 +225,7 @@ class Watch:
             test, cause = LiveRise(STEP, score), estimator.cause
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
             max_flow = estimator.max_law_ratio * self._detector.bound() * pressure
-            bound = max_flow * (1.0 + UPPER_95 * estimator.size_error)
+            bound = max_flow * (1.0 + UPPER_95 * estimator.leak_error)
         least, usual, most = self._flow_ratios()
         # mean increase of the leakage
         flow = Estimate(usual * test.size * pressure, usual * test.deviation * pressure)
@@ -242,7 +242,7 @@ class Watch:
             bound_flow=bound,
             pump_flow=(pump_flow, pump_flow),  # mean over all samples, and while the pump delivers
             lpm_per_flow=1.0 / LITRE_PER_MINUTE if self._states_litres else None,
-            size_deviation=estimator.size_error,
+            size_deviation=estimator.leak_error,
         )
 
     def _flow_ratios(self) -> tuple[float, float, float]:
@@ -523,7 +523,9 @@ class Watch:
                 "more than the warmest oil can cause"
             )
             threshold = rise.threshold(probability)
-            self._raise_leak(rise, block, threshold=threshold, reason=reason, before=healthy.level)
+            # as later conductances `g`, which differ from the `total` by what the other coefficients have changed
+            before = healthy.level if has_baseline else healthy.level + g - total
+            self._raise_leak(rise, block, threshold=threshold, reason=reason, before=before)
 
     def _raise_leak(
         self,
@@ -618,7 +620,7 @@ class Watch:
         else:
             return estimate
         leak = mean_flow((blocks["g"] - reference.value) * lpm, errors)
-        half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.size_error * leak.value)
+        half_width = WITHIN_95 * math.hypot(leak.deviation, reference_sd * mean_lpm, estimator.leak_error * leak.value)
         low = least * (leak.value + (reference.value - reference.high) * mean_lpm - half_width)
         high = most * (leak.value + (reference.value - reference.low) * mean_lpm + half_width)
         return replace(estimate, leak_lpm=usual * leak.value, leak_interval_lpm=(max(0.0, low), max(0.0, high)))

@@ -56,6 +56,7 @@ class WatchPriors(PriorTable):
     # the pressures, shows of it
     outside: tuple[float, float, float]
     outside_by_pressures: tuple[float, float, float]
+    law: float  # relative standard deviation of a leak's flow by the volume balance, as its law is unknown
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
     step: float  # fraction of the false alarms for the test for a step
