@@ -60,14 +60,16 @@ def judge(machine: Path, into: Path) -> None:
         call("commission", machine / "healthy", "-o", file, *options)
         names = ("healthy", "suspect")
         parts = [call("diagnose", machine / name, "--machine", file, "--format", "jsonl") for name in names]
-    part = into.with_suffix(".part")
-    part.write_text("".join(parts))
-    part.replace(into)
+    if all(parts):  # else the errors are printed, and a later call tries again
+        part = into.with_suffix(".part")
+        part.write_text("".join(parts))
+        part.replace(into)
 
 
 def outcomes(machine: Path, verdicts: Path) -> Iterator[tuple[str, bool]]:
     """Yield rows of the table with True or False for each recording that counts in them."""
-    stated = {"/".join(Path(v["file"]).parts[-2:]): v for v in map(json.loads, verdicts.read_text().splitlines())}
+    lines = verdicts.read_text().splitlines() if verdicts.exists() else []
+    stated = {"/".join(Path(v["file"]).parts[-2:]): v for v in map(json.loads, lines)}
     for name, truth in json.loads((machine / "truth.json").read_text())["files"].items():
         verdict: dict[str, Any] | None = stated.get(name)
         if verdict is None:
