@@ -208,7 +208,8 @@ def test_a_leak_of_a_running_press_is_stated_soon(idle: float) -> None:
     assert onset < again.leak.raised_s < onset + 15.0
     flow = (conductance - 2e-14) * float(np.mean(np.abs(leaking["p_A"] - leaking["p_B"]))) / LPM
     low, high = last.leak_interval_lpm
-    assert low < flow < high < 1.3 * flow
+    assert low < flow < high < 1.3 * flow  # the leak's law is not known
+    assert last.leak_lpm == pytest.approx(flow, rel=0.25)
 
 
 def test_a_stream_that_begins_with_a_rest_learns_again_what_its_pump_feeds() -> None:
