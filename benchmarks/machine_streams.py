@@ -5,7 +5,7 @@
 The folders are those of `machine_folders.py`, whose commissioned machines a monitor watches here, in messages of some
 seconds. The stream of a machine is all its healthy recordings, in the order of their names, a day apart. For each other
 recording a copy of the monitor goes on with it up to `--sessions` times, a day apart, until an alarm. Nobody says when
-a leak begins; a false alarm is marked as a person would.
+a leak begins; a false alarm is marked as a person would. It needs the extra `serve`.
 """
 
 from __future__ import annotations
