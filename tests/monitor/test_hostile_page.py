@@ -20,10 +20,10 @@ from hypothesis import strategies as st
 from starlette.testclient import TestClient
 
 from sealscope.monitor.page import site as site_module
-from sealscope.monitor.page.guard import Admission, connection_limit, limit_protocol
 from sealscope.monitor.page.site import PageServer, site
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import PageSettings, topic_level
+from sealscope.web.guard import Admission, connection_limit, limit_protocol
 
 from ..refusals import refusal
 from .plant import served, settings_in, until
@@ -131,7 +131,7 @@ def test_guesses_of_an_address_are_slowed_down_and_others_are_not():
 
 
 def test_a_page_with_a_token_answers_guesses_later(service: Service, tmp_path: Path, monkeypatch):
-    monkeypatch.setattr("sealscope.monitor.page.guard._FIRST_PAUSE_S", 50.0)
+    monkeypatch.setattr("sealscope.web.guard._FIRST_PAUSE_S", 50.0)
     settings = PageSettings(host="0.0.0.0", token_file=tmp_path)
     page = TestClient(site(service.actuators, settings, "s3cret"), base_url="http://monitor.example")
     statuses = [page.get("/metrics", headers={"Authorization": f"Bearer {k}"}).status_code for k in range(30)]
@@ -141,7 +141,7 @@ def test_a_page_with_a_token_answers_guesses_later(service: Service, tmp_path: P
     assert refused.status_code == 429 and 0 < int(refused.headers["retry-after"]) <= 50
     assert page.post("/login", data={"token": "s3cret"}).status_code == 429
     assert page.get("/metrics").status_code == 401  # without a token nothing is guessed
-    monkeypatch.setattr("sealscope.monitor.page.guard._FIRST_PAUSE_S", 0.0)  # the pause is over
+    monkeypatch.setattr("sealscope.web.guard._FIRST_PAUSE_S", 0.0)  # the pause is over
     assert page.get("/metrics", headers=right).status_code == 200
 
 
@@ -150,7 +150,7 @@ def test_a_page_with_a_token_answers_guesses_later(service: Service, tmp_path: P
 )
 def test_who_asks_is_who_connects_unless_a_proxy_is_named(service: Service, tmp_path: Path, monkeypatch, proxies):
     """100 guesses, each for another address: looked at are five, or all where the settings believe this machine."""
-    monkeypatch.setattr("sealscope.monitor.page.guard._FIRST_PAUSE_S", 50.0)
+    monkeypatch.setattr("sealscope.web.guard._FIRST_PAUSE_S", 50.0)
     (tmp_path / "token").write_text("s3cret")
     service.stopping.clear()
     server = PageServer(service.actuators, PageSettings(port=0, token_file=tmp_path / "token", proxies=proxies))
@@ -204,9 +204,10 @@ def server(service: Service) -> Iterator[PageServer]:
 @pytest.fixture
 def narrow(monkeypatch) -> None:
     """A page with room for 20 connections, silent for at most 1 s."""
-    monkeypatch.setattr("sealscope.monitor.page.guard._CHECK_INTERVAL_S", 0.1)
+    monkeypatch.setattr("sealscope.web.guard._CHECK_INTERVAL_S", 0.1)
     monkeypatch.setattr(site_module, "connection_limit", lambda: 20)
-    monkeypatch.setattr(site_module, "limit_protocol", lambda most: limit_protocol(most, 1.0))
+    monkeypatch.setattr("sealscope.web.serving.connection_limit", lambda: 20)
+    monkeypatch.setattr("sealscope.web.serving.limit_protocol", lambda most: limit_protocol(most, 1.0))
 
 
 def connected(server: PageServer, count: int, first: bytes = b"") -> list[socket.socket]:

@@ -1,20 +1,10 @@
 // The page of a monitor. Whatever comes from the wire goes into the document as text, never as markup.
 "use strict";
 
-const byId = (id) => document.getElementById(id);
 let chosen = decodeURIComponent(location.hash.slice(1)) || null;
 let hours = "";
 let chart = null;
 let shown = "";
-
-function element(kind, className, text) {
-  const made = document.createElement(kind);
-  if (className) made.className = className;
-  if (text !== undefined) made.textContent = text;
-  return made;
-}
-
-const litres = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(3)).toString());
 
 function flow(value, interval) {
   if (value === null || value === undefined) return "no L/min";
@@ -26,24 +16,6 @@ function flow(value, interval) {
 function leakOf(row) {
   if (row.leak_lpm !== null) return `${litres(Math.max(row.leak_lpm, 0))} L/min`;
   return row.bound_lpm === null || row.bound_lpm === undefined ? "" : `< ${Number(row.bound_lpm.toPrecision(2))} L/min`;
-}
-
-// the local time in the form of ISO 8601, whatever the browser's language; for files the time that they state
-function isoTime(t, byFiles) {
-  const zone = byFiles ? 0 : new Date(t * 1000).getTimezoneOffset() * 60000;
-  const local = new Date(t * 1000 - zone);
-  return local.toISOString().slice(0, 19).replace("T", " ");
-}
-
-// uPlot's templates of dates, the American ones as ISO 8601 writes them
-function isoTemplate(template) {
-  const iso = template
-    .replace("{M}/{D}/{YY}", "{YYYY}-{MM}-{DD}")
-    .replace("{M}/{D}", "{MM}-{DD}")
-    .replace("{h}{aa}", "{HH}:00")
-    .replace("{h}", "{HH}")
-    .replace("{aa}", "");
-  return uPlot.fmtDate(iso);
 }
 
 // whether the chosen actuator's recordings are files, on their logger's clock
@@ -95,13 +67,6 @@ const byChance = (alarm) =>
   alarm.by_chance_per_1000_h === null || alarm.by_chance_per_1000_h === undefined
     ? ""
     : `healthy, the fleet would raise such an alarm once in ${onceIn(alarm.by_chance_per_1000_h * fleetCount)} or less often`;
-
-// the state of NE 107 as a badge: its letter, and its name for who cannot see colours
-function badge(state) {
-  const made = element("span", `badge ${state.symbol}`, state.name);
-  made.prepend(element("b", "", state.symbol));
-  return made;
-}
 
 function stateOf(row) {
   const since = row.state.since_s === null ? "" : ` since ${clock(row.state.since_s, row.by_files)}`;
@@ -174,8 +139,6 @@ function showWorkflow(alarm) {
     button.disabled = button.value === alarm.state || (button.value === "acknowledged" && alarm.state === "valid");
   }
 }
-
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
 // the range of the chart of flows: from zero, and of what lies below a tenth of it
 function flowRange(least, most) {

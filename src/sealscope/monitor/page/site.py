@@ -31,38 +31,30 @@ from sealscope.monitor.alarms import rank_actuators
 from sealscope.monitor.bounded_queue import QueueLoad
 from sealscope.monitor.database.store import outage_reason
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, format_metrics
-from sealscope.monitor.page.guard import BACKLOG, Admission, connection_limit, limit_protocol
 from sealscope.monitor.page.live import DETAIL_FORMS, PRESSURES, LiveSamples, describe_rig
 from sealscope.monitor.settings import PageSettings, read_secret
 from sealscope.monitor.supervisor import DATABASE
 from sealscope.reporting.template import read_package_file
 from sealscope.storage.plain_values import parse_json
+from sealscope.web.guard import Admission, connection_limit
+from sealscope.web.responses import BODY_S, HEADERS, LOCAL, SHARED_FILES, make_refusal, read_body, serve_shared_file
+from sealscope.web.serving import format_place, make_server, open_socket
 
-#: Largest body of a request [bytes], time limit for receiving it [s], and most listeners at a time.
-_MAX_BODY_BYTES, _BODY_S, _MAX_LISTENERS = 10_000, 10.0, 200
+#: Most listeners at a time.
+_MAX_LISTENERS = 200
 #: How often changes are looked for [s], and silence after which an event keeps a connection to a browser alive [s].
 _POLL_S, _KEEP_ALIVE_S = 0.3, 15.0
-_HEADERS = {
-    "Content-Security-Policy": "default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self'; "
-    "img-src 'self' data:; form-action 'self'; frame-ancestors 'none'; base-uri 'none'",
-    "X-Content-Type-Options": "nosniff",
-    "Referrer-Policy": "no-referrer",
-    "Cache-Control": "no-store",
-}
 _HOURS = re.compile(r"[0-9]{1,8}(\.[0-9]{1,8})?")
 #: Header that states when to repeat a request [s].
 _RETRY_HEADERS = {"Retry-After": "5"}
 #: Name of the login's cookie, and its lifetime [s].
 _COOKIE, _COOKIE_S = "sealscope", 30 * 86_400
-_LOCAL = ("127.0.0.1", "localhost", "::1")
 _PACKAGE = "sealscope.monitor.page"
 #: By address: static file and its media type.
 _FILES = {
     "/": ("page.html", "text/html"),
     **{f"/{name}": (name, "text/javascript") for name in ("page.js", "live.js", "twin.js")},
-    **dict.fromkeys(("/page.css", "/login.css"), ("page.css", "text/css")),
-    "/uPlot.js": ("vendor/uPlot.iife.min.js", "text/javascript"),
-    "/uPlot.css": ("vendor/uPlot.min.css", "text/css"),
+    "/page.css": ("page.css", "text/css"),
 }
 
 
@@ -81,6 +73,7 @@ def site(
     pages = _Pages(actuators, token, queue_load, live or LiveSamples(actuators.store.last_samples))
     routes = [
         *(Route(path, pages.file) for path in _FILES),
+        *(Route(path, serve_shared_file) for path in SHARED_FILES),
         Route("/login", pages.login, methods=["GET", "POST"]),
         Route("/api/fleet", pages.fleet),
         Route("/api/actuator", pages.actuator),
@@ -89,8 +82,8 @@ def site(
         Route("/metrics", pages.metrics),
     ]
     middleware = [Middleware(BaseHTTPMiddleware, dispatch=pages.guard)]
-    if settings.host in _LOCAL:  # against DNS rebinding: refuse host names of other sites
-        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*_LOCAL, "[::1]"]))
+    if settings.host in LOCAL:  # against DNS rebinding: refuse host names of other sites
+        middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*LOCAL, "[::1]"]))
     handlers: Any = {SQLAlchemyError: pages.answer_outage}
     return Starlette(routes=routes, middleware=middleware, exception_handlers=handlers)
 
@@ -134,7 +127,7 @@ class _Pages:
         name, hours = request.query_params.get("name", ""), request.query_params.get("hours", "")
         summary = self._actuators.summaries().get(name)
         if summary is None:
-            return _make_refusal("no such actuator", 404)
+            return make_refusal("no such actuator", 404)
         settings = self._actuators.settings[name]
         seconds = float(hours) * 3600.0 if _HOURS.fullmatch(hours) else None
         details = {
@@ -157,18 +150,18 @@ class _Pages:
         """
         # against forged requests: a form of another site cannot send this header
         if request.headers.get("x-sealscope") != "mark":
-            return _make_refusal("the header X-Sealscope is missing", 403)
+            return make_refusal("the header X-Sealscope is missing", 403)
         name = request.query_params.get("name", "")
         try:
-            values = parse_json(await _read_body(request))
+            values = parse_json(await read_body(request))
             if not isinstance(values, dict) or not all(isinstance(value, str) for value in values.values()):
                 raise InputError("a mark must be a mapping of texts")
             note = {"by_whom": values.get("by", ""), "text": values.get("text", "")}
             alarm = await asyncio.to_thread(self._actuators.apply_mark, name, values.get("mark", ""), **note)
         except TimeoutError:
-            return _make_refusal(f"a request must arrive within {_BODY_S:g} s", 408)
+            return make_refusal(f"a request must arrive within {BODY_S:g} s", 408)
         except ValueError as error:
-            return _make_refusal(str(error), 400)
+            return make_refusal(str(error), 400)
         return JSONResponse(alarm.as_dict())
 
     async def changes(self, request: Request) -> Response:
@@ -181,13 +174,13 @@ class _Pages:
         RMS.
         """
         if self._n_listeners >= self._max_listeners:
-            return _make_refusal("too many listeners", 503)
+            return make_refusal("too many listeners", 503)
         defaults = {"actuator": "", "pressure": "p_A", "drawn": "rms"}
         name, pressure, detail_form = (request.query_params.get(key, default) for key, default in defaults.items())
         if name and name not in self._machines:
-            return _make_refusal("no such actuator", 404)
+            return make_refusal("no such actuator", 404)
         if pressure not in PRESSURES or detail_form not in DETAIL_FORMS:
-            return _make_refusal(f"pressure must be one of {PRESSURES}, drawn one of {DETAIL_FORMS}", 400)
+            return make_refusal(f"pressure must be one of {PRESSURES}, drawn one of {DETAIL_FORMS}", 400)
         self._n_listeners += 1
         return _EventStream(self._events(request, name, pressure, detail_form), self._remove_listener)
 
@@ -249,7 +242,7 @@ class _Pages:
                 return _refuse_for_now(wait)
             token = ""  # of a body that is too long or too slow: counts as wrong
             with suppress(InputError, TimeoutError):
-                form = parse_qs((await _read_body(request)).decode("utf-8", "replace"))
+                form = parse_qs((await read_body(request)).decode("utf-8", "replace"))
                 token, *_ = form.get("token", [""])
             if admission.admits(address, token):
                 answer = RedirectResponse("/", 303)
@@ -262,7 +255,7 @@ class _Pages:
     def _find_refusal(self, request: Request) -> Response | None:
         """Check the token or cookie of a request; return the answer that refuses the request, or None to admit it."""
         admission, path = self._admission, request.url.path
-        if admission is None or path in ("/login", "/login.css"):
+        if admission is None or path in ("/login", "/base.css"):
             return None
         authorization, session = request.headers.get("authorization"), request.cookies.get(_COOKIE)
         if authorization is not None or session is not None:
@@ -273,7 +266,7 @@ class _Pages:
                 return None
             if session is not None and admission.admits(address, session, session=True):
                 return None
-        answer: Response = RedirectResponse("/login", 303) if path == "/" else _make_refusal("a token is needed", 401)
+        answer: Response = RedirectResponse("/login", 303) if path == "/" else make_refusal("a token is needed", 401)
         if session is not None:  # an invalid cookie, for example of an earlier token
             answer.delete_cookie(_COOKIE)
         return answer
@@ -281,7 +274,7 @@ class _Pages:
     async def guard(self, request: Request, call_next: Callable[[Request], Awaitable[Response]]) -> Response:
         """Refuse a request without a valid token or cookie, or answer it by `call_next`; add the security headers."""
         answer = self._find_refusal(request) or await call_next(request)
-        answer.headers.update(_HEADERS)
+        answer.headers.update(HEADERS)
         return answer
 
 
@@ -299,12 +292,8 @@ class _EventStream(StreamingResponse):
             self._on_end()
 
 
-def _make_refusal(error: str, status: int, headers: dict[str, str] | None = None) -> JSONResponse:
-    return JSONResponse({"error": error}, status, headers)
-
-
 def _refuse_for_now(wait: float) -> Response:
-    return _make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
+    return make_refusal(f"too many wrong tokens: wait {wait:.0f} s", 429, {"Retry-After": str(math.ceil(wait))})
 
 
 def _format_live(curves: Mapping[str, Any]) -> str:
@@ -314,17 +303,6 @@ def _format_live(curves: Mapping[str, Any]) -> str:
 
 def _client_address(request: Request) -> str:
     return "" if request.client is None else request.client.host
-
-
-async def _read_body(request: Request) -> bytes:
-    """Read the body of a request; raise InputError if it is too long, TimeoutError if it takes over `_BODY_S`."""
-    data = b""
-    async with asyncio.timeout(_BODY_S):
-        async for part in request.stream():
-            data += part
-            if len(data) > _MAX_BODY_BYTES:
-                raise InputError(f"a request must have at most {_MAX_BODY_BYTES} bytes")
-    return data
 
 
 class PageServer:
@@ -344,44 +322,21 @@ class PageServer:
         self._actuators, self._host, self.port = actuators, settings.host, settings.port
         self._application = site(actuators, settings, token, queue_load, live)
         self._proxies = [str(address) for address in settings.proxies]
-        self._socket: socket.socket | None = self._open_socket()
+        self._socket: socket.socket | None = open_socket(self._host, self.port, "page.port")
         self.port = int(self._socket.getsockname()[1])  # chosen by the system if the stated port is 0
-        self.address = f"http://{self._format_place()}/"
+        self.address = f"http://{format_place(self._host, self.port)}/"
         self._server: uvicorn.Server | None = None
         self._thread = actuators.supervisor.start("page", self._serve)
-
-    def _open_socket(self) -> socket.socket:
-        try:
-            family = socket.AF_INET6 if ":" in self._host else socket.AF_INET
-            return socket.create_server((self._host, self.port), family=family, backlog=BACKLOG)
-        except OSError as error:
-            reason = error.strerror or error
-            raise InputError(f"page.port must be free, got {reason} ({self._format_place()})") from None
-
-    def _format_place(self) -> str:
-        """Format host and port of the page as in a URL, with an IPv6 address in brackets."""
-        return f"[{self._host}]:{self.port}" if ":" in self._host else f"{self._host}:{self.port}"
 
     def _serve(self) -> None:
         """Serve the page until `leave` is called; uvicorn closes the socket at the end.
 
         Raises RuntimeError if the server ends before, so that the supervisor starts it again.
         """
-        page_socket = self._socket or self._open_socket()  # opened again after an error, which closes it
+        # opened again after an error, which closes it
+        page_socket = self._socket or open_socket(self._host, self.port, "page.port")
         self._socket = None
-        config = uvicorn.Config(
-            self._application,
-            http=limit_protocol(connection_limit()),
-            ws="none",
-            lifespan="off",
-            log_config=None,
-            access_log=False,
-            backlog=BACKLOG,
-            timeout_graceful_shutdown=1,
-            proxy_headers=bool(self._proxies),
-            forwarded_allow_ips=self._proxies,
-        )
-        self._server = uvicorn.Server(config)
+        self._server = make_server(self._application, self._proxies)
         self._server.should_exit = self._actuators.closed  # `leave` may have been called before
         self._server.run(sockets=[page_socket])
         if not self._actuators.closed:
