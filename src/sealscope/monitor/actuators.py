@@ -32,8 +32,9 @@ from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database import tables
 from sealscope.monitor.database.machine_files import record_mark
 from sealscope.monitor.database.store import MAX_IDENTITIES, MonitorStore, StoredRows, StoredSamples, outage_reason
+from sealscope.monitor.logged_counts import LoggedCounts, log_growth
 from sealscope.monitor.settings import ActuatorSettings, WatchSettings
-from sealscope.monitor.sources.source_block import SourceBlock, count_bytes
+from sealscope.monitor.sources.source_block import TIME_UNITS, SourceBlock, count_bytes
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.supervisor import Supervisor, describe_error
 from sealscope.monitor.verdicts import STREAM_SHARE, RecordingVerdict, judge_stream
@@ -49,6 +50,9 @@ _SHELVED_S = 8 * 3600.0
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Counter of the blocks that raised an error.
 DROPPED = "blocks that raised an error"
+#: Counter of blocks whose times seem to be in another unit than seconds, and the relative deviation up to which they
+#: seem so.
+WRONG_PACE, _SAME_PACE = "blocks whose clock runs too fast for their rate", 0.01
 #: Fields of the verdict on a recording that the summary of an actuator contains.
 _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
 #: Fields of the healthy baseline that the summary contains.
@@ -78,6 +82,7 @@ class _Actuator:
     verdict: RecordingVerdict | None = None  # on the last recording, None also if newer results replace it
     # last samples during an alarm, which may become a healthy recording
     alarm_samples: list[Recording] = field(default_factory=list)
+    last_times: tuple[float, float] = (0.0, 0.0)  # begin and end of the last block of samples by its rate [s]
     # None for files, for machines that are not commissioned, and for `recording_s` = 0
     recorder: StreamRecorder | None = None
 
@@ -248,6 +253,7 @@ class WatchedActuators:
         self._last_block_clock = dict.fromkeys(self.settings, time.monotonic())
         self._keep_s = keep_days * 86_400.0
         self._counters, self._counting = Counter[str](), threading.Lock()
+        self._logged_counts = LoggedCounts(self.count)
         # change_number: see `_notify_change`; closed: set to True when open web pages must end
         self._changes, self.change_number, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(outage_reason, self._notify_change)
@@ -402,6 +408,7 @@ class WatchedActuators:
         samples, follows, verdict = block.samples, block.follows, block.verdict
         if samples is None:
             return
+        self._check_time_unit(actuator, samples)
         settings, recorder = actuator.settings, actuator.recorder
         name, number = settings.name, actuator.n_stored
         if recorder is not None and (recording := recorder.take(number, samples)) is not None:
@@ -423,6 +430,23 @@ class WatchedActuators:
         if not is_due or (recorder is not None and recorder.first):  # the recording that has not ended needs the block
             rows.add_pending(name, StoredSamples(number, samples, follows, verdict))
 
+    def _check_time_unit(self, actuator: _Actuator, samples: Recording) -> None:
+        """Count and log samples whose clock runs a thousand, a million or a billion times too fast for their rate.
+
+        The times of a block then count milliseconds, microseconds or nanoseconds, and each block looks like a pause.
+        """
+        start, stop = actuator.last_times
+        if len(samples):
+            actuator.last_times = float(samples.t[0]), float(samples.t[0]) + len(samples) / samples.rate
+        if not stop > start or not len(samples):
+            return
+        pace = (float(samples.t[0]) - start) / (stop - start)
+        for unit, parts in TIME_UNITS.items():
+            if abs(pace / parts - 1.0) < _SAME_PACE:
+                step, duration = pace * (stop - start), stop - start
+                detail = f"is t in {unit}? It steps by {step:g} where the samples take {duration:g} s"
+                self._logged_counts.add(WRONG_PACE, actuator.settings.name, detail=detail)
+
     def _checkpoint(self, actuator: _Actuator, rows: StoredRows) -> None:
         """Add a checkpoint of an actuator's state to the rows that will be stored, and mark old rows for deletion."""
         settings, recorder = actuator.settings, actuator.recorder
@@ -437,9 +461,11 @@ class WatchedActuators:
 
     @staticmethod
     def _add_summary(actuator: _Actuator, rows: StoredRows) -> None:
-        """Add the summary of an actuator to the rows that will be stored, if it has changed."""
+        """Add the summary of an actuator to the rows that will be stored, if it has changed; log counters that grew."""
         summary = actuator.summary()
         if summary != actuator.stored_summary:
+            counters_before = (actuator.stored_summary or summary)["counters"]
+            log_growth(actuator.settings.name, counters_before, summary["counters"])
             actuator.stored_summary = summary
             rows.add_summary(actuator.settings.name, summary)
 

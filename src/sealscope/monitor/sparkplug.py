@@ -34,8 +34,10 @@ _FIELD_OF_TYPE = {
 }
 #: Metrics of a message, at most.
 _MAX_METRICS = 100_000
-#: Property that names the unit of a metric.
-_UNIT = "engUnit"
+#: Properties that state the unit of a metric, and the quality of its value.
+_UNIT, _QUALITY = "engUnit", "Quality"
+#: Data type and good values of the quality: 192, or 193 to 255 as in OPC; 0 is bad, 500 is stale.
+_INT32, _GOOD = 3, range(192, 256)
 
 
 @dataclass(frozen=True)
@@ -48,6 +50,18 @@ class SparkplugMetric:
     alias: int | None = None
     timestamp: int | None = None  # [ms since 1970]
     unit: str | None = None  # its property `engUnit`
+    is_historical: bool = False  # True if the value was stored for a while, and is not the present one
+    quality: int | None = None  # its property `Quality`, None if it states none, which is good
+
+    @property
+    def is_good(self) -> bool:
+        """True unless the sender states that the quality of the value is not good."""
+        return self.quality is None or self.quality in _GOOD
+
+    def as_missing(self) -> SparkplugMetric:
+        """Replace the value by a missing one: NaN for each number of an array, else None."""
+        value = np.full(self.value.shape, np.nan) if isinstance(self.value, np.ndarray) else None
+        return replace(self, value=value)
 
     def with_datatype(self, datatype: int) -> SparkplugMetric:
         """Convert the value from its transmitted form to a Sparkplug data type; return the changed metric.
@@ -125,8 +139,15 @@ def encode_payload(payload: SparkplugPayload) -> bytes:
             fields["bytes_value"] = np.asarray(value, dtype=_ARRAYS[datatype]).tobytes()
         else:
             fields[_FIELD_OF_TYPE[datatype]] = value
+        if metric.is_historical:
+            fields["is_historical"] = True
+        properties: dict[str, dict[str, Any]] = {}
         if metric.unit is not None:
-            fields["properties"] = {"keys": [_UNIT], "values": [{"type": STRING, "string_value": metric.unit}]}
+            properties[_UNIT] = {"type": STRING, "string_value": metric.unit}
+        if metric.quality is not None:
+            properties[_QUALITY] = {"type": _INT32, "int_value": metric.quality}
+        if properties:
+            fields["properties"] = {"keys": [*properties], "values": [*properties.values()]}
         message.metrics.add(**fields)
     return bytes(message.SerializeToString())
 
@@ -162,11 +183,30 @@ def _decode_metric(entry: Any) -> SparkplugMetric:
     value = None if field is None else getattr(entry, field)
     if not isinstance(entry.name, str) or (field == "string_value" and not isinstance(value, str)):
         raise ValueError("a text must be UTF-8")  # protobuf returns a damaged text as bytes
-    properties = zip(entry.properties.keys, entry.properties.values, strict=False)  # a sender may state fewer values
+    # a sender may state fewer values than keys
+    properties = [*zip(entry.properties.keys, entry.properties.values, strict=False)]
     unit = next((str(value.string_value)[:40] for key, value in properties if key == _UNIT), None)
+    qualities = (_decode_quality(value) for key, value in properties if str(key).casefold() == _QUALITY.casefold())
     name, alias, timestamp = _get_fields(entry, "name", "alias", "timestamp")
-    metric = SparkplugMetric(name, value, alias=alias, timestamp=timestamp, unit=unit or None)
+    metric = SparkplugMetric(
+        name,
+        value,
+        alias=alias,
+        timestamp=timestamp,
+        unit=unit or None,
+        is_historical=bool(entry.is_historical),
+        quality=next(qualities, None),
+    )
     return metric.with_datatype(int(entry.datatype)) if entry.datatype else metric
+
+
+def _decode_quality(value: Any) -> int | None:
+    """Convert the property `Quality` to its number; None if it is null, 0, which is bad, if it is no number."""
+    field = None if value.is_null else value.WhichOneof("value")
+    quality = None if field is None else getattr(value, field)
+    if quality is None:
+        return None
+    return int(quality) if isinstance(quality, (int, float)) and abs(quality) < np.inf else 0
 
 
 def topic_of(group: str, kind: str, node: str, device: str | None = None) -> str:

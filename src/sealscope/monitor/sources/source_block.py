@@ -46,6 +46,9 @@ _ARRAY_DTYPES = dict(zip(FLOAT_ARRAYS, (">f4", ">f8", "<f4", "<f8"), strict=True
 _SAMPLE_TYPES = {int, float, type(None)}
 #: Number of leading bytes of a refused message that are stored.
 _N_KEPT_BYTES = 4000
+#: Times from here on are no seconds, as no clock counts from so long ago [s]; units of time that may be meant, in parts
+#: of a second.
+_MAX_TIME_S, TIME_UNITS = 1e11, {"ms": 1e3, "us": 1e6, "ns": 1e9}
 _KNOWN_NAMES = {"actuator", "t", "rate", "units", "id", *CHANNELS}
 
 
@@ -169,6 +172,9 @@ def decode_message(
     t, rate = _parse_number(values, "t"), _parse_number(values, "rate")
     if not rate > 0.0:
         raise RefusedMessage(NO_CLOCK, f"rate must be > 0 Hz, got {rate:g}")
+    if abs(t) >= _MAX_TIME_S:
+        units_of_time = (f": is t in {unit}?" for unit, parts in TIME_UNITS.items() if abs(t) / parts < _MAX_TIME_S)
+        raise RefusedMessage(NO_CLOCK, f"t must be a time in seconds, got {t:.6g}{next(units_of_time, '')}")
     units = {**units_of.get(name, {}), **units}
     channels = {channel: _parse_channel(values[channel], channel, units) for channel in CHANNELS if channel in values}
     sizes = {array.size for channel, array in channels.items() if channel not in SLOW}

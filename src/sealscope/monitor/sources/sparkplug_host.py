@@ -5,6 +5,9 @@ one of its devices is an actuator, and its metrics are the channels. The value o
 begins at its timestamp, or a single sample; a single value that is left out has not changed. Timestamps are whole
 milliseconds; a block that follows the block before within that resolution is joined to it. After a missing sequence
 number an alias may stand for another metric, so messages with aliases are refused until a new birth.
+
+A value whose quality is not good is a missing sample. A historical value, which the node has stored for a while, never
+changes the present one: it is a sample if it is newer than all samples before it, else it is dropped.
 """
 
 from __future__ import annotations
@@ -21,6 +24,7 @@ import numpy as np
 
 from sealscope.diagnosis.live.joining import CHANNELS
 from sealscope.monitor import sparkplug as spb
+from sealscope.monitor.logged_counts import LoggedCounts
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources import source_block as blocks
 from sealscope.monitor.sources.message_limits import MAX_SAMPLES
@@ -37,6 +41,10 @@ from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 _log = logging.getLogger(__name__)
 #: Counter of missing sequence numbers; a message after a gap is still used if its metrics have names.
 GAPS = "gaps in the sequence of a Sparkplug node"
+#: Counter of values that are missing, as their sender says that they are not good.
+NOT_GOOD = "Sparkplug values whose quality is not good"
+#: Counter of historical values that are dropped.
+OUTDATED = "historical Sparkplug values that are no newer than the samples before them"
 #: Shortest time between two requests for the birth of a node [s].
 _REQUEST_PAUSE_S = 10.0
 #: Timestamps are truncated or rounded to whole milliseconds: largest distance of the true time before and after [s].
@@ -54,7 +62,8 @@ class _Birth:
 
     names: dict[str, str] = field(default_factory=dict)  # of the metrics, by channel or `_RATE`
     aliases: dict[int | None, str] = field(default_factory=dict)  # name of the metric, by its alias, a number
-    metrics: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)  # by name, with the last value
+    metrics: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)  # by name, with the present value
+    history: dict[str | None, spb.SparkplugMetric] = field(default_factory=dict)  # by name, with the last stored value
 
     @classmethod
     def from_metrics(cls, metrics: Iterable[spb.SparkplugMetric], actuator: ActuatorSettings) -> _Birth:
@@ -74,7 +83,8 @@ class _Birth:
             if channel is None:
                 continue
             birth.names[channel] = name
-            birth.metrics[name] = replace(metric, unit=unit)
+            is_present = metric.is_good and not metric.is_historical
+            birth.metrics[name] = replace(metric if is_present else metric.as_missing(), unit=unit)
             if metric.alias is not None:
                 birth.aliases[metric.alias] = name
         return birth
@@ -131,7 +141,7 @@ class SparkplugHost:
         count_event: Callable[[str], None],
     ) -> None:
         spb.payload_class()  # fails here rather than at the first message
-        self._publish, self._count_event = publish, count_event
+        self._publish, self._counts = publish, LoggedCounts(count_event)
         self._actuators = {actuator.sparkplug: actuator for actuator in actuators if actuator.sparkplug is not None}
         # by (group, node) of the actuators' paths "group/node" or "group/node/device"
         self._nodes = {tuple(path.split("/")[:2]): _EdgeState() for path in self._actuators}
@@ -199,7 +209,7 @@ class SparkplugHost:
             self._request_birth(group, node)
             raise RefusedMessage(blocks.UNBORN, f"data of {path} must follow its birth")
         metrics = [birth.complete_metric(metric, is_complete=state.is_complete) for metric in payload.metrics]
-        known_metrics = [metric for metric in metrics if metric is not None]
+        known_metrics = [self._with_quality(metric, actuator) for metric in metrics if metric is not None]
         samples = self._build_recording(actuator, birth, known_metrics, sent_ms=payload.timestamp)
         if samples is None:
             return None
@@ -229,9 +239,16 @@ class SparkplugHost:
         else:
             if payload.seq != (state.seq + 1) % 256:
                 state.is_complete = False
-                self._count_event(GAPS)
+                self._counts.add(GAPS, f"{group}/{node}")
                 self._request_birth(group, node)
             state.seq = payload.seq
+
+    def _with_quality(self, metric: spb.SparkplugMetric, actuator: ActuatorSettings) -> spb.SparkplugMetric:
+        """Replace the value of a metric by a missing one if its quality is not good, and count this."""
+        if metric.is_good:
+            return metric
+        self._counts.add(NOT_GOOD, f"{actuator.name}, {str(metric.name)[:40]!r}", detail=f"got {metric.quality}")
+        return metric.as_missing()
 
     def _build_recording(
         self, actuator: ActuatorSettings, birth: _Birth, metrics: list[spb.SparkplugMetric], sent_ms: int | None
@@ -241,29 +258,42 @@ class SparkplugHost:
         `metrics`: metrics of channels or of the sampling rate, with names; `sent_ms` [ms since 1970]: time of sending,
         used for metrics without a time. The value of a slow channel, such as the oil temperature, is not a sample: the
         `birth` of the actuator stores it, and all recordings repeat it until the next value. Only an array with the
-        time and length of the samples has one for each. Raises RefusedMessage if the samples cannot be used.
+        time and length of the samples has one for each. Historical values that do not follow the samples so far are
+        dropped and counted. Raises RefusedMessage if the samples cannot be used.
         """
         channel_of = {name: channel for channel, name in birth.names.items() if channel != _RATE}
-        groups: dict[int, dict[str, spb.SparkplugMetric]] = defaultdict(dict)
+        # by timestamp, and False for present values, True for historical ones
+        groups: dict[tuple[int, bool], dict[str, spb.SparkplugMetric]] = defaultdict(dict)
         for metric in metrics:
             name, timestamp = str(metric.name), sent_ms if metric.timestamp is None else metric.timestamp
             if name not in channel_of or (channel_of[name] in SLOW and not isinstance(metric.value, np.ndarray)):
-                birth.metrics[name] = metric
+                if metric.is_historical:
+                    self._counts.add(OUTDATED, f"{actuator.name}, {name[:40]!r}")
+                elif name in channel_of or metric.is_good:  # the rate is known from before
+                    birth.metrics[name] = metric
             elif timestamp is None:
                 raise RefusedMessage(blocks.NO_CLOCK, f"the metric {name[:40]!r} must have a time, got none")
             else:
-                groups[timestamp][channel_of[name]] = metric
+                groups[timestamp, metric.is_historical][channel_of[name]] = metric
                 birth.metrics[name] = replace(birth.metrics[name], unit=metric.unit)  # the message may state another
-        for group in groups.values():
-            _store_slow_values(group, birth)
-        groups = {timestamp: group for timestamp, group in groups.items() if group}
+        for (_, is_historical), group in groups.items():
+            _store_slow_values(group, birth.history if is_historical else birth.metrics)
+        groups = {key: group for key, group in groups.items() if group}
         if not groups:
             return None
         rate, pieces = birth.rate(actuator), []
-        for timestamp in sorted(groups):
-            piece = _simultaneous_samples(groups[timestamp], birth, channel_of)
+        for timestamp, is_historical in sorted(groups):
+            group, t_stated = groups[timestamp, is_historical], timestamp / 1000.0
+            if is_historical and not self._follows(actuator.name, t_stated, rate):
+                for metric in group.values():
+                    self._counts.add(OUTDATED, f"{actuator.name}, {str(metric.name)[:40]!r}")
+                continue
+            last_metrics = birth.history if is_historical else birth.metrics
+            piece = _simultaneous_samples(group, last_metrics, channel_of)
             size = next(iter(piece.values())).size
-            pieces.append({"t": self._sample_times(actuator.name, timestamp / 1000.0, size, rate), **piece})
+            pieces.append({"t": self._sample_times(actuator.name, t_stated, size, rate), **piece})
+        if not pieces:
+            return None
         if (n_samples := sum(piece["t"].size for piece in pieces)) > MAX_SAMPLES:
             raise RefusedMessage(blocks.OVERSIZED, f"there must be at most {MAX_SAMPLES} samples, got {n_samples}")
         t = np.concatenate([piece["t"] for piece in pieces])
@@ -279,6 +309,12 @@ class SparkplugHost:
             unit = birth.metrics[birth.names[channel]].unit or actuator.units.get(channel)
             values[channel] = convert_to_si(array, unit, channel)
         return Recording(t, values, {channel: CHANNEL_UNITS[channel] for channel in values}, rate)
+
+    def _follows(self, actuator: str, t: float, rate: float) -> bool:
+        """Return True if a sample at the time `t` [s] is newer than the actuator's samples so far, at `rate` [Hz]."""
+        expected_start = self._next_starts.get(actuator, -math.inf)
+        # `t` may be truncated to whole milliseconds, and one sampling interval may be shorter
+        return t > min(expected_start - 1.0 / rate, expected_start - 3.0 * _LATE_S)
 
     def _sample_times(self, actuator: str, t: float, size: int, rate: float) -> Array:
         """Compute the times [s] of `size` samples at `rate` [Hz], the first at or near its stated time `t` [s].
@@ -303,10 +339,13 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _store_slow_values(group: dict[str, spb.SparkplugMetric], birth: _Birth) -> None:
-    """Store the last value of each slow channel's array in `birth`; remove arrays longer or shorter than the samples.
+def _store_slow_values(
+    group: dict[str, spb.SparkplugMetric], last_metrics: dict[str | None, spb.SparkplugMetric]
+) -> None:
+    """Store the last value of each slow channel's array; remove arrays longer or shorter than the samples.
 
-    `group`: metrics with the same timestamp, by channel. Raises RefusedMessage if a slow channel's array is empty.
+    `group`: metrics with the same timestamp, by channel; `last_metrics`: metrics with their last values, by name.
+    Raises RefusedMessage if a slow channel's array is empty.
     """
     samples = [metric.value for channel, metric in group.items() if channel not in SLOW]
     sizes = {values.size for values in samples if isinstance(values, np.ndarray)}
@@ -314,19 +353,22 @@ def _store_slow_values(group: dict[str, spb.SparkplugMetric], birth: _Birth) -> 
         metric = group[channel]
         if not metric.value.size:
             raise RefusedMessage(blocks.NO_SAMPLES, f"an array of {channel} must have a number, got none")
-        birth.metrics[metric.name] = replace(metric, value=float(metric.value[-1]))
+        last_metrics[metric.name] = replace(metric, value=float(metric.value[-1]))
         if metric.value.size not in sizes:
             del group[channel]
 
 
 def _simultaneous_samples(
-    group: Mapping[str, spb.SparkplugMetric], birth: _Birth, channel_of: Mapping[str, str]
+    group: Mapping[str, spb.SparkplugMetric],
+    last_metrics: dict[str | None, spb.SparkplugMetric],
+    channel_of: Mapping[str, str],
 ) -> dict[str, Array]:
     """Collect the samples (n,) of the metrics that have the same timestamp, by channel.
 
     `group`: these metrics by channel; `channel_of`: channel by name of its metric. If a value is an array, all must be
-    arrays of the same length n, and channels without a value are left out. Otherwise n is 1: `birth` stores the values,
-    and a channel that is not in the group repeats the last single value stored there. None becomes NaN.
+    arrays of the same length n, and channels without a value are left out. Otherwise n is 1: `last_metrics`, by name,
+    stores the values, and a channel that is not in the group repeats the last single value stored there. None, and a
+    value that is not known, become NaN.
     """
     if any(isinstance(metric.value, np.ndarray) for metric in group.values()):
         piece = {channel: np.atleast_1d(metric.value) for channel, metric in group.items() if metric.value is not None}
@@ -334,8 +376,9 @@ def _simultaneous_samples(
         if len(sizes) != 1 or 0 in sizes or any(values.dtype != np.float64 for values in piece.values()):
             raise RefusedMessage(blocks.NO_SAMPLES, "metrics of one time must be arrays of numbers of one length")
         return piece
-    birth.metrics.update({metric.name: metric for metric in group.values()})
-    last_values = {channel: birth.metrics[name].value for name, channel in channel_of.items() if channel not in SLOW}
+    last_metrics.update({metric.name: metric for metric in group.values()})
+    known_metrics = {channel: last_metrics.get(name) for name, channel in channel_of.items() if channel not in SLOW}
+    last_values = {channel: None if metric is None else metric.value for channel, metric in known_metrics.items()}
     numbers = {channel: value for channel, value in last_values.items() if not isinstance(value, np.ndarray)}
     if not all(value is None or _is_number(value) for value in numbers.values()):
         raise RefusedMessage(blocks.NO_SAMPLES, "a single sample must be a number")
