@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from shutil import copytree
 
+import numpy as np
 import pytest
 
 import sealscope as ss
@@ -100,6 +101,44 @@ def test_what_the_machine_states_is_not_stated_twice(call, healthy, file):
     assert "--rig cannot be combined with --machine" in refused
     refused = call("diagnose", healthy / "run1.nc", "--machine", file, "--rate", "0").refused()
     assert "--rate cannot be combined with --machine" in refused
+
+
+def write_log(path, recording, temperature):
+    """Write a CSV with the headings of a logger, the last one `temperature` (°C) unless it is empty."""
+    headings = ["t [s]", "Druck A [bar]", "Druck B [bar]", "Weg [mm]", "Drehzahl [1/min]"]
+    scales = {"p_A": 1e-5, "p_B": 1e-5, "x": 1e3, "omega": 30.0 / np.pi}
+    columns = [recording.t, *(scale * recording[name] for name, scale in scales.items())]
+    if temperature:
+        headings.append(temperature)
+        columns.append(np.full(len(recording), 41.0))
+    np.savetxt(
+        path, np.column_stack(columns)[::5], "%.7g", ",", header=",".join(headings), comments="", encoding="utf-8"
+    )
+
+
+def test_a_channel_that_healthy_days_had_and_a_file_lacks_is_found_doubted_and_mapped(call, tmp_path):
+    """An entry of [map] that a file lacks leaves `auto` to the others; --map beside --machine adds the column."""
+    folder, file, new = tmp_path / "days", tmp_path / "m.toml", tmp_path / "new.csv"
+    folder.mkdir()
+    for seed in (1, 2):
+        write_log(folder / f"day{seed}.csv", record_press(seed), "TT7 [°C]")
+    call("commission", folder, "-o", file, "--map", "auto", "--map", "T_oil=TT7 [°C]", "--rig", "thesis")
+    line, judge = "T_oil=Wannen [°C]", ("diagnose", new, "--machine", file)
+    for heading, options in (("Wannen [°C]", ()), ("Wannen [°C]", ("--map", line)), ("Toil", ())):
+        write_log(new, record_press(7), heading)
+        (verdict,) = call(*judge, *options, "--format", "jsonl").objects
+        missing = [finding for finding in verdict["quality"] if finding["code"] == "missing_channel"]
+        assert verdict["verdict"] == "no leak"
+        assert "x" not in verdict["unused"]
+        if heading == "Toil" or options:
+            assert not missing
+            continue
+        assert [(finding["severity"], finding["channel"]) for finding in missing] == [("warning", "T_oil")]
+        assert f"--map '{line}'" in missing[0]["text"]
+        assert "T_oil, recorded on healthy days, is missing" in verdict["reason"]
+        assert "no leak was found above the bound" in verdict["next_check"]
+        assert missing[0]["text"] in " ".join(call(*judge).out.split())
+    assert "Wanne7, mapped to T_oil, must be a column" in call(*judge, "--map", "T_oil=Wanne7").refused(1)
 
 
 @pytest.mark.slow

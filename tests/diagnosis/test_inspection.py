@@ -106,6 +106,29 @@ def test_a_recording_is_judged_by_the_channels_of_its_healthy_recordings() -> No
     assert finding.text.endswith("p_1, p_2")
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_what_most_healthy_recordings_have_and_the_judged_one_lacks_is_a_finding(seed: int) -> None:
+    """Any channel, of any share of the healthy recordings; an oil temperature in the header replaces T_oil."""
+    generator = np.random.default_rng(seed)
+    days = [machine(k, rate=50.0, duration=20.0) for k in range(int(generator.integers(2, 6)))]
+    name = str(generator.choice(["p_1", "x", "T_oil"]))
+    values = {"T_oil": np.full(len(days[0]), 313.15)}
+    having = int(generator.integers(0, len(days) + 1))
+    healthy = [
+        replace(day, channels=day.channels | values, units=day.units | {"T_oil": "K"})
+        if k < having
+        else day.only(channel for channel in day.channels if channel != name)
+        for k, day in enumerate(days)
+    ]
+    judged = machine(9, rate=50.0, duration=20.0)
+    judged = judged.only(channel for channel in judged.channels if channel != name)
+    for remarks in ({}, {"Oil temperature": "40 °C"}):
+        stated = replace(judged, provenance=judged.provenance | {"about": remarks})
+        findings = select_comparable(inspect_recording(stated), healthy).findings
+        missing = {finding.channel for finding in findings if finding.code == "missing_channel"}
+        assert (name in missing) == (2 * having > len(days) and not (name == "T_oil" and remarks))
+
+
 def test_no_leak_is_not_stated_where_the_healthy_recordings_give_another_balance() -> None:
     healthy = [machine(seed, rate=100.0, duration=60.0) for seed in range(1, 6)]
     leaky = without_pump_lines(machine(9, G=step(0.0, 3.0e-12, at=0.0), rate=100.0, duration=60.0))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -226,3 +227,30 @@ def test_an_ending_that_may_be_no_unit_is_one_behind_a_word_of_its_kind(heading,
 def test_of_two_endings_the_known_unit_is_the_unit(heading, parts):
     label = Label.parse(heading)
     assert (label.name, label.unit) == parts
+
+
+def test_the_oil_s_temperature_is_found_in_any_order_of_words_and_with_any_unit(tmp_path: Path) -> None:
+    """Words, order, joints and units are drawn; without a unit the numbers are deg C, which the history says."""
+    generator = np.random.default_rng(88)
+    kelvin = {"degC": 273.15 + 40.0, "C": 273.15 + 40.0, "°C": 273.15 + 40.0, "degF": (40.0 + 459.67) / 1.8, "K": 40.0}
+    oils, temperatures = ("oil", "oel", "Öl", "Oil", "fluid", "huile", "Hydrauliköl"), ("T", "Temp", "temperature")
+    for _ in range(60):
+        words = [str(generator.choice(oils)), str(generator.choice(temperatures))]
+        joint = str(generator.choice(["", "_", " ", ".", "-"]))
+        name = joint.join(words[:: int(generator.choice([1, -1]))])
+        unit = str(generator.choice(["", *kelvin]))
+        heading = name if not unit else f"{name} [{unit}]" if generator.random() < 0.5 else f"{name}_{unit}"
+        (tmp_path / "log.csv").write_text(f"t [s],Druck A [bar],Druck B [bar],{heading}\n0,3,4,40\n0.1,3,4,40\n")
+        recording = read(tmp_path / "log.csv", map="auto")
+        assert recording.channels.keys() == {"p_A", "p_B", "T_oil"}, heading
+        assert recording["T_oil"][0] == pytest.approx(kelvin[unit or "degC"]), heading
+        assert any("taken as °C" in line for line in recording.history) == (not unit)
+
+
+@pytest.mark.parametrize(
+    "heading",
+    ["T", "T_mot [°C]", "Ambient temp_C", "oil level [%]", "oil pressure [bar]", "toilet", "tol_C", "T_water"],
+)
+def test_what_is_no_oil_temperature_is_none(heading: str) -> None:
+    labels = [Label.parse(name) for name in ("Druck A [bar]", "Druck B [bar]", heading)]
+    assert "T_oil" not in proposed_map(labels)

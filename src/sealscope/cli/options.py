@@ -103,7 +103,9 @@ RateOption = Annotated[float | None, Option("--rate", help="Sampling rate [Hz] o
 JoinOption = Annotated[bool, Option("--join", help="The files are parts of a single run: join them by their clocks.")]
 _BASELINE = "Leak-free recordings of the same machine."
 BaselineOption = Annotated[list[Path] | None, Option("--baseline", metavar="FILE...", help=_BASELINE)]
-_MACHINE = "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings."
+_MACHINE = (
+    "The machine's file, by `sealscope commission`; it states map, rig, limit and healthy recordings. --map adds to it."
+)
 MachineOption = Annotated[Path | None, Option("--machine", metavar="FILE", help=_MACHINE)]
 #: Default of `--false-alarm`, equal to `FALSE_ALARM_PROBABILITY` of `diagnose`, whose import would slow down the help.
 FALSE_ALARM_PROBABILITY = 0.01
@@ -122,7 +124,8 @@ SheetOption = Annotated[Path | None, Option("--sheet", help=_SHEET)]
 class StatedMachine:
     """The machine that the options of a call describe, and the way to read its files.
 
-    - `commissioned`: the machine of the option `--machine`, which determines everything else
+    - `commissioned`: the machine of the option `--machine`, which determines everything else; `channel_map` adds to its
+      own
     - `channel_map`, `rate`: columns of the channels and sampling rate [Hz] for reading files
     - `rig`: known or assumed parameters of the machine
     - `limit`: leak from which the machine must be repaired, as text such as "5 mL/min"
@@ -150,7 +153,8 @@ class StatedMachine:
     ) -> StatedMachine:
         """Build the machine from the values of a command's options, which the types of the parameters declare.
 
-        Raises InputError for an invalid option, and for another option together with `machine`.
+        Raises InputError for an invalid option, and for another option than `maps` together with `machine`: maps add to
+        that in the machine's file.
         """
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
@@ -158,13 +162,15 @@ class StatedMachine:
         if machine is not None:
             from sealscope.diagnosis.commissioned.machine_file import read_machine
 
-            options = {"--baseline": baseline, "--map": maps, "--rate": rate, "--rig": rig}
+            options: dict[str, object] = {"--baseline": baseline, "--rate": rate, "--rig": rig}
             options |= {"--area": area, "--displacement": displacement, "--limit": limit}
             for name, value in options.items():
                 if value is not None and value != []:  # []: a repeatable option that the call does not have
                     raise InputError(f"{name} cannot be combined with --machine, whose file states it")
             known_machine = read_machine(machine)
-            return cls(known_machine, rig=known_machine.rig, limit=known_machine.limit)
+            added_map = parse_channel_map(maps)
+            check_request(added_map, None)
+            return cls(known_machine, added_map, rig=known_machine.rig, limit=known_machine.limit)
         stated_machine = cls(
             rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps), rate=rate,
             limit=limit, baseline=tuple(baseline or ()),
@@ -206,7 +212,7 @@ class StatedMachine:
     def _read(self, file: Path) -> Recording:
         """Read the recording in a file by the channel map of the machine, of the call or, if it fits, of the rig."""
         if self.commissioned is not None:
-            return self.commissioned.read(file)
+            return self.commissioned.read(file, map=self.channel_map or None)
         if not self._rig_map:
             from sealscope.recordings import read
 

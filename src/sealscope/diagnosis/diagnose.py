@@ -19,6 +19,7 @@ from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.decision.combination import ORDER, combine, is_decided, rank
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
@@ -27,10 +28,12 @@ from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, VOLUME_BALANCE, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
+from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.quality import MISSING_CHANNEL
 from sealscope.recordings.recording import Recording
 
 #: Probability of `leak` on a leak-free recording, unless the caller asks for another.
@@ -209,6 +212,10 @@ def diagnose(
             judged_until=inspection.judged_until,
         )
         evidence = examination.decide_by_all()
+    missing = [str(finding.channel) for finding in comparable.findings if finding.code == MISSING_CHANNEL]
+    if missing and evidence.verdict != LEAK:
+        doubt = text_of("remark", "channels missing", names=join_names(missing))
+        evidence = replace(evidence, reason=f"{evidence.reason}{doubt}")
     return Diagnosis.from_evidence(
         evidence,
         recording,

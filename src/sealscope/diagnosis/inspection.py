@@ -17,12 +17,16 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import SLOW
+from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
 from sealscope.recordings.corrections.samples import correct_samples
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import find_name_and_unit, suggest_map_entry
 from sealscope.recordings.hydraulics import describe_missing_chambers, find_implausibility
+from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quality import SHORTEST, Finding, Severity, inspect
+from sealscope.recordings.quality import MISSING_CHANNEL, SHORTEST, Finding, Severity, inspect
 from sealscope.recordings.recording import Recording, compute_once
+from sealscope.units import same_dimension
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,7 +165,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
         refusal = f"no baseline recording can be used: {most_frequent_reason}"
     entries = [healthy[k] for k in sorted(index_of_digest.values())]  # in the order of `baseline`
     parts = tuple(entry.part if isinstance(entry, Inspection) else entry for entry in entries)
-    findings = [*_lower_usual(judged, entries), *findings]
+    findings = [*_lower_usual(judged, entries), *_find_missing_channels(judged, entries), *findings]
     part = judged.part
     # without a comparable baseline no channel is left out
     known = SLOW.union(*(entry.units for entry in entries)) if entries else part.channels.keys()
@@ -170,6 +174,38 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
         findings.append(Finding("channels_left_out", "note", channel=None, count=len(unknown), first_t=None, text=note))
         part = part.only(name for name in part.channels if name in known)
     return Baselines(part, parts, tuple(findings), refusal)
+
+
+def _find_missing_channels(judged: Inspection, entries: Sequence[Inspection | SummarisedRecording]) -> list[Finding]:
+    """Report each channel that most comparable healthy recordings have, but the judged one lacks, with the remedy.
+
+    An oil temperature that the file's header states replaces the channel T_oil.
+    """
+    part, findings = judged.part, list[Finding]()
+    for name in CHANNEL_UNITS:
+        count = sum(name in entry.units for entry in entries)
+        if name in part or 2 * count <= len(entries) or (name == "T_oil" and oil_temperature(part) is not None):
+            continue
+        text = f"{name}: {count} of {len(entries)} healthy recordings have it and this one does not, so that the bound "
+        text += "allows for what it may have been"
+        if (column := _find_column_for(name, part)) is None:
+            text += "; record it, or map its column"
+        else:
+            text += f"; if {column} is its column: --map '{name}={column}', or in the [map] of the machine's file: "
+            text += f'{name} = "{column}"'
+        findings.append(Finding(MISSING_CHANNEL, "warning", name, len(part), None, text))
+    return findings
+
+
+def _find_column_for(channel: str, recording: Recording) -> str | None:
+    """Find the unused column of a recording's file that could be the `channel`, by its name or else its unit."""
+    if channel == "T_oil" and recording.unused_temperatures:
+        return recording.unused_temperatures[0]
+    columns = {column: Label.parse(column) for column in recording.unused}
+    by_name = (column for column, label in columns.items() if suggest_map_entry(label).startswith(f"{channel}="))
+    units = {column: find_name_and_unit(label)[1] for column, label in columns.items()}
+    by_unit = (column for column, unit in units.items() if unit and same_dimension(unit, CHANNEL_UNITS[channel]))
+    return next(by_name, next(by_unit, None))
 
 
 def _find_obstacle(entry: Inspection | SummarisedRecording, judged: Inspection) -> tuple[Severity, str] | None:

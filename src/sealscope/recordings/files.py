@@ -149,7 +149,11 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name, file)
+    return read_file(file, Request(map or {}, rate, file.name, file))
+
+
+def read_file(file: Path, request: Request) -> Recording:
+    """Read the recording in a file; `request` chooses the columns. Errors are as of `read`."""
     with _unpacked_file(file) as (inner, kind):
         return _read_unpacked(inner, kind, request)
 

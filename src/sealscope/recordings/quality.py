@@ -31,6 +31,10 @@ _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS, _GAPS = (
 _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
 
+#: Code of the finding on a channel that the healthy recordings have and the judged one lacks.
+MISSING_CHANNEL = "missing_channel"
+
+
 @dataclass(frozen=True)
 class Finding:
     """One defect of a recording."""

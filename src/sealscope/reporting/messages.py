@@ -19,6 +19,7 @@ from sealscope.errors import printable
 from sealscope.paragraphs import format_count, join_names, paragraph, paragraphs
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import suggest_map_entry
+from sealscope.recordings.quality import MISSING_CHANNEL
 from sealscope.units import from_si
 
 ABSENT = "–"
@@ -318,7 +319,9 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
         if diagnosis.unused and not estimates_flow:
             steps.insert(0, say("next.map"))
     # a baseline that was left out, such as the recording itself, is no defect of the data
-    findings = (finding for finding in diagnosis.quality if finding.code != "baseline_left_out")
+    # and a missing channel has a line of its own
+    no_defects = ("baseline_left_out", MISSING_CHANNEL)
+    findings = (finding for finding in diagnosis.quality if finding.code not in no_defects)
     defects = [finding for finding in findings if finding.severity != "note"]
     if defects:
         names = [f"{entry.code.replace('_', ' ')}{f' ({entry.channel})' if entry.channel else ''}" for entry in defects]
@@ -366,6 +369,7 @@ def short_text(diagnosis: Diagnosis) -> str:
         ("data", quality_summary(diagnosis) if diagnosis.quality else None),
         ("units", raw_counts(diagnosis)),
         ("not used", format_unused_columns(diagnosis)),
+        *(("missing", finding.text) for finding in diagnosis.missing_channels),
         ("next", next_steps(diagnosis)[0]),
     ]
     return _format_lines(diagnosis, rows)

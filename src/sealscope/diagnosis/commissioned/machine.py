@@ -32,7 +32,8 @@ from sealscope.errors import InputError, SealscopeError, UnreadableFile
 from sealscope.paragraphs import format_count
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
-from sealscope.recordings.formats.columns import REST, ChannelMap
+from sealscope.recordings.files import read_file
+from sealscope.recordings.formats.columns import REST, ChannelMap, Request, as_mapping
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files
@@ -137,9 +138,9 @@ class CommissionedMachine:
 
         return summarise_machine(self.healthy, self.rig, self.left_out)
 
-    def read(self, path: str | os.PathLike[str]) -> Recording:
-        """Read a log with the channel map or, if it does not fit, without; raise UnreadableFile if both fail."""
-        return read_by_map(path, self.channel_map, self.rate)
+    def read(self, path: str | os.PathLike[str], *, map: ChannelMap | None = None) -> Recording:
+        """Read a log with the channel map, and the entries of `map` added to it, as `read_by_map`."""
+        return read_by_map(path, self.channel_map, self.rate, map)
 
     def diagnose(
         self, recording: Recording | str | os.PathLike[str], *, false_alarm_probability: float = FALSE_ALARM_PROBABILITY
@@ -228,18 +229,24 @@ class CommissionedMachine:
         return "\n".join([self.summary.text(self.healthy, self.rig), *alarms])
 
 
-def read_by_map(path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None) -> Recording:
+def read_by_map(
+    path: str | os.PathLike[str], channel_map: ChannelMap, rate: float | None, added: ChannelMap | None = None
+) -> Recording:
     """Read a log with the channel map of its machine or, if the log does not fit the map, without a map.
 
-    `rate` is the sampling rate [Hz] of a log without a time column. If both fail, the first UnreadableFile is raised.
+    An entry of the map whose column the log lacks is left out, and the history says so; the others, such as "auto",
+    count. The entries of `added` come first, and must fit. `rate` is the sampling rate [Hz] of a log without a time
+    column. If both attempts fail, the first UnreadableFile is raised.
     """
-    if not channel_map:
-        return read(path, rate=rate)
+    file, extra = Path(path), as_mapping(added or {})
+    columns = as_mapping(channel_map) | extra
     try:
-        return read(path, map=channel_map, rate=rate)
+        return read_file(file, Request(columns, rate, file.name, file, frozenset(columns.keys() - extra.keys())))
     except UnreadableFile as map_error:
+        if not columns:
+            raise
         try:
-            return read(path, rate=rate)
+            return read(path, map=extra, rate=rate)
         except UnreadableFile:
             raise map_error from None
 

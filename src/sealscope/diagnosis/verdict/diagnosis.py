@@ -15,7 +15,7 @@ from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
 from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, action_of, state_of
 from sealscope.errors import InputError, MissingExtra
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import MISSING_CHANNEL, Finding
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_values import to_plain
 
@@ -183,6 +183,8 @@ class Diagnosis(Evidence):
         """
         if self.verdict != NO_LEAK:
             return self.verdict
+        if self.missing_channels:
+            return "channel missing"
         if self.known_healthy:
             return NO_LEAK if self.is_baseline else "no leak found"
         return "no change of RMS" if self.detector == RMS_CHANGE else "no change"
@@ -191,6 +193,11 @@ class Diagnosis(Evidence):
     def named_cause(self) -> str | None:
         """The `cause` if it agrees with the verdict, i.e. is one of `LEAKS` for the verdict `leak` only; else None."""
         return self.cause if (self.verdict == LEAK) == (self.cause in LEAKS) else None
+
+    @property
+    def missing_channels(self) -> tuple[Finding, ...]:
+        """Findings on channels that the healthy recordings have and this one lacks; each states the remedy."""
+        return tuple(finding for finding in self.quality if finding.code == MISSING_CHANNEL)
 
     @property
     def next_check(self) -> str:
@@ -216,13 +223,19 @@ class Diagnosis(Evidence):
     def is_baseline(self) -> bool:
         """True if the recording may serve as a baseline, as no leak was found and its leakage is usual.
 
-        At least 1 in 20 healthy recordings must score as high in the comparison with healthy recordings, in the test
-        for a step, and in the rarest of all tests (`rarest_chance`). The result is False without that comparison, or if
-        a cause of a change is stated. If the total leakage is surely above 0, an undetected leak must not be the whole
-        of it.
+        It must have the channels of the healthy recordings. At least 1 in 20 of these must score as high in the
+        comparison with healthy recordings, in the test for a step, and in the rarest of all tests (`rarest_chance`).
+        The result is False without that comparison, or if a cause of a change is stated. If the total leakage is surely
+        above 0, an undetected leak must not be the whole of it.
         """
         comparison = self._find_test(AGAINST)
-        if self.verdict != NO_LEAK or self.cause is not None or comparison is None or not _is_usual(comparison):
+        if (
+            self.missing_channels
+            or self.verdict != NO_LEAK
+            or self.cause is not None
+            or comparison is None
+            or not _is_usual(comparison)
+        ):
             return False
         if self.rises_within or self.rarest_chance < _MIN_USUAL_CHANCE:
             return False

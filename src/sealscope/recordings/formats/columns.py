@@ -31,6 +31,11 @@ from sealscope.recordings.formats.headings.split_time import find_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import same_dimension, to_si
 
+
+class _MissingColumnError(InputError):
+    """A map names a column that a file does not have."""
+
+
 _MAX_DIGITS = 9  # most digits of a column's number; no log has as many columns
 #: Separators of the parts of a path such as `Rig.Cyl.p_A`.
 _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
@@ -50,6 +55,7 @@ class Request:
     rate: float | None = None  # sampling rate [Hz] in place of a time column
     file: str = ""  # name of the file for the provenance
     path: Path | None = None  # the file, if others beside it may tell whether dates begin with the day
+    optional: frozenset[str] = frozenset()  # entries of the map that do not count in a file that lacks their columns
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
@@ -122,6 +128,11 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 def uses_names(channel_map: ChannelMap) -> bool:
     """Test whether a map from channels to columns contains "auto", i.e. whether the columns' names choose channels."""
     return isinstance(channel_map, str) or REST in channel_map
+
+
+def as_mapping(channel_map: ChannelMap) -> dict[str, str]:
+    """Convert a map to a dictionary; "auto" becomes the entry of `REST`."""
+    return {REST: channel_map} if isinstance(channel_map, str) else dict(channel_map)
 
 
 def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
@@ -206,7 +217,7 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
         operand = description if name == column_text else f"{name} of {description}"
         column = _find_column(labels, name, operand, mapped=True)
         if column is None:
-            raise InputError(f"{operand} must be a column, got columns {_format_columns(labels)}")
+            raise _MissingColumnError(f"{operand} must be a column, got columns {_format_columns(labels)}")
         factors[column] = factors.get(column, 0.0) + factor
     units = {_find_unit(labels[column], channel) for column in factors}
     if formula.unit is None and len(units) > 1:
@@ -217,10 +228,13 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
     """Choose the unit in which a column in `unit` is read as a channel; also return a note for the history, or None.
 
-    The column keeps its unit, with two exceptions. A column without unit (None), or a command in amperes or per cent,
-    is read as raw counts, i.e. numbers of an unknown scale. A speed in turns per minute, however written, is in rpm.
+    The column keeps its unit, with these exceptions. A column without unit (None), or a command in amperes or per cent,
+    is read as raw counts, i.e. numbers of an unknown scale; a temperature without unit is in deg C. A speed in turns
+    per minute, however written, is in rpm.
     The note begins with `description`. Raises InputError for a unit of the wrong dimension.
     """
+    if unit is None and channel == "T_oil":
+        return "degC", f"{description} has no unit: taken as °C"
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
     if same_dimension(unit, COUNTS):
@@ -369,11 +383,18 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
 
     With a requested rate no time is read. Without a time column the rate is the `stated_rate` [Hz] of the file. If the
     map contains "auto", other columns are chosen by their names and units (`proposed_map`). A column in the map takes
-    precedence over a column with the channel's name. Raises InputError if a mapped column does not exist, no column is
-    a channel, there is neither a time nor a rate, or a unit has the wrong dimension.
+    precedence over a column with the channel's name. Raises InputError if a mapped column does not exist, unless its
+    entry is `optional`, if no column is a channel, there is neither a time nor a rate, or a unit has the wrong
+    dimension.
     """
     choice = ColumnMap(labels, stated_rate)
     columns, rate = explicit_columns(request.map), request.rate
+    for channel in request.optional & columns.keys():
+        try:
+            _parse_mapping(labels, channel, columns[channel])
+        except _MissingColumnError:
+            choice.notes.append(f"{columns[channel]}, which the machine's map reads as {channel}, is not in this file")
+            del columns[channel]
     if uses_names(request.map):
         mapped_columns: set[int] = set()
         for channel, column_text in columns.items():

@@ -21,6 +21,15 @@ _KIND = {name: frozenset(words) for name, words in WORDS["kind"].items()}
 _UNSPACED = frozenset(
     word for words in (*_MEASURED.values(), *_SIDE.values()) for word in words if ord(word[0]) > 0x2E7F
 )
+#: Words of the temperature of oil, longest first, and a word that joins some in any order, such as `toil` or `oeltemp`;
+#: `ol`, in `tol`, is none of them.
+_OIL_WORD = re.compile(
+    "|".join(sorted((_KIND["oil"] | _KIND["oil_place"] | _KIND["temperature"]) - {"ol"}, key=len, reverse=True))
+)
+_OIL_COMPOUND = re.compile(rf"(?:{_OIL_WORD.pattern}){{2,6}}")
+#: The unit at the end of the name of a temperature, as in `OilTempC` or `T_oil_F`, by its letter.
+_TEMPERATURE_LETTER = re.compile(r"(?:[ _.]+(?:deg[ _]?|°)?|(?<=[a-z]))(?P<unit>[CFK]|(?<=[ _.])[cfk])$")
+_TEMPERATURE_UNITS = {"c": "degC", "f": "degF", "k": "K"}
 #: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool may have any unit of
 #: a command (`_is_command_unit`).
 _CHANNELS: dict[str, str] = WORDS["channel"]
@@ -137,7 +146,8 @@ def split_unit(name: str) -> tuple[str, str | None]:
     """Split `PA_bar`, `flow_l_min` or `MainPaBar` into name and unit; (name, None) if there is no such unit at the end.
 
     The unit must be familiar (`is_familiar`), and one of a channel, a time, a velocity, or of a spool or command, such
-    as mA or %. One in `_AMBIGUOUS_UNITS` counts only after a word for its quantity.
+    as mA or %. One in `_AMBIGUOUS_UNITS` counts only after a word for its quantity, and the letter of a temperature's
+    only after words for that of oil.
     """
     parts = name.replace(" ", "_").split("_")
     # the last two words, such as l/min, and the last one
@@ -156,6 +166,8 @@ def split_unit(name: str) -> tuple[str, str | None]:
             is_current_or_fraction(unit) or any(same_dimension(unit, channel_unit) for channel_unit in channel_units)
         ):
             return stem, unit
+    if (letter := _TEMPERATURE_LETTER.search(name)) and _is_named_oil_temperature(name[: letter.start()]):
+        return name[: letter.start()], _TEMPERATURE_UNITS[letter["unit"].casefold()]
     return name, None
 
 
@@ -172,14 +184,30 @@ def ends_in(name: str, words: str) -> bool:
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
 
 
+def _split_temperature_words(name: str) -> set[str]:
+    """Split the name of a temperature into its words; `toil` or `oiltemp` is replaced by its parts."""
+    words = set[str]()
+    for word in _split_words(name):
+        is_compound = _OIL_COMPOUND.fullmatch(word)
+        words |= set(_OIL_WORD.findall(word)) if is_compound else {word}
+    return words
+
+
 def names_oil(name: str) -> bool:
-    """Test whether a name has a word for oil."""
-    return not _split_words(name).isdisjoint(_KIND["oil"])
+    """Test whether a name has a word for oil, possibly joined to one for a temperature: `Toil`."""
+    return not _split_temperature_words(name).isdisjoint(_KIND["oil"])
 
 
 def is_oil_temperature(name: str) -> bool:
-    """Test whether the name of a temperature has a word for oil, or none but for a temperature, as in `TT101`."""
-    return names_oil(name) or {word for word in _split_words(name) if not word.isdigit()} <= _KIND["temperature"]
+    """Test whether the name of a temperature has a word for oil, or only words for its place or for a temperature."""
+    words = {word for word in _split_temperature_words(name) if not word.isdigit()}
+    return bool(words & _KIND["oil"]) or words <= _KIND["temperature"] | _KIND["oil_place"]
+
+
+def _is_named_oil_temperature(name: str) -> bool:
+    """Test whether a name means the temperature of oil even without a unit, such as `Toil` or `Temp`, but not `T`."""
+    words = _split_temperature_words(name) & _KIND["temperature"]
+    return is_oil_temperature(name) and (bool(words) if names_oil(name) else any(len(word) > 3 for word in words))
 
 
 def is_temperature(label: Label) -> bool:
@@ -274,6 +302,8 @@ def _guess_meaning(label: Label, sides: Mapping[str, str] | None = None) -> _Gue
         return None if words & (_KIND["other"] | _KIND["wanted"]) else _Guess("pressure", side, unit)
     if unit is not None and same_dimension(unit, "K"):  # before `other`, whose words include oil
         return _Guess("oil", "", unit) if is_oil_temperature(name) else None
+    if unit is None and _is_named_oil_temperature(name):
+        return _Guess("oil", "", None)
     if words & _MEASURED["spool"]:
         return _Guess("spool", "", unit) if unit is None or _is_command_unit(unit) else None
     if unit is not None and same_dimension(unit, "m^3/s"):
