@@ -7,12 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.optimize import lsq_linear
+from scipy.optimize import least_squares, lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import extend_rests, find_charge_pressure, find_locked_holds
-from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, SideSupply, growth_factor
-from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, residual_squares
+from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, SideSupply, UnitLeak, growth_factor
+from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, fit_leak
+from sealscope.diagnosis.inference.circuit.holds.onset_sums import score_onsets
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -335,43 +336,110 @@ def test_the_growth_of_a_leak_moves_no_onset(since: float) -> None:
     assert best.leak.onset == pytest.approx(since, abs=2.0)
 
 
-def test_volumes_lost_to_a_growing_leak_are_those_of_each_onset_by_itself() -> None:
+def lost_volumes(chambers: HeldChambers, leak: UnitLeak, onset: float) -> Array:
+    """Return the volume lost up to each reading (r,) since an onset, one hold and one side after the other."""
+    columns, first = [], 0
+    for hold in chambers.holds:
+        for is_A, flow in zip((True, False), leak.flows[:, first : first + len(hold.t)], strict=True):
+            volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * np.diff(hold.t))])
+            since = np.where(hold.t >= onset, volume - np.interp(onset, hold.t, volume), 0.0)
+            columns.append(hold.centre(hold.mean(since), is_A))
+        first += len(hold.t)
+    return np.concatenate(columns)
+
+
+@pytest.mark.parametrize("growth", [0.0, 1.5])
+def test_products_of_all_onsets_are_those_of_each_onset_by_itself(growth: float) -> None:
     chambers = held_press(piston=0.3 * SEAL)
-    leak = chambers._unit_piston_leak(PistonLeak())
-    columns = chambers._growing_leak_columns(leak, 1.5)
-    for index in (0, 3, len(chambers.onsets) // 2, len(chambers.onsets) - 1):
-        onset = float(chambers.onsets[index])
-        flows = [
-            flow * growth_factor(hold.t, 1.5, onset, chambers.end)
-            for flow, hold in zip(leak.flows, chambers.holds, strict=True)
-        ]
-        expected = chambers._leak_columns(leak._replace(flows=flows), np.array([onset]))[:, 0]
-        # the kink at the onset lies between two samples
-        assert columns[:, index] == pytest.approx(expected, rel=1e-3, abs=1e-3 * np.abs(expected).max())
+    leak = chambers._unit_piston_leak(PistonLeak(supplies=BOTH))
+    sums = chambers._sum_products(leak, chambers.onsets, growth)
+    regressors = chambers._regressions[BOTH].regressors
+    for onset, found in zip(chambers.onsets.tolist(), sums, strict=True):
+        flows = leak.flows * growth_factor(chambers._samples.t, growth, onset, chambers.end)
+        column = lost_volumes(chambers, leak._replace(flows=flows), onset)
+        expected = np.append(column @ regressors, column @ column)
+        # the kink of a growing leak at the onset lies between two samples
+        assert found == pytest.approx(expected, rel=1e-3 if growth else 1e-9, abs=1e-12 * np.abs(sums).max())
+
+
+@pytest.mark.parametrize("exponent", [1.0, 0.75])
+def test_offsets_are_scored_together_as_each_by_itself(exponent: float) -> None:
+    chambers = held_press(piston=3.0 * SEAL, gain=0.995, loads=(1.0, 0.8, 0.6, 0.4))
+    for supplies in chambers._possible_supplies:
+        leak = PistonLeak(exponent, supplies=supplies)
+        offsets = np.array([-2e5, 0.0, 3e4])
+        together = chambers._find_onsets(leak, offsets)
+        for offset, (score, found) in zip(offsets.tolist(), together, strict=True):
+            alone = chambers._onset_posteriors(chambers._unit_piston_leak(leak._replace(offset=offset)))
+            assert found == leak._replace(offset=offset, onset=float(chambers.onsets[alone.argmax()]))
+            share = 0.5 * chambers.n_readings * math.log(chambers._closed_share(supplies))
+            expected = alone.max() + chambers._conditions_log_prior(found) + share
+            assert score == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("seed", few([0, 1, 2, 3, 4], 2))
+def test_a_leak_and_the_oil_are_fitted_as_by_a_general_least_squares(seed: int) -> None:
+    """The oracle minimises the squares of all readings and of the priors, weighted by the fitted variance."""
+    random, prior = np.random.default_rng(seed), INFERENCE.held_oil
+    chambers = held_press(seed, piston=SEAL * 10.0 ** random.uniform(-1.0, 1.0))
+    regression = chambers._regressions[BOTH]
+    leak = chambers._unit_piston_leak(PistonLeak(supplies=BOTH))
+    column = lost_volumes(chambers, leak, 0.0)
+    sums = np.append(column @ regression.regressors, column @ column)
+    fit = fit_leak(regression, sums, chambers.n_readings)
+    deviations = np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    unit = np.sqrt(fit.variance)
+    scale = np.linalg.norm(regression.displaced) / np.linalg.norm(column)
+
+    def residuals(numbers: Array) -> Array:
+        """Return the residuals of readings and priors, in standard deviations of a reading."""
+        oil, dead_A, dead_B, air = numbers[1:]
+        volumes = np.array([1.0, 1.0 + dead_A, 1.0 + dead_B])
+        lost = regression.displaced - (np.exp(oil) * regression.strained + np.exp(air) * regression.aired) @ volumes
+        weights = np.sqrt(regression.inflation) / deviations
+        return np.append((lost - numbers[0] * scale * column) / unit, numbers[1:] * weights)
+
+    least_dead = prior.least_dead / prior.dead - 1.0
+    bounds = ([-np.inf, -np.inf, least_dead, least_dead, -np.inf], np.inf)
+    oracle = least_squares(residuals, np.array([0.0, 0.0, 0.0, 0.0, 0.0]), bounds=bounds, xtol=1e-14, ftol=1e-14)
+    deviation = math.hypot(fit.by_noise**0.5, fit.by_oil**0.5)
+    assert abs(fit.coefficient - scale * oracle.x[0]) < 0.02 * deviation
+    covariance = np.linalg.inv(oracle.jac.T @ oracle.jac) * regression.inflation
+    if (oracle.x[2:4] > least_dead + 1e-6).all():
+        assert deviation == pytest.approx(scale * covariance[0, 0] ** 0.5, rel=0.02)
 
 
 @pytest.mark.parametrize("seed", few([0, 1, 2, 3, 4], 2))
 def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(seed: int) -> None:
     """A slow oracle solves the same problem, with no negative leak, dead volume, air or compressibility."""
-    random = np.random.default_rng(seed)
-    n_rows, n_onsets = 40, 6
+    random, prior = np.random.default_rng(seed), INFERENCE.held_oil
+    n_rows, n_onsets, n_readings, misfit, inflation = 40, 6, 8.0, 0.1, 4.0
     strained, aired = random.standard_normal((2, n_rows, 3))
-    regression = OilRegression(
-        random.standard_normal(n_rows) * 3.0, strained, aired, inflation=4.0, misfit_variance=0.1
-    )
+    regression = OilRegression(random.standard_normal(n_rows) * 3.0, strained, aired, inflation, misfit)
     columns = random.standard_normal((n_rows, n_onsets))
-    squares = residual_squares(regression, columns, variance=0.5)
-    prior = INFERENCE.held_oil
+    sums = np.column_stack([columns.T @ regression.regressors, (columns**2).sum(axis=0)])
+    scores = score_onsets(regression.onset_priors(variance=0.5, n_readings=n_readings), sums)
     least_dead = prior.least_dead / prior.dead - 1.0
     deviations = np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
-    left, oil = regression.leaked(np.zeros(4)), regression.slopes(np.zeros(4))
-    for onset in range(n_onsets):
-        rows = np.column_stack([np.vstack([oil, np.diag((0.5 * 4.0) ** 0.5 / deviations)]), np.zeros(n_rows + 4)])
-        rows[:n_rows, -1] = columns[:, onset]
-        least = np.expm1(-2.0 * deviations)  # of compressibility and air, whose changes are logarithms
-        lowest = np.array([least[0], max(least_dead, least[1]), max(least_dead, least[2]), least[3], 0.0])
-        oracle = lsq_linear(rows, np.append(left, np.zeros(4)), bounds=(lowest, np.inf), tol=1e-12)
-        assert squares[onset] == pytest.approx(2.0 * oracle.cost, rel=1e-6)
+    least = np.expm1(-2.0 * deviations)  # of compressibility and air, whose changes are logarithms
+    lowest = np.array([least[0], max(least_dead, least[1]), max(least_dead, least[2]), least[3], 0.0])
+    left = regression.displaced - (strained + aired).sum(axis=1)
+    dead = strained[:, 1:] + aired[:, 1:]
+    oil = np.column_stack([strained.sum(axis=1), dead, aired.sum(axis=1)])
+
+    def least_squares_of_onsets(variance: float) -> Array:
+        """Return the residual sum of squares (o,) with priors that are weighted by a variance of a reading."""
+        squares = []
+        for column in columns.T:
+            priors = np.diag((variance * inflation) ** 0.5 / deviations)
+            rows = np.column_stack([np.vstack([oil, priors]), np.append(column, np.zeros(4))])
+            oracle = lsq_linear(rows, np.append(left, np.zeros(4)), bounds=(lowest, np.inf), tol=1e-12)
+            squares.append(2.0 * oracle.cost + misfit * n_rows)
+        return np.array(squares)
+
+    # the priors are weighted by the variance without a leak, then by that of the best onset
+    squares = least_squares_of_onsets(least_squares_of_onsets(0.5).min() / n_rows)
+    assert scores == pytest.approx(-0.5 * n_readings * np.log(squares), rel=1e-6)
 
 
 def test_a_rest_begins_as_the_flow_has_fallen_to_half() -> None:

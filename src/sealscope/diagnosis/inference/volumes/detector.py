@@ -180,6 +180,10 @@ class VolumeBalance:
         - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
+        return compute_once(recording, (self.name, self.rig, "summary"), self._summarise)
+
+    def _summarise(self, recording: Recording) -> Summary | None:
+        """Compute the summary of a healthy recording (`learn`)."""
         recorded = self._compute_blocks(recording)
         balance = self.balance(recording) if recorded is None else self._build_balance(recording, recorded.open)
         if balance is None:

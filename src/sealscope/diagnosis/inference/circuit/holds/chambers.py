@@ -29,15 +29,16 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
+from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, estimate_hold_offsets
 from sealscope.diagnosis.inference.circuit.holds.leaks import (
     BOTH,
     NEITHER,
@@ -56,11 +57,16 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import (
 )
 from sealscope.diagnosis.inference.circuit.holds.oil import (
     CylinderSides,
-    LeakRegression,
     OilRegression,
     build_regression,
-    fit_leaks,
-    residual_squares,
+    fit_leak,
+)
+from sealscope.diagnosis.inference.circuit.holds.onset_sums import (
+    HoldSamples,
+    OnsetPriors,
+    score_offsets,
+    score_onsets,
+    sum_onset_products,
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
 from sealscope.diagnosis.inference.onset import Estimate, Interval
@@ -120,11 +126,28 @@ class HeldChambers:
         return independent * 2.0 * len(self.holds)
 
     @cached_property
+    def _samples(self) -> HoldSamples:
+        """Samples of all holds, one after the other, for compiled functions."""
+        return HoldSamples.from_holds(self.holds)
+
+    def _join(self, values: Iterable[NDArray[Any]]) -> NDArray[Any]:
+        """Join values of each hold, (..., n) for n samples, to those of the N samples of all holds, (..., N)."""
+        return np.concatenate(list(values), axis=-1)
+
+    @cached_property
     def _regressions(self) -> dict[SideSupplies, OilRegression]:
         """Regressions that estimate the oil's properties, one for each possible choice of the sides' supplies."""
         return {
             supplies: build_regression(self.holds, self._closed_flags(supplies), self.sides, self.n_readings)
             for supplies in (NEITHER, self._refillable_sides, BOTH, self._unloaded_open)
+        }
+
+    @cached_property
+    def _onset_priors(self) -> dict[SideSupplies, OnsetPriors]:
+        """Numbers by which onsets of a leak are scored, for each of the `_regressions`."""
+        return {
+            supplies: regression.onset_priors(self._variances_without_leak[supplies], self.n_readings)
+            for supplies, regression in self._regressions.items()
         }
 
     @property
@@ -205,33 +228,42 @@ class HeldChambers:
         )
         return [is_shut | (has_check & flags) for flags in self._above_charge]
 
+    @cached_property
+    def _closed_samples(self) -> dict[SideSupplies, NDArray[np.bool_]]:
+        """Flags (2, N) of the samples of all holds in which A or B is closed, by the supplies of A and B."""
+        return {supplies: self._join(self._closed_flags(supplies)) for supplies in self._regressions}
+
     def _closed_share(self, supplies: SideSupplies) -> float:
         """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
 
         While a side is not closed, its readings are constant and fit any leak: the variance of all readings is too
         small by this factor.
         """
-        share = float(np.concatenate(self._closed_flags(supplies), axis=1).mean())
+        share = float(self._closed_samples[supplies].mean())
         return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
+    def _hold_offsets(self, offsets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
+        """Estimate the sensor offset in each of H holds for g offsets of the recording, (g, H) each.
+
+        See `estimate_hold_offsets`.
+        """
+        last_A, last_B = np.array([hold.last_pressures for hold in self.holds]).T
+        return estimate_hold_offsets(last_A, last_B, offsets[:, None])
+
     def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
-        """Compute the flow past the piston in each hold for a `leak` with a coefficient of 1.
+        """Compute the flow past the piston in the holds for a `leak` with a coefficient of 1.
 
         With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`. The sensor offset z
         in a hold may differ from the recording's (`LockedHold.driving_pressure`).
         """
-        flows = []
-        for hold in self.holds:
-            difference = hold.driving_pressure(leak.offset)
-            flow = np.sign(difference) * np.abs(difference) ** leak.exponent
-            flow *= growth_factor(hold.t, leak.growth, leak.onset, self.end)
-            flows.append(np.array([flow, -flow]))
-        return self._while_closed(flows, leak.supplies)
+        difference = self._join(hold.driving_pressure(leak.offset) for hold in self.holds)
+        flow = np.sign(difference) * np.abs(difference) ** leak.exponent
+        flow *= growth_factor(self._samples.t, leak.growth, leak.onset, self.end)
+        return self._while_closed(np.array([flow, -flow]), leak.supplies)
 
-    def _while_closed(self, flows: Sequence[Array], supplies: SideSupplies) -> UnitLeak:
-        """Set `flows` (2, n) out of A and B, for each hold of n samples, to 0 while a side is not closed."""
-        is_closed = self._closed_flags(supplies)
-        return UnitLeak([sides * flags for sides, flags in zip(flows, is_closed, strict=True)], supplies)
+    def _while_closed(self, flows: Array, supplies: SideSupplies) -> UnitLeak:
+        """Set `flows` (2, N) out of A and B to 0 while a side is not closed."""
+        return UnitLeak(flows * self._closed_samples[supplies], supplies)
 
     def pressure_difference(self, t: Array, difference: Array, offset: float) -> Array:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
@@ -252,9 +284,8 @@ class HeldChambers:
         It is the gauge pressure of the side, at least 0, and 0 while the side is not closed: its supply, in `supplies`,
         then replaces or takes the oil.
         """
-        pressures = [hold.p_A if is_A else hold.p_B for hold in self.holds]
-        flows = [flow_of_side(np.maximum(p - P_ATM, 0.0), is_A) for p in pressures]
-        return self._while_closed(flows, supplies)
+        pressure = self._join(hold.p_A if is_A else hold.p_B for hold in self.holds)
+        return self._while_closed(flow_of_side(np.maximum(pressure - P_ATM, 0.0), is_A), supplies)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
         """Compute the flow [Pa] from A (or B, if not `is_A`) through open valves and the pump, for a conductance of 1.
@@ -262,18 +293,15 @@ class HeldChambers:
         The other chamber has no flow, since check valves or a shuttle valve keep it at the charge pressure.
         """
         sign = 1.0 if is_A else -1.0
-        flows = []
-        for hold in self.holds:
-            hold_offset, *_ = hold.offset_in_hold(0.0)  # 0: the offset of the recording is not known here
-            flow = np.maximum(sign * (hold.p_A - hold.p_B - hold_offset), 0.0)
-            flows.append(flow_of_side(flow, is_A))
-        return UnitLeak(flows)
+        # 0: the offset of the recording is not known here
+        differences = (hold.difference - hold.offset_in_hold(0.0)[0] for hold in self.holds)
+        return UnitLeak(flow_of_side(np.maximum(sign * self._join(differences), 0.0), is_A))
 
     @cached_property
-    def _fits_without_leak(self) -> dict[SideSupplies, LeakRegression]:
-        """Fits of the oil's properties without any leak, by the supplies of A and B."""
+    def _variances_without_leak(self) -> dict[SideSupplies, float]:
+        """Variance of a reading [m^6] without any leak, by the supplies of A and B."""
         return {
-            supplies: fit_leaks(regression, np.empty((len(regression.displaced), 0)), self.n_readings)
+            supplies: fit_leak(regression, np.empty(0), self.n_readings).variance
             for supplies, regression in self._regressions.items()
         }
 
@@ -288,8 +316,17 @@ class HeldChambers:
         A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the
         recording's, in standard deviations (`LockedHold.offset_in_hold`).
         """
-        offset_costs = [float(offset_cost(leak.offset)), *(hold.offset_in_hold(leak.offset)[1] for hold in self.holds)]
-        return self._supply_log_prior(leak.supplies, drains=True) - 0.5 * sum(offset_costs)
+        costs = self._offset_costs(np.array([leak.offset]))
+        return self._supply_log_priors[leak.supplies] - 0.5 * float(costs[0])
+
+    def _offset_costs(self, offsets: Array) -> Array:
+        """Compute -2 log prior (g,) of sensor `offsets` (g,) [Pa] of the recording, with those of its holds."""
+        return np.asarray(offset_cost(offsets) + self._hold_offsets(offsets)[1].sum(axis=1))
+
+    @cached_property
+    def _supply_log_priors(self) -> dict[SideSupplies, float]:
+        """Log prior of the sides' supplies while the piston leaks (`_supply_log_prior`)."""
+        return {supplies: self._supply_log_prior(supplies, drains=True) for supplies in self._regressions}
 
     def start_error(self, leak: PistonLeak) -> float:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
@@ -332,14 +369,13 @@ class HeldChambers:
 
     def _fit_leak(self, leak: UnitLeak, onset: float) -> LeakFit:
         """Fit the coefficient (>= 0) of a leak since `onset` [s] to all holds; 0 +- `UNKNOWN` if it has no flow."""
-        column = self._leak_columns(leak, np.array([onset]))
-        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, self._fits_without_leak[leak.supplies].variance
-        if column.any():
-            fit = fit_leaks(self._regressions[leak.supplies], column, self.n_readings)
-            # the leak is the only coefficient
-            deviation, by_oil = float(fit.by_noise[0, 0]) ** 0.5, float(max(fit.by_oil[0, 0], 0.0)) ** 0.5
-            if not fit.coefficients[0] < 0.0:  # no leak flows from the lower to the higher pressure
-                value, variance = float(fit.coefficients[0]), fit.variance
+        sums = self._sum_products(leak, np.array([onset]))[0]
+        value, deviation, by_oil, variance = 0.0, UNKNOWN, 0.0, self._variances_without_leak[leak.supplies]
+        if sums[-1] > 0.0:
+            fit = fit_leak(self._regressions[leak.supplies], sums, self.n_readings)
+            deviation, by_oil = fit.by_noise**0.5, max(fit.by_oil, 0.0) ** 0.5
+            if not fit.coefficient < 0.0:  # no leak flows from the lower to the higher pressure
+                value, variance = fit.coefficient, fit.variance
         closed_variance = variance / self._closed_share(leak.supplies)  # without readings that fit any leak
         return LeakFit(value, deviation, by_oil, log_likelihood=-0.5 * self.n_readings * math.log(closed_variance))
 
@@ -375,56 +411,19 @@ class HeldChambers:
         from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1  # each hold has later ones
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / n_later))))
 
-    def _leak_columns(self, leak: UnitLeak, onsets: Array) -> Array:
-        """Compute the volume lost up to each of r readings through a leak that begins at each of o `onsets`, (r, o).
-
-        With the volume V(t) that a leak from the start of the hold has lost, a sample at t shows V(t) - V(onset), or 0
-        before the onset. The rows are those of `build_regression`.
-        """
-        columns = []
-        for hold, sides in zip(self.holds, leak.flows, strict=True):
-            steps = np.diff(hold.t)
-            # samples `first` (k, o) to `last` - 1 of each of k readings, which are not before the onset
-            last = hold.edges[1:, None]
-            first = np.minimum(np.maximum(hold.edges[:-1, None], np.searchsorted(hold.t, onsets)), last)
-            counts, sizes = last - first, hold.sizes[:, None]
-            for is_A, flow in zip((True, False), sides, strict=True):
-                volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * steps)])
-                volume_before = np.interp(onsets, hold.t, volume)  # V(onset)
-                sums = np.concatenate([[0.0], np.cumsum(volume)])  # differences are sums over samples
-                readings = (sums[last] - sums[first] - counts * volume_before) / sizes
-                columns.append(hold.centre(readings, is_A))
-        return np.vstack(columns)
+    def _sum_products(self, leak: UnitLeak, onsets: Array, growth: float = 0.0) -> Array:
+        """Sum the products of the leak's readings for each of o `onsets` (`sum_onset_products`), (o, 8)."""
+        regressors = self._regressions[leak.supplies].regressors
+        return np.asarray(sum_onset_products(self._samples, leak.flows, growth, self.end, onsets, regressors))
 
     def _onset_posteriors(self, leak: UnitLeak, growth: float = 0.0) -> Array:
         """Compute the log posterior probability of each possible onset of a leak (`onsets`), shape (o,).
 
         It is log prior - N/2 log(residual sum of squares), up to a constant, for N independent readings and a
-        coefficient >= 0, with the properties of the oil eliminated. The variance of the readings weights the priors of
-        these: first without a leak, then with the most probable onset. `growth`: as in `PistonLeak`.
+        coefficient >= 0, with the properties of the oil eliminated (`score_onsets`). `growth`: as in `PistonLeak`.
         """
-        regression = self._regressions[leak.supplies]
-        variance, n_rows = self._fits_without_leak[leak.supplies].variance, len(regression.displaced)
-        columns = self._growing_leak_columns(leak, growth)
-        for _ in range(2):
-            squares = residual_squares(regression, columns, variance) + regression.misfit_variance * n_rows
-            variance = float(squares.min()) / n_rows
-        return np.asarray(self._onset_log_priors - 0.5 * self.n_readings * np.log(squares))
-
-    def _growing_leak_columns(self, leak: UnitLeak, growth: float) -> Array:
-        """Compute the volume lost up to each of r readings through a leak that grows from each of `onsets`, (r, o).
-
-        With the relative growth g from the onset s to the end e of the recording, the flow u of the leak becomes
-
-                    (1 + g (t - s)/(e - s)) u = (1 - g s/(e - s)) u + g/(e - s) t u.
-        """
-        columns = self._leak_columns(leak, self.onsets)
-        if not growth:
-            return columns
-        times_flow = [flow * hold.t for flow, hold in zip(leak.flows, self.holds, strict=True)]
-        rates = growth / np.maximum(self.end - self.onsets, np.finfo(float).tiny)  # growth per second
-        growing = self._leak_columns(leak._replace(flows=times_flow), self.onsets)
-        return np.asarray((1.0 - rates * self.onsets) * columns + rates * growing)
+        sums = self._sum_products(leak, self.onsets, growth)
+        return np.asarray(self._onset_log_priors + score_onsets(self._onset_priors[leak.supplies], sums))
 
     @cached_property
     def _offset_grid(self) -> Array:
@@ -454,21 +453,30 @@ class HeldChambers:
         grid, fits = self._offset_grid, list[tuple[float, PistonLeak]]()
         for supplies in self._possible_supplies:
             leak = PistonLeak(exponent, supplies=supplies)
-            coarse_fits = [self._find_onset(leak._replace(offset=offset)) for offset in grid.tolist()]
+            coarse_fits = self._find_onsets(leak, grid)
             best = int(np.argmax([posterior for posterior, _ in coarse_fits]))
             refined = np.linspace(grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)], N_REFINED)
-            fits += [self._find_onset(leak._replace(offset=offset)) for offset in refined.tolist()]
-            fits.append(coarse_fits[best])
+            fits += [*self._find_onsets(leak, refined), coarse_fits[best]]
         return max(fits, key=lambda fit: fit[0])[1]  # with the highest posterior
 
-    def _find_onset(self, leak: PistonLeak) -> tuple[float, PistonLeak]:
-        """Find the most probable onset of a `leak` with given offset and supplies; return its log posterior first."""
-        posteriors = self._onset_posteriors(self._unit_piston_leak(leak))
-        index = int(posteriors.argmax())
+    def _find_onsets(self, leak: PistonLeak, offsets: Array) -> list[tuple[float, PistonLeak]]:
+        """Find the most probable onset of a `leak` for each sensor offset; return each log posterior and leak."""
+        regression, priors = self._regressions[leak.supplies], self._onset_priors[leak.supplies]
+        hold_offsets, _, is_equalised = self._hold_offsets(offsets)
+        scores = self._onset_log_priors + score_offsets(
+            priors, self._samples, hold_offsets, is_equalised, leak.exponent, INFERENCE.held_oil.resolved,
+            self._closed_samples[leak.supplies], self.onsets, regression.regressors,
+        )  # fmt: skip
         # the variance of readings, which is too small by this share, must be no evidence for sides that are not closed
         correction = 0.5 * self.n_readings * math.log(self._closed_share(leak.supplies))
-        log_posterior = float(posteriors[index]) + self._conditions_log_prior(leak) + correction
-        return log_posterior, leak._replace(onset=float(self.onsets[index]))
+        conditions = self._supply_log_priors[leak.supplies] - 0.5 * self._offset_costs(offsets)
+        log_posteriors, best = scores.max(axis=1) + conditions + correction, scores.argmax(axis=1)
+        return [
+            (log_posterior, leak._replace(onset=onset, offset=offset))
+            for log_posterior, onset, offset in zip(
+                log_posteriors.tolist(), self.onsets[best].tolist(), offsets.tolist(), strict=True
+            )
+        ]
 
     @cached_property
     def _laws(self) -> list[tuple[PistonLeak, float, Array]]:
@@ -505,10 +513,7 @@ class HeldChambers:
         for leak, (growth, probability) in itertools.product(leaks, growth_priors()):
             index = int(self._onset_posteriors(leak, growth).argmax())
             onset = float(self.onsets[index])
-            flows = [
-                flow * growth_factor(hold.t, growth, onset, self.end)
-                for flow, hold in zip(leak.flows, self.holds, strict=True)
-            ]
+            flows = leak.flows * growth_factor(self._samples.t, growth, onset, self.end)
             fit = self._fit_leak(leak._replace(flows=flows), onset)
             mean_ratio = 1.0 + 0.5 * growth  # mean over initial coefficient, for a linear growth
             fits.append((fit.scale(mean_ratio, fit.log_likelihood), index))  # scaling does not change the likelihood
@@ -521,10 +526,7 @@ class HeldChambers:
     def _mean_unit_flow(self, leak: PistonLeak) -> float:
         """Compute the mean magnitude of the flow past the piston in holds after the onset, for a coefficient of 1."""
         unit_leak = self._unit_piston_leak(leak._replace(supplies=NEITHER))
-        flows = [  # row 0 is the flow out of A
-            np.abs(sides[0])[hold.t >= leak.onset] for hold, sides in zip(self.holds, unit_leak.flows, strict=True)
-        ]
-        after_onset = np.concatenate(flows)
+        after_onset = np.abs(unit_leak.flows[0])[self._samples.t >= leak.onset]  # row 0 is the flow out of A
         # at least a tiny number, as a divisor
         return max(float(after_onset.mean()) if after_onset.size else 0.0, float(np.finfo(float).tiny))
 

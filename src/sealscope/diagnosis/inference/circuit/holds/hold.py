@@ -6,10 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import law
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.motion import find_runs
 from sealscope.recordings.recording import Array
@@ -21,6 +23,12 @@ FIRST_READING, GROWTH, MIN_READINGS = 0.05, 1.2, 8
 MAX_RATE = 100.0
 #: Quantile of the lower chamber pressure that counts as charge pressure.
 LOWEST = 0.02
+
+
+@law
+def small_difference_factor(difference: Any, resolved: float) -> Any:
+    """Compute the factor d^2 / (d^2 + r^2) of a pressure difference d, with the smallest resolved one r [Pa]."""
+    return difference**2 / (difference**2 + resolved**2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,35 +76,27 @@ class LockedHold:
         centred[:first] = 0.0
         return centred
 
+    @cached_property
+    def last_pressures(self) -> tuple[float, float]:
+        """Mean pressures of A and B [Pa] in the last interval."""
+        return float(self.p_A[self.edges[-2] :].mean()), float(self.p_B[self.edges[-2] :].mean())
+
     def offset_in_hold(self, offset: float) -> tuple[float, float, bool]:
-        """Estimate the sensor offset of p_A - p_B [Pa] in this hold, given the recording's `offset` [Pa].
-
-        If the two sensors differ in gain, the offset of a hold is normal about `offset`, with a standard deviation s of
-        `held_oil.gain` (`priors.toml`) times the higher pressure at the end of the hold. The more probable of two cases
-        is assumed: a leak has equalised the pressures, and the recorded p_A - p_B at the end is the offset of the hold;
-        or a load causes p_A - p_B, equally probable up to the higher pressure, and the offset is `offset`.
-
-        Returns the offset of the hold, ((offset of the hold - `offset`) / s)^2, and True in the first case.
-        """
-        last_A, last_B = (float(p[self.edges[-2] :].mean()) for p in (self.p_A, self.p_B))
-        pressure, difference = max(last_A, last_B), last_A - last_B
-        deviation = INFERENCE.held_oil.gain * pressure
-        cost = ((difference - offset) / deviation) ** 2
-        # log densities of `difference` in the two cases
-        is_equalised = -0.5 * cost - math.log(deviation * math.sqrt(2.0 * math.pi)) > -math.log(pressure)
-        return (difference, cost, True) if is_equalised else (offset, 0.0, False)
+        """Estimate the sensor offset [Pa] in this hold, given the recording's `offset` (`estimate_hold_offsets`)."""
+        hold_offset, cost, is_equalised = estimate_hold_offsets(*self.last_pressures, offset)
+        return float(hold_offset), float(cost), bool(is_equalised)
 
     def driving_pressure(self, offset: float) -> Array:
         """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
 
         Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
-        exceed that of the large difference before. In such holds d is multiplied by d^2 / (d^2 +
-        `held_oil.resolved`^2).
+        exceed that of the large difference before. In such holds d is multiplied by the `small_difference_factor` of
+        `held_oil.resolved`.
         """
         offset_here, _, is_equalised = self.offset_in_hold(offset)
         difference = np.asarray(self.difference - offset_here)
         if is_equalised:
-            difference *= difference**2 / (difference**2 + INFERENCE.held_oil.resolved**2)
+            difference *= small_difference_factor(difference, INFERENCE.held_oil.resolved)
         return difference
 
     def steepest_time(self) -> float:
@@ -108,6 +108,27 @@ class LockedHold:
         n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
         difference = self.difference
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
+
+
+def estimate_hold_offsets(
+    last_A: Array | float, last_B: Array | float, offset: Array | float
+) -> tuple[Array, Array, NDArray[np.bool_]]:
+    """Estimate the sensor offset of p_A - p_B [Pa] in holds, given the recording's `offset` [Pa].
+
+    If the two sensors differ in gain, the offset of a hold is normal about `offset`, with a standard deviation s of
+    `held_oil.gain` (`priors.toml`) times the higher pressure at the end of the hold. The more probable of two cases is
+    assumed: a leak has equalised the pressures, and the recorded p_A - p_B at the end is the offset of the hold; or a
+    load causes p_A - p_B, equally probable up to the higher pressure, and the offset is `offset`.
+
+    `last_A`, `last_B`: pressures at the end of each hold (`LockedHold.last_pressures`). Returns the offset of the hold,
+    ((offset of the hold - `offset`) / s)^2, and True in the first case, each in the joint shape of the arguments.
+    """
+    pressure, difference = np.maximum(last_A, last_B), np.subtract(last_A, last_B)
+    deviation = INFERENCE.held_oil.gain * pressure
+    cost = ((difference - offset) / deviation) ** 2
+    # log densities of `difference` in the two cases
+    is_equalised = -0.5 * cost - np.log(deviation * math.sqrt(2.0 * math.pi)) > -np.log(pressure)
+    return np.where(is_equalised, difference, offset), np.where(is_equalised, cost, 0.0), np.asarray(is_equalised)
 
 
 def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: float) -> float:

@@ -37,11 +37,12 @@ BOTH: SideSupplies = (SideSupply.CHECK, SideSupply.CHECK)
 class UnitLeak(NamedTuple):
     """Flow of a leak with a coefficient of 1 while shut valves hold the load.
 
-    `flows`: for each hold of n samples the flow out of A (first row) and out of B, (2, n), in Pa^e for the exponent e
-    of the law (laminar: 1), 0 while the side's supply replaces or takes the oil; `supplies`: those of A and B.
+    `flows` (2, N): at the N samples of all holds, one after the other, the flow out of A (first row) and out of B, in
+    Pa^e for the exponent e of the law (laminar: 1), 0 while the side's supply replaces or takes the oil; `supplies`:
+    those of A and B.
     """
 
-    flows: Sequence[Array]
+    flows: Array
     supplies: SideSupplies = NEITHER
 
 
