@@ -59,8 +59,9 @@ class Examination:
     rig: Rig | str | os.PathLike[str] = "thesis"  # sizes of the machine that the detectors assume
     distrust: str | None = None  # reason why the pressures cannot be trusted, in which case no detector runs
     refusal: str | None = None  # reason why none of the given healthy recordings can be compared
-    # fractions of the original samples: those that `recording` contains, and those up to its last time
+    # fractions of the original samples: those that `recording` contains, those before it, those up to its last time
     share: float = 1.0
+    judged_from: float = 0.0
     judged_until: float = 1.0
     _reports: dict[str, Observed] = field(default_factory=dict, init=False)  # by detector; `replace` starts anew
 
@@ -124,8 +125,15 @@ class Examination:
                 decisions[name] = self._decide_by(name, reports)
         reports_in_order = [self.report(name) for name in ORDER if name in decisions]  # of measuring detectors
         refusals = [report.lack if report.has_failed else report.refusal for report in reports_in_order]
-        refusal = self.refusal or next(filter(None, refusals), None)  # reason not to state "no leak"
+        # reason not to state "no leak"
+        refusal = self.refusal or next(filter(None, refusals), None) or self._unseen_beginning()
         return combine(list(decisions.values()), refusal)
+
+    def _unseen_beginning(self) -> str | None:
+        """Say that a leak may have begun before the first judged sample, where no healthy recording would show it."""
+        if self.baseline or self.judged_from <= DECISION.worth.unjudged:
+            return None
+        return text_of("doubt", "beginning", percent=100.0 * self.judged_from)
 
     def _decide_by(self, name: str, reports: Sequence[Observed], *, weigh_rivals: bool = True) -> Evidence:
         """Decide from the observations of the detector called `name` if the machine leaks (`decide`)."""
@@ -209,6 +217,7 @@ def diagnose(
             distrust=inspection.distrust,
             refusal=comparable.refusal,
             share=inspection.share,
+            judged_from=inspection.judged_from,
             judged_until=inspection.judged_until,
         )
         evidence = examination.decide_by_all()

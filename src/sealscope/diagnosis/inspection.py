@@ -12,8 +12,6 @@ from functools import cached_property
 from hashlib import sha256
 from typing import NamedTuple
 
-import numpy as np
-
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import chambers_of
@@ -38,6 +36,7 @@ class Inspection:
     findings: tuple[Finding, ...]  # defects found in the whole recording
     distrust: str | None  # reason why the chamber pressures cannot be trusted; None if they can
     share: float  # fraction of the recording's samples between the first and the last time of `part`
+    judged_from: float = 0.0  # fraction of the recording's samples before the first time of `part`
     judged_until: float = 1.0  # fraction of the recording's samples up to the last time of `part`
 
     @property
@@ -81,7 +80,7 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     """Correct the samples of a recording, find the defects of the channels `names`, and test if it can be trusted."""
     chambers = chambers_of(recording)
     # `stuck`: names of chamber pressures that repeat one value for too long
-    part, corrections, stuck, share = correct_samples(recording)
+    part, corrections, stuck, share, unjudged_before, unjudged_after = correct_samples(recording)
     findings = (*inspect(recording.only(names)), *corrections)
     chamber_findings = [finding for finding in findings if finding.channel in chambers]
     defects = [finding for finding in chamber_findings if finding.code == "constant"]
@@ -94,9 +93,7 @@ def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
     # a shorter part has a `defect` in any case
     if distrust is None and len(part) >= SHORTEST and (reason := find_implausibility(part)):
         distrust = f"this is no recording of a hydraulic machine: {reason}"
-    # fraction of all samples up to the end of `part`
-    judged_until = np.count_nonzero(recording.t <= part.t[-1]) / len(recording) if len(part) else 0.0
-    return Inspection(part, findings, distrust, share, float(judged_until))
+    return Inspection(part, findings, distrust, share, unjudged_before, 1.0 - unjudged_after)
 
 
 def _defect_name(finding: Finding) -> str:

@@ -14,6 +14,9 @@ class ClockPriors(PriorTable):
     near: float  # [usual intervals, i.e. medians] longest interval in which no sample is missing
     lost: float  # largest fraction of lost samples in one recording
     late: float  # largest fraction of samples with a time that is not later than all before
+    leap: float  # [s] smallest step of a clock that was set, and did not wait
+    pause: float  # [s] pause of unknown length before a logger that restarts
+    meet: tuple[float, float]  # [usual intervals] mean step between late rows that are sorted to their places
 
 
 class StalePriors(PriorTable):

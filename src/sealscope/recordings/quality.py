@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
 from typing import Any, Literal, NamedTuple
@@ -27,6 +28,7 @@ SHORTEST = 226  # fewest samples of a recording, the length of db8's level-4 fil
 _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS, _GAPS = (
     RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible, RECORDINGS.gaps
 )  # fmt: skip
+_MAX_TEXT = 400  # longest text taken from the provenance of a file
 #: Intervals between these numbers of sampling steps are regular; a longer one is a gap, unless a logger polls.
 _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
@@ -53,9 +55,11 @@ class Finding:
 def inspect(recording: Recording) -> tuple[Finding, ...]:
     """Find the defects of a recording's times and channels.
 
-    Codes of the time: ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``,
-    ``rate_mismatch``, ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``,
-    ``impossible``, ``clipped``, ``stuck``, ``mains_hum``, ``raw_counts``; of both chambers: ``creeping_pressures``.
+    Codes of what was found when the file was read: ``clock_wrapped``, ``wrong_times``, ``rows_written_twice``,
+    ``rows_sorted``, ``clock_set``, ``clock_restarted``. Codes of the time: ``too_short``, ``missing_time``,
+    ``reversed_time``, ``duplicated_time``, ``gap``, ``rate_mismatch``, ``irregular_sampling``; of a channel:
+    ``missing``, ``mixed_rate``, ``infinite``, ``constant``, ``impossible``, ``clipped``, ``stuck``, ``mains_hum``,
+    ``raw_counts``; of both chambers: ``creeping_pressures``.
 
     Parameters
     ----------
@@ -79,7 +83,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     warning constant - p_A: is constant at 300000 Pa
     """
     with np.errstate(all="ignore"):
-        findings = _time_findings(recording)
+        findings = [*_clock_findings(recording), *_time_findings(recording)]
         for name, values in recording.channels.items():
             findings += _channel_findings(recording, name, values) if name not in SLOW else []
         findings += _creep_findings(recording)
@@ -97,6 +101,30 @@ def _make_finding(
     """Make a finding on `count` samples; its time is that of the sample with index `first`, None if unknown."""
     t = float(recording.t[first]) if first < recording.t.size else np.nan
     return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
+
+
+def _clock_findings(recording: Recording) -> list[Finding]:
+    """List what was found about the order of the rows when a recording was read, from the entry `clock` of its origin.
+
+    Entries that are not written by `formats.table` are ignored: the provenance of a file may hold anything.
+    """
+    entries = recording.provenance.get("clock")
+    findings = []
+    for entry in entries if isinstance(entries, Sequence) and not isinstance(entries, str) else ():
+        with suppress(KeyError, TypeError, ValueError):
+            severity: Severity = "warning" if entry["severity"] == "warning" else "note"
+            code, text = str(entry["code"])[:_MAX_TEXT], str(entry["text"])[:_MAX_TEXT]
+            findings.append(Finding(code, severity, None, int(entry["count"]), float(entry["first_t"]), text))
+    return findings
+
+
+def _is_known_break(recording: Recording, times: Array) -> NDArray[np.bool_]:
+    """Flag the times (n,) [s] at which a clock was set or a logger restarted, by the recording's provenance."""
+    breaks = recording.provenance.get("clock_breaks")
+    try:
+        return np.isin(times, np.asarray(breaks if breaks is not None else (), dtype=np.float64))
+    except (TypeError, ValueError):
+        return np.zeros(times.size, dtype=bool)
 
 
 def _time_findings(recording: Recording) -> list[Finding]:
@@ -134,6 +162,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
         if max_step > _MAX_STEP:  # a logger that polls: from sample to sample it takes the mean of its intervals
             sampling_step = float(positive_steps[positive_steps <= max_step * step].mean())
         gaps = np.flatnonzero(steps > max_step * step)
+        gaps = gaps[~_is_known_break(recording, t[timed[gaps + 1]])]  # the pause of a restart is only assumed
         n_lost = np.round((steps[gaps] - step) / sampling_step).sum()  # infinite if a time is absurd
         samples = format_count(int(n_lost), "sample") if n_lost < 1e15 else f"{n_lost:.3g} samples"
         longest = float(steps[gaps].max(initial=0.0))

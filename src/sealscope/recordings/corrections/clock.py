@@ -1,4 +1,4 @@
-"""An even clock for samples that were polled at uneven times.
+"""An even clock for samples whose times step back, or that were polled at uneven times.
 
 The diagnosis integrates over an even clock. Uneven samples are interpolated linearly to the recording's rate;
 integrated, that is about the trapezoidal rule over the recorded times. Between samples that are far apart, values are
@@ -8,13 +8,17 @@ missing; `corrections.gaps` bridges and marks them. Called by the inspection.
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.formats.times.row_order import COUNTERS, order_rows
 from sealscope.recordings.formats.times.timebase import interpolate_samples
 from sealscope.recordings.priors import RECORDINGS
+from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.clock
@@ -22,15 +26,54 @@ _PRIORS = RECORDINGS.clock
 MAX_INTERVAL: float = _PRIORS.near
 
 
+class OrderedRecording(NamedTuple):
+    """A recording whose times do not step back."""
+
+    recording: Recording
+    findings: tuple[Finding, ...]
+    n_before: int = 0  # number of rows left out before the first row
+    n_after: int = 0  # number of rows left out after the last row
+
+
+def order_recording(recording: Recording) -> OrderedRecording:
+    """Bring the rows of a recording into the order of time (`row_order.order_rows`).
+
+    Where no order is found, all rows are left out but the longest run of rows whose times do not step back.
+    """
+    ordered = order_rows(recording.t, list(recording.channels.values()), COUNTERS)
+    if ordered.events:
+        order = np.arange(len(recording)) if ordered.rows is None else ordered.rows
+        channels = {name: values[order] for name, values in recording.channels.items()}
+        recording = replace(recording, t=ordered.t, channels=channels)
+    findings = [
+        Finding(event.code, event.severity, None, event.number, float(ordered.t[event.row]), f"time {event.text}")
+        for event in ordered.events
+    ]
+    timed = np.flatnonzero(np.isfinite(recording.t))
+    starts = np.flatnonzero(np.diff(recording.t[timed]) < 0.0) + 1
+    if not starts.size:
+        return OrderedRecording(recording, tuple(findings))
+    run = max(np.split(timed, starts), key=len)
+    n_left_out = len(recording) - run.size
+    text = f"time steps back {format_count(starts.size, 'time')} and shows no order: "
+    text += f"{format_count(n_left_out, 'row')} of {len(recording)} left out"
+    first = float(recording.t[timed[starts[0]]])
+    findings.append(Finding("rows_left_out", "warning", None, n_left_out, first, text))
+    rows = slice(int(run[0]), int(run[-1]) + 1)
+    return OrderedRecording(recording.samples(rows), tuple(findings), rows.start, len(recording) - rows.stop)
+
+
 def resample_evenly(recording: Recording) -> Recording:
     """Resample a recording to evenly spaced times, with NaN in rows that the logger has lost.
 
-    Rows without a time, or not later than all rows before (`_ordered_rows`), are dropped. If long breaks divide the
-    recording, only its longest stretch is used. If the intervals are then whole numbers of sampling steps, to within
-    `clock.scatter` of `priors.toml` (rms), rows of NaN are inserted for lost samples; else the samples are interpolated
-    linearly. A recording that needs none of this is returned as it is.
+    Rows without a time, or not later than all rows before, are dropped (`order_recording` comes first). If long breaks
+    divide the recording, only its longest stretch is used. If the intervals are then whole numbers of sampling steps,
+    to within `clock.scatter` of `priors.toml` (rms), rows of NaN are inserted for lost samples; else the samples are
+    interpolated linearly. A recording that needs none of this is returned as it is.
     """
-    rows = _ordered_rows(recording.t)
+    timed = np.flatnonzero(np.isfinite(recording.t))
+    latest_time = np.maximum.accumulate(recording.t[timed])
+    rows = timed[np.diff(latest_time, prepend=-np.inf) > 0.0]
     rows = rows[_longest_dense_stretch(recording.t[rows], recording.rate)]
     if rows.size < 2:  # too few for a clock
         return recording.samples(slice(rows[0], rows[0] + 1) if rows.size else slice(0))
@@ -42,24 +85,6 @@ def resample_evenly(recording: Recording) -> Recording:
             return recording
         return _insert_lost_rows(recording, rows, n_steps.astype(np.int64))
     return _interpolate_rows(recording, rows)
-
-
-def _ordered_rows(t: Array) -> NDArray[np.intp]:
-    """Find the indices of the rows that are later than all earlier rows of a log; `t` (n,): times [s], NaN if missing.
-
-    If more than the fraction `clock.late` (`priors.toml`) of the timed rows are out of this order, the result is the
-    longest run of rows whose times do not step back, without repeated times.
-    """
-    timed = np.flatnonzero(np.isfinite(t))
-    if timed.size < 2:
-        return timed
-    latest_time = np.maximum.accumulate(t[timed])
-    is_out_of_order = np.r_[False, t[timed][1:] <= latest_time[:-1]]
-    if np.mean(is_out_of_order) <= _PRIORS.late:
-        return np.asarray(timed[~is_out_of_order])
-    runs = np.split(timed, np.flatnonzero(np.diff(t[timed]) < 0.0) + 1)
-    run = max(runs, key=len)
-    return np.asarray(run[np.r_[True, np.diff(t[run]) > 0.0]])
 
 
 def _longest_dense_stretch(t: Array, rate: float) -> slice:

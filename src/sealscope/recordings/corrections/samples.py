@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.corrections.clock import resample_evenly
+from sealscope.recordings.corrections.clock import order_recording, resample_evenly
 from sealscope.recordings.corrections.gaps import (
     bridge,
     flag_holes,
@@ -39,12 +39,16 @@ class CorrectedSamples(NamedTuple):
     recording: Recording  # evenly spaced, from the first to the last row with all chamber pressures and the command
     findings: tuple[Finding, ...]  # the corrections that `correct_samples` reports
     stuck: tuple[str, ...]  # names of chamber pressures that repeat one value for too long to be used
-    used_fraction: float  # fraction of the original samples within the time span of `recording`
+    # fractions of the original samples: those within the time span of `recording`, those before it, those after it
+    used_fraction: float
+    before_fraction: float
+    after_fraction: float
 
 
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, in this order.
 
+    0. rows out of the order of time;
     1. impossible values, dropouts, i.e. rows with zeros in both chamber pressures, and sensors without a supply;
     2. rows, and then single pressures, that repeat one value for a long time;
     3. spikes, and samples that repeat the previous one;
@@ -52,11 +56,12 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     5. speeds and flows without a sign;
     6. gaps, which are interpolated or bridged, and incomplete rows at the ends, which are cut off.
 
-    Steps 3 and 5, bridged gaps, and rows outside of the time span that is left are reported as findings. Channels
+    Steps 0, 3 and 5, bridged gaps, and rows outside of the time span that is left are reported as findings. Channels
     without any value are left out, except chamber pressures. A chamber pressure that is stuck in more than
     `MAX_STUCK_FRACTION` of the rows keeps these rows, and is named as unusable.
     """
-    part = remove_unsupplied(remove_dropouts(remove_impossible(recording)))
+    ordered = order_recording(recording)
+    part = remove_unsupplied(remove_dropouts(remove_impossible(ordered.recording)))
     part = set_missing(part, dict.fromkeys(part.channels, flag_frozen_rows(part)))
     chambers = chambers_of(part)
     # empty channels are left out, except chamber pressures
@@ -69,7 +74,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     part, spikes = remove_spikes(part)
     part, stale_samples = interpolate_stale_samples(part)
     part, restored_signs = restore_signs(resample_evenly(part))
-    findings = [*spikes, *stale_samples, *restored_signs]
+    findings = [*ordered.findings, *spikes, *stale_samples, *restored_signs]
     part = interpolate_short_gaps(bridge(part, needed), needed)
     if part.bridged is not None:
         bridged = np.flatnonzero(part.bridged)
@@ -77,14 +82,21 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
         text = f"{format_count(bridged.size, 'missing sample')} in {gaps} bridged: blocks with a long gap count less"
         findings.append(Finding("gaps_bridged", "note", None, bridged.size, float(part.t[bridged[0]]), text))
     part = _cut_to_complete(part, needed)
-    n_within = int(np.count_nonzero((recording.t >= part.t[0]) & (recording.t <= part.t[-1]))) if len(part) else 0
-    if len(part) and n_within < len(recording):
-        text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {n_within} of {len(recording)} samples"
-        first = float(part.t[0])
-        n_outside = len(recording) - n_within
-        severity = weigh_defects(n_outside, len(recording))
-        findings.append(Finding("part_analysed", severity, None, n_outside, first, text))
-    return CorrectedSamples(part, tuple(findings), unusable, n_within / max(len(recording), 1))
+    times, n_total = ordered.recording.t, len(ordered.recording) + ordered.n_before + ordered.n_after
+    n_before, n_after = ordered.n_before, n_total - ordered.n_before
+    if len(part):
+        n_before += int(np.count_nonzero(times < part.t[0]))
+        n_after = ordered.n_after + int(np.count_nonzero(times > part.t[-1]))
+    n_outside = len(times) - int(np.count_nonzero((times >= part.t[0]) & (times <= part.t[-1]))) if len(part) else 0
+    n_outside += ordered.n_before + ordered.n_after
+    if len(part) and n_outside:
+        n_within = n_total - n_outside
+        text = f"analysed from {part.t[0]:.4g} s to {part.t[-1]:.4g} s: {n_within} of {n_total} samples"
+        severity = weigh_defects(n_outside, n_total)
+        findings.append(Finding("part_analysed", severity, None, n_outside, float(part.t[0]), text))
+    count = max(n_total, 1)
+    used = 1.0 - n_outside / count if len(part) else 0.0
+    return CorrectedSamples(part, tuple(findings), unusable, used, n_before / count, n_after / count)
 
 
 def _cut_to_complete(recording: Recording, needed: Sequence[str]) -> Recording:

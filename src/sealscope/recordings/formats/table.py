@@ -31,7 +31,9 @@ from sealscope.recordings.formats.headings.proposal import is_time, unit_of_time
 from sealscope.recordings.formats.headings.split_time import combine_time_parts
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.formats.times.dates import find_order, stated_start
+from sealscope.recordings.formats.times.row_order import COUNTERS, order_rows
 from sealscope.recordings.formats.times.timebase import (
+    TimeBase,
     TimeState,
     interpolate_samples,
     is_falling,
@@ -146,17 +148,21 @@ def build_fields(
     except InputError:
         if (long_columns := _find_long_columns([member.label for member in series])) is None:
             raise
-        channel_series, more_notes = _pivot_long_table(series, long_columns, prepare)
+        clock_findings: list[dict[str, Any]] = []
+        channel_series, more_notes = _pivot_long_table(series, long_columns, prepare, clock_findings)
         table = build_fields(channel_series, request, kind, remarks)  # their values are read already
-        return table._replace(history=(*more_notes, *table.history))
+        findings = {finding["code"]: finding for finding in clock_findings}  # alike for all channels
+        provenance = table.provenance | ({"clock": [*findings.values()]} if findings else {})
+        return table._replace(history=(*more_notes, *table.history), provenance=provenance)
     # the series to read; `CLOCK_LABEL`, which may come after all series, is not one
     kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}
     members = {column: candidates[column] for column in kinds}
     if prepare is not None:
         notes += prepare(kinds, choice.date)
     check_size(max(member.count for member in members.values()), len(choice.columns), size)
+    clock = dict[str, Any]()
     if choice.time == len(candidates):  # `CLOCK_LABEL`: sampling times of the series, not a column
-        columns, more_notes = _align_clocks(choice, members)
+        columns, more_notes, clock = _align_clocks(choice, members)
         notes = [*notes, *more_notes]
     else:
         last = members[[*kinds][-1]]  # the time, if there is one
@@ -165,7 +171,8 @@ def build_fields(
                 required = f"{last.path} ({last.count})"
                 raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
         columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
-    return convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
+    table = convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
+    return table._replace(provenance=table.provenance | clock) if clock else table
 
 
 def convert_columns(
@@ -187,7 +194,7 @@ def convert_columns(
 
     Rows that begin with the last sample are reversed. Raises InputError without rows, and for dates in place of times.
     """
-    label, start = choice.time_label, dict[str, Any]()
+    label, start, clock = choice.time_label, dict[str, Any](), dict[str, Any]()
     remarks = remarks or {}
     count = len(next(iter(columns.values())))
     if count == 0:
@@ -214,14 +221,17 @@ def convert_columns(
         # a map may choose another time column; in a data frame, i.e. without a file, rows may have been removed
         t, rate = time, description["rate"]
     else:
-        t, rate, start, time_notes = time_base(time, label.unit, label.whole, choice.rate, state)
-        notes += time_notes
+        base = time_base(time, label.unit, label.whole, choice.rate, state, list(channels.values()))
+        t, rate, start = base.t, base.rate, base.start
+        notes += base.notes
+        clock = _describe_clock(base, label.whole)
+        if base.rows is not None:
+            time, channels = time[base.rows], {name: values[base.rows] for name, values in channels.items()}
         if description is not None and abs(rate / description["rate"] - 1.0) <= _SAME_RATE:
             rate = description["rate"]
     if description is not None:  # a recording that Sealscope has written states its provenance itself
-        return RecordingFields(
-            t, channels, units, rate, description["provenance"], (*description["history"], *notes), kind
-        )
+        provenance = description["provenance"] | clock
+        return RecordingFields(t, channels, units, rate, provenance, (*description["history"], *notes), kind)
     path = request.path or Path(request.file)
     order = find_order(path)
     if not start:
@@ -230,10 +240,27 @@ def convert_columns(
     details = {"file": request.file, "name_order": order, "format": kind, **start, "about": dict(remarks)}
     details |= {"columns": choice.names}
     details |= {"unused": list(choice.unused), "unused_temperatures": list(choice.unused_temperatures)}
-    details["log_units"] = log_units
+    details |= {"log_units": log_units, **clock}
     # no empty ones, but a start of 0
     provenance = {key: value for key, value in details.items() if value or key in start}
     return RecordingFields(t, channels, units, rate, provenance, tuple(notes), kind)
+
+
+def _describe_clock(base: TimeBase, name: str) -> dict[str, Any]:
+    """Describe the events and breaks of the clock in column `name` for the provenance, where `quality` finds them."""
+    if not base.events:
+        return {}
+    findings = [
+        {
+            "code": event.code,
+            "severity": event.severity,
+            "count": event.number,
+            "first_t": float(base.t[min(event.row, base.t.size - 1)]),
+            "text": f"column {name} {event.text}",
+        }
+        for event in base.events
+    ]
+    return {"clock": findings, "clock_breaks": [float(base.t[row]) for row in base.breaks]}
 
 
 def _convert_channels(
@@ -394,12 +421,15 @@ def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
     return np.asarray(values, dtype=np.float64)
 
 
-def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int, NDArray[Any]], list[str]]:
+def _align_clocks(
+    choice: ColumnMap, used: dict[int, Series]
+) -> tuple[dict[int, NDArray[Any]], list[str], dict[str, Any]]:
     """Resample the columns to read, column -> series in `used`, to the sampling times of the chamber pressures.
 
     Without chamber pressures, the times are those of the pressures at the pump, or of the longest series. Rows without
-    a time are left out. Returns column -> values (n,), including the time, and lines for the history. Raises InputError
-    if no series has sampling times, or one without them has another number of samples.
+    a time are left out. Returns column -> values (n,), including the time, lines for the history, and entries for the
+    provenance on a clock that wraps. Raises InputError if no series has sampling times, or one without them has another
+    number of samples.
     """
     channel_of = choice.channel_of
     rank = {channel: number for number, channel in enumerate(_BASE_CHANNELS)}
@@ -410,6 +440,9 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
         names = ", ".join(used[column].path for column in ranked)
         raise InputError(f"a channel must have a clock or be given a rate, got none for {names}")
     t, start = base.clock.read()
+    clock: dict[str, Any] = {}
+    if any(member.clock is not None and member.clock.key != base.clock.key for member in used.values()):
+        t, clock = _unwrap_clock(t, base.path)
     known = np.isfinite(t)
     columns: dict[int, NDArray[Any]] = {}
     notes: list[str] = []
@@ -429,7 +462,19 @@ def _align_clocks(choice: ColumnMap, used: dict[int, Series]) -> tuple[dict[int,
     columns[choice.time] = (
         t if start is None else start.astype("datetime64[ns]") + np.round(t * 1e9).astype("timedelta64[ns]")
     )
-    return columns, notes
+    return columns, notes, clock
+
+
+def _unwrap_clock(t: Array, name: str) -> tuple[Array, dict[str, Any]]:
+    """Undo the wraps of the times `t` (n,) [s] of the series `name`; also return entries on them for the provenance.
+
+    Raises InputError if the times step back otherwise, as the clocks of several series then cannot be compared.
+    """
+    ordered = order_rows(t, (), COUNTERS)
+    if ordered.rows is not None or ordered.breaks:
+        raise InputError(f"the times of {name} must increase, as others have a clock of their own, got steps back")
+    base = TimeBase(ordered.t, 1.0, {}, [], None, ordered.events, ())
+    return ordered.t, _describe_clock(base, name)
 
 
 def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | None) -> tuple[Array, str]:
@@ -442,6 +487,7 @@ def _resample(values: Array, member: Series, t: Array, start: np.datetime64 | No
     """
     assert member.clock is not None
     times, member_start = member.clock.read()
+    times, _ = _unwrap_clock(times, member.path)
     if member_start is not None and start is not None:
         times = times + timedelta_seconds(member_start - start)
     timed = np.isfinite(times)
@@ -485,14 +531,20 @@ def _find_long_columns(labels: Sequence[Label]) -> dict[str, int] | None:
 
 
 def _read_long_channel(
-    choice: ColumnMap, table: Mapping[int, NDArray[Any]], value_column: int, label: Label, rows: NDArray[np.intp]
+    choice: ColumnMap,
+    table: Mapping[int, NDArray[Any]],
+    value_column: int,
+    label: Label,
+    clock_findings: list[dict[str, Any]],
+    rows: NDArray[np.intp],
 ) -> tuple[Array, Array, np.datetime64 | None]:
     """Read a channel of a long table, in which each row is one sample of a named channel; `rows` (k,) are its rows.
 
     Returns its values (n,), times (n,) [s] and the time stamp of 0 s, None if unknown. Times of day without a date
     count from the first of the table. `choice`: the time column, and the values as the only channel `u`, in counts
     (`_count_request`); `table`: column -> cells; `value_column`: column of the values. Rows without a time are left
-    out. Raises InputError for too many words.
+    out. What is found about the clock is added to `clock_findings`. Raises InputError for too many words, and if the
+    logger restarted: the channels, each with times of its own, would then not fit together.
     """
     assert choice.time is not None
     times = table[choice.time]
@@ -505,6 +557,12 @@ def _read_long_channel(
     columns[value_column][is_word] = np.nan
     fields = convert_columns(choice, columns, "", _count_request(value_column))
     t, start = fields.t, None
+    clock_findings += fields.provenance.get("clock", [])
+    if breaks := fields.provenance.get("clock_breaks"):
+        raise InputError(
+            f"the times of a long table must not step back, got a break of the clock at {breaks[0]:g} s of "
+            f"{label.whole[:40]}: cut the table there"
+        )
     if "start_epoch_s" in fields.provenance:
         start = np.datetime64(round(fields.provenance["start_epoch_s"] * 1e9), "ns")
     elif "start" in fields.provenance:
@@ -522,11 +580,15 @@ def _count_request(value_column: int) -> Request:
 
 
 def _pivot_long_table(
-    series: Sequence[Series], column_by_kind: Mapping[str, int], prepare: Prepare | None
+    series: Sequence[Series],
+    column_by_kind: Mapping[str, int],
+    prepare: Prepare | None,
+    clock_findings: list[dict[str, Any]],
 ) -> tuple[list[Series], list[str]]:
     """Make a series for each channel of a table in which each row is one sample of a named channel.
 
-    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`. Values with a 0 in the column
+    `column_by_kind`: as from `_find_long_columns`; `prepare`: as for `build_fields`; `clock_findings`: list to which
+    the findings on the clock are added when a channel is read. Values with a 0 in the column
     "valid" become NaN. Also returns lines for the history. Raises InputError without a time, or for too many names.
     """
     value_column, validity_column = column_by_kind["value"], column_by_kind.get("valid")
@@ -561,7 +623,7 @@ def _pivot_long_table(
     def make_series(number: int, label: Label) -> Series:
         """Make the series of the channel with this number, which is read when it is needed."""
         rows = rows_by_key[number]
-        read_channel = cache(partial(_read_long_channel, choice, columns, value_column, label, rows))
+        read_channel = cache(partial(_read_long_channel, choice, columns, value_column, label, clock_findings, rows))
         return Series("", label, rows.size, lambda: read_channel()[0], Clock(number, lambda: read_channel()[1:]))
 
     result = []

@@ -9,7 +9,7 @@ import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.times import row_order
+from sealscope.recordings.formats.times.row_order import ClockEvent, OrderedRows, Wrap, order_rows
 from sealscope.units import to_si
 
 #: Date such as 05/06/2024 or 05-06-24, in which the day or the month comes first.
@@ -56,10 +58,11 @@ _EPOCH = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"), (1e8, "s"))
 _MIN_SHARED = 20  # fewest samples from which the number of samples per stamp is estimated
 #: Largest deviation of times from a uniform clock that is rounding, in intervals; limits of a rate's relative error.
 _MAX_ROUNDING, _MIN_SLACK, _MAX_SLACK = 0.6, 1e-9, 1e-3
+_MAX_RISING = 0.1  # largest number of rising steps over that of falling ones in a log that begins with the last sample
 #: The date used for a time of day without a date.
 _NO_DATE = "1970-01-01"
-_HOUR, _DAY = 3600.0, 86400.0  # [s]
-_TOLERANCE = 3.0  # largest deviation of a clock jump from its nominal size, in median intervals
+_DAY = 86400.0  # [s]
+_HOURS_OF_HALF_DAY = 1, 12  # least and largest hour on a clock of 12 hours
 _LATEST_CHANGE = 4  # daylight saving time changes before this hour of the day
 #: Range of days since 1899-12-30 in the years 1982 to 2077.
 _EXCEL_RANGE = (30_000, 65_000)
@@ -70,8 +73,28 @@ _DATENUM_OFFSET = 693_960  # MATLAB's datenum of 1899-12-30
 _SINCE_1904, _FROM_1904_TO_1970 = 3.28e9, 2_082_844_800.0
 #: Range of seconds since 1970, from March 1973 to the year 5138; smaller times count from the start of a recording.
 _MIN_EPOCH, _MAX_EPOCH = 1e8, 1e11
-#: Times (n,) [s], provenance of the start (`start` or `start_epoch_s`), and lines for the history.
-_Seconds = tuple[Array, dict[str, Any], list[str]]
+
+
+class _Seconds(NamedTuple):
+    """A time column in seconds, in the order of the file."""
+
+    t: Array  # (n,) [s]
+    start: dict[str, Any]  # provenance of the start (`start` or `start_epoch_s`), empty if t = 0 has no date
+    notes: list[str]  # lines for the history
+    wraps: tuple[Wrap, ...]  # steps by which the clock may jump
+    reading: float  # reading of the clock at t = 0 [s], NaN if it does not begin anew at a known reading
+
+
+class TimeBase(NamedTuple):
+    """The sampling times of a log, in the order of time."""
+
+    t: Array  # (m,) [s]
+    rate: float  # sampling rate [Hz]
+    start: dict[str, Any]  # provenance of the start (`start` or `start_epoch_s`), empty if t = 0 has no date
+    notes: list[str]  # lines for the history
+    rows: NDArray[np.intp] | None  # (m,): index of each row in the log; None if all rows stay where they are
+    events: tuple[ClockEvent, ...]  # what was found and done about the order of the rows
+    breaks: tuple[int, ...]  # indices in `t` of the rows before which the clock was set or the logger restarted
 
 
 @dataclass
@@ -288,62 +311,42 @@ def _shortest_decimal(value: float, slack: float) -> float:
 
 
 def is_falling(times: NDArray[Any]) -> bool:
-    """Test whether times (n,) decrease from each sample to the next, as in logs that begin with the last sample."""
-    return len(times) > 1 and bool(np.all(times[1:] < times[:-1]))
+    """Test whether times (n,) decrease from sample to sample, as in logs that begin with the last sample.
+
+    Neighbours may share a time, and a tenth of the steps may be those of a clock that begins anew.
+    """
+    n_falling, n_rising = np.count_nonzero(times[1:] < times[:-1]), np.count_nonzero(times[1:] > times[:-1])
+    return bool(n_falling > 0 and n_rising <= _MAX_RISING * n_falling)
 
 
-def _convert_stamps(values: NDArray[np.datetime64], name: str, state: TimeState) -> _Seconds:
-    """Convert date stamps (n,) of the time column `name` to seconds from the first stamp.
+def _convert_stamps(values: NDArray[np.datetime64]) -> _Seconds:
+    """Convert date stamps (n,) of a time column to seconds from the first one; raise InputError if all are missing.
 
-    Times of day without a date continue from the last time in `state`, and their jumps back at midnight or at the full
-    hour are removed. In dated stamps a single jump by an hour is removed, as that of daylight saving time, if a stamp
-    is before 4 o'clock. Raises InputError if all stamps are missing.
+    Times of day without a date may begin again at the full hour, after half a day or after a day. Dated stamps may step
+    by an hour, as to daylight saving time, if one of them is before 4 o'clock; their date may be late or early, and
+    their hours those of a clock without AM and PM.
     """
     nanoseconds = values.astype("datetime64[ns]")
     known = ~np.isnat(nanoseconds)
     if not known.any():
         raise InputError("time must have a stamp in some row, got none")
-    is_undated = bool((nanoseconds[known] < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
-    continues = is_undated and state.last_time is not None
-    if continues:  # prefix the last stamp of the previous part of the log
-        nanoseconds, known = np.append(state.last_time, nanoseconds), np.append(True, known)
     stamps = nanoseconds[known]
     start = stamps[0]
+    is_undated = bool((stamps < np.datetime64(_NO_DATE, "ns") + np.timedelta64(1, "D")).all())
+    times_of_day = stamps - stamps.astype("datetime64[D]")
+    hours = times_of_day // np.timedelta64(1, "h")
+    least, largest = _HOURS_OF_HALF_DAY
+    wraps: tuple[Wrap, ...] = (row_order.NEXT_DAY, row_order.NEXT_HOUR) if is_undated else (row_order.LATE_DATE,)
+    if least <= hours.min() and hours.max() <= largest:
+        wraps += (row_order.HALF_DAY,)
+        is_midnight = (hours[1:] == largest) & (hours[:-1] == largest - 1) & (np.diff(stamps) > np.timedelta64(1, "D"))
+        wraps += (row_order.HALF_DAY_MIDNIGHT,) if is_midnight.any() else ()
+    if hours.min() < _LATEST_CHANGE and not is_undated:
+        wraps += row_order.SUMMER_TIME
     t = timedelta_seconds(nanoseconds - start)
-    earliest_hour = int((stamps - stamps.astype("datetime64[D]")).min() / np.timedelta64(1, "h"))  # of the day
-    note_of_jump = {
-        -_DAY: "has no date: begins again with the next day",
-        -_HOUR: "has no date: begins again with the next hour",
-    }
     if not is_undated:
-        note = "steps by an hour: taken for daylight saving time, the hour left out"
-        note_of_jump = dict.fromkeys((-_HOUR, _HOUR), note) if earliest_hour < _LATEST_CHANGE else {}
-    notes = []
-    for step, note in note_of_jump.items():
-        if (continuous := _remove_jumps(t, step, single=not is_undated)) is not None:
-            t = continuous
-            notes.append(f"column {name} {note}")
-    if continues:  # without the prefixed stamp
-        t = t[1:] + state.last_seconds
-    return t, {} if is_undated else {"start": iso_moment(start)}, notes
-
-
-def _remove_jumps(t: Array, step: float, single: bool) -> Array | None:
-    """Remove clock jumps of `step` [s], such as -86400 s at midnight, from times (n,).
-
-    An interval is a jump if it differs from `step` plus the median interval by at most `_TOLERANCE` median intervals.
-    None if there is no jump, if there are several although `single`, or if ordinary intervals could look like jumps.
-    """
-    steps = np.diff(t)
-    positive_steps = steps[np.isfinite(steps) & (steps > 0)]
-    if not positive_steps.size:
-        return None
-    median_step = float(np.median(positive_steps))
-    jumps = np.flatnonzero(np.abs(steps - step - median_step) <= _TOLERANCE * median_step)
-    is_coarse = median_step * _TOLERANCE >= 0.1 * abs(step)  # ordinary intervals could look like jumps
-    if not jumps.size or (single and jumps.size > 1) or is_coarse:
-        return None
-    return t - step * np.searchsorted(jumps + 1, np.arange(t.size), side="right")  # jumps up to each sample
+        return _Seconds(t, {"start": iso_moment(start)}, [], wraps, np.nan)
+    return _Seconds(t, {}, [], wraps, float(times_of_day[0] / np.timedelta64(1, "ns")) / 1e9)
 
 
 def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeState) -> _Seconds:
@@ -363,15 +366,16 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
         seconds = to_si(values - first, unit_of_time, "s", name="time")
         try:
             elapsed = np.timedelta64(round(to_si(first, unit_of_time, "s") * 1e9), "ns")
-            return seconds, {"start": iso_moment(parse_stamps([since["start"]])[0] + elapsed)}, []
+            start = iso_moment(parse_stamps([since["start"]])[0] + elapsed)
         except (ValueError, OverflowError):  # no date in a known form, or one too far: stated as written
-            return seconds, {"start": f"{first:g} {unit}"}, []
+            start = f"{first:g} {unit}"
+        return _Seconds(seconds, {"start": start}, [], (), np.nan)
     seconds = to_si(values, unit, "s", name="time")
     epoch = float(seconds[np.isfinite(values)][0])
     if epoch >= _MIN_EPOCH:
         # the difference is taken before the conversion, which would round such large times
-        return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, []
-    return seconds, {}, []
+        return _Seconds(to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [], (), np.nan)
+    return _Seconds(seconds, {}, [], row_order.COUNTERS, 0.0)
 
 
 def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeState) -> _Seconds:
@@ -387,11 +391,10 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
     if (days := _detect_days(head)) is not None:
         origin, meaning = days
         note = f"column {name} read as {meaning}"
-        if origin is None:  # fractions of a day have no start date, and continue from part to part
-            previous = first if state.last_time is None else state.last_time
-            return (values - previous) * _DAY + state.last_seconds, {}, [note]
+        if origin is None:  # fractions of a day have no start date
+            return _Seconds((values - first) * _DAY, {}, [note], (row_order.NEXT_DAY,), first * _DAY)
         start = {"start": iso_moment(origin + np.timedelta64(round(first * _DAY * 1e6), "us"))}
-        return (values - first) * _DAY, start, [note]
+        return _Seconds((values - first) * _DAY, start, [note], (row_order.LATE_DATE,), np.nan)
     is_row_count = is_first_part and finite.size == values.size and np.all(np.diff(finite) == 1)
     if is_row_count and abs(first) < _MIN_EPOCH:  # larger ones may be seconds since 1970, at 1 Hz
         raise InputError(
@@ -400,11 +403,12 @@ def _convert_without_unit(values: Array, finite: Array, name: str, state: TimeSt
         )
     unit = next((unit for min_value, unit in _EPOCH if abs(head[0]) >= min_value), None)
     if unit is None:
-        return values, {}, [f"column {name} has no unit: taken as s"]
+        return _Seconds(values, {}, [f"column {name} has no unit: taken as s"], row_order.COUNTERS, 0.0)
     epoch, year = to_si(first, unit, "s"), 1970
     if _SINCE_1904 <= epoch < _SINCE_1904 + 1e9:  # until 2039
         epoch, year = epoch - _FROM_1904_TO_1970, 1904
-    return to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [f"column {name} read as {unit} since {year}"]
+    note = f"column {name} read as {unit} since {year}"
+    return _Seconds(to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [note], (), np.nan)
 
 
 def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
@@ -431,37 +435,87 @@ def _detect_days(values: Array) -> tuple[np.datetime64 | None, str] | None:
 
 
 def time_base(
-    values: NDArray[Any], unit: str | None, name: str, stated_rate: float | None = None, state: TimeState | None = None
-) -> tuple[Array, float, dict[str, Any], list[str]]:
-    """Convert the values (n,) of a time column, numbers in `unit` or datetime64, to seconds and a sampling rate.
+    values: NDArray[Any],
+    unit: str | None,
+    name: str,
+    stated_rate: float | None = None,
+    state: TimeState | None = None,
+    channels: Sequence[Array] = (),
+) -> TimeBase:
+    """Convert the values (n,) of a time column, numbers in `unit` or datetime64, to seconds in the order of time.
 
-    Returns the times (n,) [s], the rate [Hz], the provenance of the start, and lines for the history. Stamps, and
-    numbers that count from a date, become relative to their first sample; other times stay as they are.
+    Stamps, and numbers that count from a date, become relative to their first sample; other times stay as they are,
+    unless the clock wraps or begins anew (`order_rows`).
 
     - `name`: the column in messages.
     - `stated_rate` [Hz]: rate in the file, with which samples that share stamps are spaced.
     - `state`: state of the column after the previous part of the log, which is updated; None for a log read as a whole.
+    - `channels`: samples (n,) of the channels, by which copies of rows and restarts of the logger are found.
 
     Raises InputError for a column that is empty, counts rows, does not increase or has no unit of time.
     """
     state = TimeState() if state is None else state
-    if values.dtype.kind == "M":
-        t, start, notes = _convert_stamps(values, name, state)
-    else:
-        t, start, notes = _convert_numbers(np.asarray(values, dtype=np.float64), unit, name, state)
-    known = np.flatnonzero(np.isfinite(t))
-    if known.size:
-        state.last_time, state.last_seconds = values[known[-1]], float(t[known[-1]])
+    notes: list[str] = []
     with np.errstate(invalid="ignore", over="ignore"):  # infinite times are findings, not warnings
-        shares_stamps = t.size > 1 and 2 * np.count_nonzero(np.diff(t)) < t.size - 1
-        if stated_rate is not None and shares_stamps:
-            notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
-            return t[0] + np.arange(t.size) / stated_rate, stated_rate, start, notes
-        if (spaced := _space_shared_times(t, state)) is not None:
+        seconds = _convert_times(values, unit, name, state)
+        notes += seconds.notes
+        continues = state.last_time is not None and not seconds.start
+        if continues:  # prefix the last time of the previous part of the log
+            seconds = _convert_times(np.append(state.last_time, values), unit, name, state)
+            channels = [np.append(np.nan, samples) for samples in channels]
+
+        def space(t: Array) -> Array:
+            """Space the times of samples that share each reading of a coarse clock."""
+            if (spaced := _space_shared_times(t, state)) is None:
+                return t
             state.resolution, t = spaced
-            notes.append(f"column {name} in steps of {state.resolution:g} s: samples in between taken as uniform")
-        state.rate = nominal_rate(t) if state.rate is None else state.rate
-        return t, state.rate, start, notes
+            note = f"column {name} in steps of {state.resolution:g} s: samples in between taken as uniform"
+            notes.extend([note] if note not in notes else [])
+            return t
+
+        shares_stamps = seconds.t.size > 1 and 2 * np.count_nonzero(np.diff(seconds.t)) < seconds.t.size - 1
+        has_stated_rate = stated_rate is not None and shares_stamps
+        ordered = order_rows(
+            seconds.t, channels, seconds.wraps, seconds.reading, None if has_stated_rate or continues else space
+        )
+        ordered = _continue_times(ordered, state.last_seconds) if continues else ordered
+        t = ordered.t
+        known = np.flatnonzero(np.isfinite(t))
+        if known.size:
+            last = int(known[-1])
+            state.last_time = values[last if ordered.rows is None else ordered.rows[last]]
+            state.last_seconds = float(t[last])
+        t = t if ordered.breaks or has_stated_rate else space(t)
+        notes += [f"column {name} {event.text}" for event in ordered.events]
+        if has_stated_rate:
+            assert stated_rate is not None
+            notes.append(f"column {name}: samples share their stamps, taken at {stated_rate:g} Hz, as the file says")
+            t, rate = t[0] + np.arange(t.size) / stated_rate, stated_rate
+        else:
+            longest_part = max(np.split(t, ordered.breaks), key=len)
+            state.rate = nominal_rate(longest_part) if state.rate is None else state.rate
+            rate = state.rate
+        return TimeBase(t, rate, seconds.start, notes, ordered.rows, ordered.events, ordered.breaks)
+
+
+def _convert_times(values: NDArray[Any], unit: str | None, name: str, state: TimeState) -> _Seconds:
+    """Convert a time column, numbers in `unit` or datetime64 (n,), to seconds."""
+    if values.dtype.kind == "M":
+        return _convert_stamps(values)
+    return _convert_numbers(np.asarray(values, dtype=np.float64), unit, name, state)
+
+
+def _continue_times(ordered: OrderedRows, last_seconds: float) -> OrderedRows:
+    """Remove the first row, which ends the previous part of a log at `last_seconds` [s], and count on from there."""
+    if ordered.rows is None:
+        t, rows, place = ordered.t[1:], None, 0
+    else:
+        place = int(np.flatnonzero(ordered.rows == 0)[0])
+        t, rows = np.delete(ordered.t, place), np.delete(ordered.rows, place) - 1
+    shift = last_seconds - float(ordered.t[place])
+    breaks = tuple(row - (row > place) for row in ordered.breaks if row > place + 1)
+    events = tuple(event._replace(row=max(0, event.row - 1)) for event in ordered.events)
+    return OrderedRows(t + shift if shift else t, rows, breaks, events)
 
 
 def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | None:
