@@ -48,7 +48,7 @@ class Wrap(NamedTuple):
 
 
 class ClockEvent(NamedTuple):
-    """What was found and done about the order of the rows."""
+    """A defect of the clock, and the correction made for it."""
 
     code: str
     severity: Literal["note", "warning"]
@@ -255,9 +255,9 @@ def _flag_copies(times: Array, channels: Sequence[Array]) -> NDArray[np.bool_]:
     return is_copy
 
 
-def _are_equal(values: Array, others: Any) -> NDArray[np.bool_]:
-    """Compare samples one by one; missing ones are equal."""
-    return np.asarray((values == others) | (np.isnan(values) & np.isnan(others)))
+def _are_equal(values: Array, references: Any) -> NDArray[np.bool_]:
+    """Compare samples with reference values one by one; missing ones are equal."""
+    return np.asarray((values == references) | (np.isnan(values) & np.isnan(references)))
 
 
 def _find_order(times: Array, interval: float) -> NDArray[np.intp] | None:
