@@ -130,7 +130,7 @@ class Examination:
         return combine(list(decisions.values()), refusal)
 
     def _unseen_beginning(self) -> str | None:
-        """Give the reason why a leak that began before the first judged sample would stay unseen; None if it would not."""
+        """Give the reason why a leak from before the first judged sample stays unseen; None if it does not."""
         if self.baseline or self.judged_from <= DECISION.worth.unjudged:
             return None
         return text_of("doubt", "beginning", percent=100.0 * self.judged_from)
