@@ -1,0 +1,1 @@
+"""Compiled kernels as source text for controllers: C99 and Structured Text."""
