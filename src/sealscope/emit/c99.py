@@ -80,7 +80,10 @@ class CText:
     def declare_function(self, function: Function, static: bool = False) -> str:
         """Declare a function: a single result is returned, several are written to the last arguments."""
         results = function.results
-        parameters = [f"{self._prefix}_state *{_STATE}", *(f"{self._types[p.kind]} {p.name}" for p in function.parameters)]
+        parameters = [
+            f"{self._prefix}_state *{_STATE}",
+            *(f"{self._types[p.kind]} {p.name}" for p in function.parameters),
+        ]
         parameters += [f"{self._types[kind]} *result_{k}" for k, kind in enumerate(results)] if len(results) > 1 else []
         returned = self._types[results[0]] if len(results) == 1 else "void"
         return f"{'static ' if static else ''}{returned} {self._prefix}_{function.name}({', '.join(parameters)})"

@@ -205,7 +205,10 @@ def _freeze(value: Value) -> Any:
     """Return something hashable that is equal for values for which a function is written alike."""
     if isinstance(value, Known):
         known = value.value
-        return ("known", known.tobytes() if isinstance(known, np.ndarray) else repr(known) if callable(known) else known)
+        return (
+            "known",
+            known.tobytes() if isinstance(known, np.ndarray) else repr(known) if callable(known) else known,
+        )
     if isinstance(value, Record):
         return ("record", value.prefix)
     return value
@@ -310,10 +313,7 @@ class _Body:
         """Collect what names of the function's surroundings stand for."""
         function = self._function
         closure = function.__closure__ or ()
-        captured = {
-            name: cell.cell_contents
-            for name, cell in zip(function.__code__.co_freevars, closure, strict=True)
-        }
+        captured = {name: cell.cell_contents for name, cell in zip(function.__code__.co_freevars, closure, strict=True)}
         return {**vars(builtins), **function.__globals__, **captured}
 
     def write(self, name: str, keeps_parameters: bool) -> Function:
@@ -709,9 +709,7 @@ class _Body:
             offset = self._operate("+", offset, self._operate("*", start, Constant(stride, "whole")))
         if not kept and not sizes:
             return Element(view.name, offset, view.kind)
-        return View(
-            view.name, view.kind, offset, (*(s for s, _ in kept), *sizes), (*(s for _, s in kept), *strides)
-        )
+        return View(view.name, view.kind, offset, (*(s for s, _ in kept), *sizes), (*(s for _, s in kept), *strides))
 
     def _limits(self, index: ast.Slice, size: Expression, node: ast.AST) -> tuple[Expression, Expression]:
         """Return the first index of a slice, and the one after its last."""

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from sealscope.diagnosis.inference.equations.expressions import increments_of
 from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import (
     BIAS,
@@ -73,7 +74,7 @@ _CYLINDER = (
 
 def _mask_term(term: Term, mask: Callable[[Signals], Array]) -> Term:
     """Multiply the increments of a term by the factors (n - 1,) that `mask` computes from the signals."""
-    return term._replace(increments=lambda s: np.asarray(mask(s) * term.increments(s)))
+    return term.with_increments(lambda s: np.asarray(mask(s) * term.increments(s)))
 
 
 def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array]) -> Equation:
@@ -151,7 +152,7 @@ def _supply_equation(rig: Rig) -> Equation:
         *while_fed("A", *chamber_terms("A")),
         *while_fed("B", *chamber_terms("B")),
         LAG_TERM,
-        BIAS_TERM._replace(increments=lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
+        BIAS_TERM.with_increments(lambda s: s.moving(_supply_volume) * direction(s) * s.dt),
         *while_fed("A", external_leak_term("A")),
         *while_fed("B", external_leak_term("B", weight=-1.0)),
         _mask_term(air, lambda s: s.moving(_supply_volume)),
@@ -229,7 +230,10 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     single_rod = rig.cylinder.single_rod
     air = free_air_term(rig, weight_A=lambda s: interval_means(s.carried_by_A) if single_rod else 0.5)
     area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
-    equation = Equation(CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio)
+    equation = Equation(
+        CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio,
+        left_expression=PUMP_VOLUMES.get(str(source), ""),
+    )  # fmt: skip
     balance = _insert_before_leaks(equation, air)
     if rig.circuit.has_asymmetric_pump:
         balance = _scale_to_side_A(balance)
@@ -282,6 +286,14 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
 
 
+#: The volume that a pump delivers, as an expression of the channel that shows it.
+PUMP_VOLUMES = {
+    "theta": "displacement * change(theta)",
+    "omega": "displacement * mean(omega) * dt",
+    "q_pump": "mean(q_pump) * dt",
+}
+
+
 def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array] | None:
     """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
 
@@ -289,16 +301,12 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
     command, from which the speed has been derived (`balance.derive_drive_signals`). Return None if none of them is
     recorded, or only the command of a pump that does not feed the chambers.
     """
-    displacement, source = rig.pump.q_b / (2.0 * np.pi), flow_source(channels)
-    if source == "theta":
-        return lambda s: displacement * s.step("theta")
-    if source == "q_pump":
-        return lambda s: s.mean("q_pump") * s.dt
+    source = flow_source(channels)
     if source == "q_supply":
         return _supply_volume
-    if source == "omega" or (source == "u" and rig.circuit.pump_feeds_chambers):
-        return lambda s: displacement * s.mean("omega") * s.dt
-    return None
+    if source == "u" and rig.circuit.pump_feeds_chambers:
+        source = "omega"
+    return increments_of(PUMP_VOLUMES[source], rig.pump.q_b / (2.0 * np.pi)) if source in PUMP_VOLUMES else None
 
 
 def with_rests(equation: Equation) -> Equation:
@@ -323,7 +331,7 @@ def shut_at_rest(equation: Equation) -> Equation:
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(equation, drift="pump"))
     return shut._replace(
         terms=tuple(
-            term._replace(increments=lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
+            term.with_increments(lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
             for term in shut.terms
         )
     )

@@ -140,10 +140,10 @@ def feed_one_chamber(equation: Equation, feed: Feed) -> Equation:
     def adapt(term: Term) -> Term:
         """Adapt one term."""
         if term.name in MOTIONS:
-            return term._replace(increments=partial(_carried_increments, term=term, equation=adapted))
+            return term.with_increments(partial(_carried_increments, term=term, equation=adapted))
         if term.name in _SIDES:
             counted = partial(_counted_increments, term=term, left=equation.left, sign_A=feed.sign_A)
-            return term._replace(increments=counted)
+            return term.with_increments(counted)
         return term
 
     return adapted._replace(terms=tuple(map(adapt, equation.terms)))

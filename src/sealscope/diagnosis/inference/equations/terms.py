@@ -18,10 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Container
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.inference.equations.expressions import DIRECTIONS, increments_of
 from sealscope.diagnosis.inference.equations.signals import Signals, interval_means, signed_root
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.recordings.recording import Array
@@ -53,6 +54,8 @@ class Term(NamedTuple):
     driver : {"", "pressure", "root"}
         Pressure or square root of a pressure that drives the flow, so that an offset of a pressure sensor changes the
         increments; "" if such an offset is neglected.
+    expression : str
+        The increments as an expression (`expressions`), which streams compute, too; "" if only files compute them.
     """
 
     name: str
@@ -62,6 +65,11 @@ class Term(NamedTuple):
     drift: Coefficient | Literal[""] = ""
     needs: tuple[str, ...] = ()
     driver: Literal["", "pressure", "root"] = ""
+    expression: str = ""
+
+    def with_increments(self, increments: Callable[[Signals], Array]) -> Term:
+        """Return the term with other increments, which only files compute."""
+        return self._replace(increments=increments, expression="")
 
     @property
     def is_fitted(self) -> bool:
@@ -96,6 +104,8 @@ class Equation(NamedTuple):
         Area of the piston on side B over that on side A; 1 in a balance of one chamber.
     fed_outward : {"", "A", "B"}
         Chamber that the pump feeds while x grows, if it feeds one at a time (`feed`); "" in a closed circuit.
+    left_expression : str
+        The left side as an expression, "" if only files compute it.
     """
 
     name: str
@@ -106,6 +116,7 @@ class Equation(NamedTuple):
     flow_sign: float = 1.0
     area_ratio: float = 1.0
     fed_outward: Literal["", "A", "B"] = ""
+    left_expression: str = ""
 
 
 #: Names of terms: first the leak past the piston or in the pump, laminar (the tested term) and through an orifice.
@@ -143,6 +154,11 @@ fitted_term = partial(Term, cause="sensor fault")
 compliance_term = partial(Term, cause="air in the oil", drift="compliance")
 
 
+def expressed_term(name: str, unit: str, expression: str, cause: Cause, **properties: Any) -> Term:
+    """Make a term from the expression of its increments; `properties`: those of `Term`."""
+    return Term(name, unit, increments_of(expression), cause, expression=expression, **properties)
+
+
 def conductance_term(
     name: str,
     increments: Callable[[Signals], Array],
@@ -156,25 +172,29 @@ def conductance_term(
 
 _LEAK_CAUSE: Cause = "piston or pump leak"
 LEAKS = (
-    conductance_term(LEAK, lambda s: s.pressure_difference * s.dt, _LEAK_CAUSE, drift="piston"),
+    expressed_term(
+        LEAK, "m^3/(s Pa)", "pressure_difference * dt", _LEAK_CAUSE,
+        drift="piston", needs=PRESSURES, driver="pressure",
+    ),
     Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, _LEAK_CAUSE, needs=PRESSURES, driver="root"),
 )
 
 
-#: Direction of the piston's motion (true: to B) and loaded side (true: A) of the terms of motion, by their names.
-MOTIONS = {
-    "motion out, A carries": (True, True),
-    "motion out, B carries": (True, False),
-    "motion in, A carries": (False, True),
-    "motion in, B carries": (False, False),
+#: Word of the expression that is 1 in a direction of motion while a side carries the load, by the name of the term.
+_MOTION_WORDS = {
+    "motion out, A carries": "out_A",
+    "motion out, B carries": "out_B",
+    "motion in, A carries": "in_A",
+    "motion in, B carries": "in_B",
 }
+#: Direction of the piston's motion (true: to B) and loaded side (true: A) of the terms of motion, by their names.
+MOTIONS = {name: DIRECTIONS[word] for name, word in _MOTION_WORDS.items()}
 
 
 def motion_term(name: str) -> Term:
     """Make the term of the piston's motion in one direction while one side carries the load (`MOTIONS`)."""
-    return fitted_term(
-        name, "m^2", lambda s: s.direction_weights(*MOTIONS[name]) * s.step("x"), drift="motion", needs=("x",)
-    )
+    expression = f"{_MOTION_WORDS[name]} * change(x)"
+    return expressed_term(name, "m^2", expression, "sensor fault", drift="motion", needs=("x",))
 
 
 def chamber_terms(side: str) -> tuple[Term, ...]:
@@ -184,12 +204,12 @@ def chamber_terms(side: str) -> tuple[Term, ...]:
     dp for a constant compliance, x dp for its change over the stroke, d(1/p) for free air, d ln p for dissolving air.
     """
     p, name = f"p_{side}", f"compliance {side}"
-    air_term = partial(Term, cause="air in the oil", drift="air")
+    term = partial(expressed_term, cause="air in the oil")
     return (
-        compliance_term(name, "m^3/Pa", lambda s: s.step(p), needs=(p,)),
-        compliance_term(f"{name} over the stroke", "m^2/Pa", lambda s: s.mean("x") * s.step(p), needs=(p, "x")),
-        air_term(f"free air {side}", "m^3 Pa", lambda s: np.diff(1.0 / s.absolute_pressure[p]), needs=(p,)),
-        air_term(f"dissolving air {side}", "m^3", lambda s: np.diff(np.log(s.absolute_pressure[p])), needs=(p,)),
+        term(name, "m^3/Pa", f"change({p})", drift="compliance", needs=(p,)),
+        term(f"{name} over the stroke", "m^2/Pa", f"mean(x) * change({p})", drift="compliance", needs=(p, "x")),
+        term(f"free air {side}", "m^3 Pa", f"change(1 / absolute({p}))", drift="air", needs=(p,)),
+        term(f"dissolving air {side}", "m^3", f"change(log(absolute({p})))", drift="air", needs=(p,)),
     )
 
 
@@ -249,7 +269,7 @@ def compensated_leak_term(side: str) -> Term:
 
 
 START_TERM = fitted_term("start of the drive", "m^3/s", lambda s: s.mean(START) * s.dt, drift="bias", needs=(START,))
-BIAS_TERM = fitted_term(BIAS, "m^3/s", lambda s: s.time_step, drift="bias")
+BIAS_TERM = expressed_term(BIAS, "m^3/s", "dt", "sensor fault", drift="bias")
 SPEED_LOSS_TERM = fitted_term(
     SPEED_LOSS, "m s", lambda s: interval_means(np.abs(s.speed)) * s.step("x"), drift="speed", needs=("x",)
 )
@@ -264,7 +284,9 @@ LINES_TERM = conductance_term(
     drift="pump",
 )
 #: The increments are changes of the piston's speed; the coefficient is the piston's area times the delay.
-LAG_TERM = fitted_term(LAG, "m^2 s", lambda s: np.gradient(s.step("x") * s.rate), drift="motion", needs=("x",))
+LAG_TERM = expressed_term(
+    LAG, "m^2 s", "gradient(change(x) * rate)", "sensor fault", drift="motion", needs=("x",)
+)
 
 
 def metering_edge_terms(

@@ -106,7 +106,7 @@ def median(values: Any, n: int) -> float:
 
 
 @law
-def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
+def sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> None:
     """Write the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,), to `gram`."""
     width = values.shape[1]
     for i in range(width):
@@ -120,7 +120,7 @@ def _sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) ->
 
 
 @large_law
-def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
+def eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> None:
     """Copy a block's Gram matrix `gram` (m, m) to `reduced` (c, c), and eliminate its fast coefficients there.
 
     `column_order` (c,): the copied columns in their order, the `n_fast` fast ones first.
@@ -132,7 +132,7 @@ def _eliminate_fast(gram: Any, column_order: Any, n_fast: int, reduced: Any) -> 
 
 
 @large_law
-def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
+def reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     """Compute Huber's weights of the rows from the residuals of the current fit; return True once they have converged.
 
     The weights have converged if their mean relative change is below `TOLERANCE`, or if the median residual is 0, which
@@ -152,6 +152,40 @@ def _reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
         change += abs(weight / workspace.weights[r] - 1.0)
         workspace.weights[r] = weight
     return change < TOLERANCE * count or not limit > 0.0
+
+
+@large_law
+def add_reduced(workspace: Any, earlier_sums: Any, n_blocks: int, n_fast: int, converged: bool) -> None:
+    """Sum the normal equations of the slow coefficients: of earlier blocks, unless `converged`, and of these blocks."""
+    normal, reduced = workspace.normal, workspace.reduced
+    for i in range(len(normal)):
+        for j in range(len(normal)):
+            normal[i, j] = 0.0 if converged else earlier_sums[i, j]
+            for block in range(n_blocks):
+                normal[i, j] += reduced[block, n_fast + i, n_fast + j]
+
+
+@large_law
+def fit_blocks(workspace: Any, n_blocks: int, n_fast: int) -> None:
+    """Solve the normal equations for the slow coefficients, from which the fast ones of each block follow."""
+    normal, reduced, fit = workspace.normal, workspace.reduced, workspace.fit
+    n_slow = len(normal) - 1
+    left = n_fast + n_slow
+    eliminate(normal, n_slow)
+    for block in range(n_blocks):
+        for i in range(left):
+            fit[block, i] = reduced[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
+        for i in range(n_fast):
+            for j in range(n_fast, left):
+                fit[block, i] -= reduced[block, i, j] * fit[block, j]
+
+
+@law
+def move_sums(normal: Any, earlier_sums: Any, n_blocks: int, update_fraction: float) -> None:
+    """Move the sums over earlier blocks towards those of `n_blocks` new ones, by a fraction of the difference."""
+    for i in range(len(normal)):
+        for j in range(len(normal)):
+            earlier_sums[i, j] += update_fraction * (SUPPORT / n_blocks * normal[i, j] - earlier_sums[i, j])
 
 
 @large_law
@@ -175,35 +209,22 @@ def weigh_rows(
       the fraction `update_fraction` of the difference.
     - `workspace`: scratch arrays (`Workspace`); `gram` (K, m, m): receives the Gram matrices of the weighted rows.
     """
-    n_rows, left, n_blocks = len(values), len(column_order) - 1, len(ends)
-    n_slow, normal, reduced = left - n_fast, workspace.normal, workspace.reduced
+    n_rows, n_blocks = len(values), len(ends)
     for r in range(n_rows):
         workspace.weights[r] = 1.0
     converged = n_rows == 0  # then one pass writes Gram matrices of zeros
     for iteration in range(MAX_ITERATIONS + 1):
         for block in range(n_blocks):
             begin = int(ends[block - 1]) if block else 0
-            _sum_products(values, begin, int(ends[block]), workspace.weights, gram[block])
-            _eliminate_fast(gram[block], column_order, n_fast, reduced[block])
+            sum_products(values, begin, int(ends[block]), workspace.weights, gram[block])
+            eliminate_fast(gram[block], column_order, n_fast, workspace.reduced[block])
         converged = converged or iteration == MAX_ITERATIONS
-        for i in range(n_slow + 1):  # once converged, the sums of these blocks alone
-            for j in range(n_slow + 1):
-                normal[i, j] = 0.0 if converged else earlier_sums[i, j]
-                for block in range(n_blocks):
-                    normal[i, j] += reduced[block, n_fast + i, n_fast + j]
+        add_reduced(workspace, earlier_sums, n_blocks, n_fast, converged)
         if converged:
             break
-        eliminate(normal, n_slow)  # gives the slow coefficients
-        for block in range(n_blocks):  # the fast coefficients of each block follow from them
-            for i in range(left):
-                workspace.fit[block, i] = reduced[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
-            for i in range(n_fast):
-                for j in range(n_fast, left):
-                    workspace.fit[block, i] -= reduced[block, i, j] * workspace.fit[block, j]
-        converged = _reweigh(values, ends, column_order, workspace)
-    for i in range(n_slow + 1):
-        for j in range(n_slow + 1):
-            earlier_sums[i, j] += update_fraction * (SUPPORT / n_blocks * normal[i, j] - earlier_sums[i, j])
+        fit_blocks(workspace, n_blocks, n_fast)
+        converged = reweigh(values, ends, column_order, workspace)
+    move_sums(workspace.normal, earlier_sums, n_blocks, update_fraction)
 
 
 def block_gram_matrices(

@@ -1,0 +1,189 @@
+"""Terms of a volume balance as expressions, evaluated by NumPy for files and written as a kernel for streams.
+
+An expression computes the increment of a term over one sampling interval, such as ``mean(x) * change(p_A)``. Its words:
+
+- a channel, such as ``p_A`` or ``x``, and ``absolute(p_A)``, an absolute pressure, and ``log(...)``: values at a sample;
+- ``change(v)`` and ``mean(v)``: difference and mean of a value v at the two ends of the interval;
+- ``dt``: the interval [s]; ``rate``: its inverse [Hz]; ``pressure_difference``: mean of p_A - p_B without the sensors'
+  offset; ``out_A``, ``out_B``, ``in_A``, ``in_B``: 1 while the piston moves towards B (out) or A (in) and side A or B
+  carries the load, else 0, and 1/2 if that changes within the interval; ``displacement``: that of the pump [m^3/rad];
+- ``gradient(e)``: change of an increment e from one interval to the next, by a central difference;
+- numbers, and ``+ - * /``.
+"""
+
+from __future__ import annotations
+
+import ast
+import linecache
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from itertools import count
+from typing import Any
+
+import numpy as np
+
+from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.recording import Array
+from sealscope.units import P_ATM
+
+#: Directions of motion with the side that carries the load: (towards B, side A) by the word of an expression.
+DIRECTIONS = {"out_A": (True, True), "out_B": (True, False), "in_A": (False, True), "in_B": (False, False)}
+_FUNCTIONS = ("change", "mean", "absolute", "log", "gradient")
+_WORDS = (*DIRECTIONS, "dt", "rate", "pressure_difference", "displacement")
+_OPERATORS = {ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/"}
+_numbers = count(1)
+
+
+@cache
+def parse_expression(text: str) -> ast.expr:
+    """Parse an expression; raise ValueError with the word that it must not have."""
+    tree = ast.parse(text, mode="eval").body
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Name):
+            known = node.id in CHANNEL_UNITS or node.id in _WORDS or node.id in _FUNCTIONS
+        elif isinstance(node, ast.Constant):
+            known = isinstance(node.value, (int, float))
+        else:
+            known = isinstance(node, (ast.Call, ast.BinOp, ast.expr_context, *_OPERATORS))
+        if not known:
+            raise ValueError(f"an expression of a term must be of its words, got {ast.unparse(node)!r} in {text!r}")
+    return tree
+
+
+@cache
+def channels_of(text: str) -> frozenset[str]:
+    """Return the channels that an expression reads."""
+    names = {node.id for node in ast.walk(parse_expression(text)) if isinstance(node, ast.Name)}
+    needed = names & set(CHANNEL_UNITS)
+    needed |= {"p_A", "p_B"} if "pressure_difference" in names else set()
+    return frozenset(needed | ({"p_A", "p_B", "x"} if names & set(DIRECTIONS) else set()))
+
+
+@cache
+def increments_of(text: str, displacement: float = 1.0) -> Callable[[Signals], Array]:
+    """Return a function that evaluates an expression over all sampling intervals of `Signals`, shape (n - 1,)."""
+    tree = parse_expression(text)
+
+    def increments(signals: Signals) -> Array:
+        """Evaluate the expression."""
+        values = _interval_values(tree, signals, displacement)
+        return np.asarray(values) if np.ndim(values) else np.full(len(signals.time_step), values)
+
+    return increments
+
+
+def _interval_values(node: ast.expr, s: Signals, displacement: float) -> Any:
+    """Evaluate an expression over the sampling intervals (n - 1,)."""
+    if isinstance(node, ast.Constant):
+        return float(node.value)  # type: ignore[arg-type]
+    if isinstance(node, ast.BinOp):
+        left, right = (_interval_values(side, s, displacement) for side in (node.left, node.right))
+        operator = _OPERATORS[type(node.op)]  # type: ignore[index]
+        return {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[operator](left, right)
+    if isinstance(node, ast.Name):
+        if node.id in DIRECTIONS:
+            return s.direction_weights(*DIRECTIONS[node.id])
+        if node.id == "pressure_difference":
+            return s.pressure_difference
+        return {"dt": s.dt, "rate": s.rate, "displacement": displacement}[node.id]
+    name, value = _call(node)
+    if name == "gradient":
+        return np.gradient(_interval_values(value, s, displacement))
+    if isinstance(value, ast.Name):
+        return s.step(value.id) if name == "change" else s.mean(value.id)
+    points = _point_values(value, s)
+    return np.diff(points) if name == "change" else 0.5 * (points[1:] + points[:-1])
+
+
+def _point_values(node: ast.expr, s: Signals) -> Any:
+    """Evaluate an expression at the samples (n,)."""
+    if isinstance(node, ast.Constant):
+        return float(node.value)  # type: ignore[arg-type]
+    if isinstance(node, ast.Name):
+        return s[node.id]
+    if isinstance(node, ast.BinOp):
+        left, right = _point_values(node.left, s), _point_values(node.right, s)
+        operator = _OPERATORS[type(node.op)]  # type: ignore[index]
+        return {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[operator](left, right)
+    name, value = _call(node)
+    if name == "absolute":
+        assert isinstance(value, ast.Name)
+        return s.absolute_pressure[value.id]
+    return np.log(_point_values(value, s))
+
+
+def _call(node: ast.expr) -> tuple[str, ast.expr]:
+    """Return name and argument of a function in an expression."""
+    if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and len(node.args) == 1):
+        raise ValueError(f"a function of an expression must have one argument, got {ast.unparse(node)!r}")
+    return node.func.id, node.args[0]
+
+
+def build_increments(expressions: Sequence[str], channels: Mapping[str, int]) -> Callable[..., None]:
+    """Write a function that evaluates expressions over one interval of the last samples, for `compiled.large_law`.
+
+    The function's arguments are `ring` (channels, width), in whose columns sample k stands at k modulo the width; the
+    interval k, from sample k to k + 1; `half`, the samples on either side of the central difference that shows the
+    direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`: rows of `ring` by name.
+    """
+    lines = [
+        "def compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:",
+        '    """Compute the increments of all terms of the volume balance over the interval from sample k to k + 1."""',
+        "    width = ring.shape[1]",
+        "    earlier, later = max(k - 1, 0), k + 1",
+    ]
+    words = {node.id for text in expressions for node in ast.walk(parse_expression(text)) if isinstance(node, ast.Name)}
+    if words & set(DIRECTIONS):
+        x, p_A, p_B = (channels[name] for name in ("x", "p_A", "p_B"))
+        lines += [f"    {word} = 0.0" for word in DIRECTIONS]
+        lines += [
+            "    for i in range(k, k + 2):  # either end of the interval counts half",
+            f"        is_outward = ring[{x}, (i + half) % width] >= ring[{x}, max(i - half, 0) % width]",
+            f"        A_carries = ring[{p_A}, i % width] > ring[{p_B}, i % width]",
+        ]
+        for word, (outward, by_A) in DIRECTIONS.items():
+            conditions = f"is_outward == {outward} and A_carries == {by_A}"
+            lines += [f"        if {conditions}:", f"            {word} += 0.5"]
+    for column, text in enumerate(expressions):
+        lines.append(f"    out[{column}] = {_interval_text(parse_expression(text), 'k', channels)}")
+    source = "\n".join([*lines, ""])
+    file = f"<terms {next(_numbers)}>"
+    linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
+    namespace: dict[str, Any] = {"Any": Any, "math": __import__("math")}
+    exec(compile(source, file, "exec"), namespace)
+    return namespace["compute_increments"]  # type: ignore[no-any-return]
+
+
+def _interval_text(node: ast.expr, interval: str, channels: Mapping[str, int]) -> str:
+    """Write an expression over an interval, from the sample of this name to the next."""
+    if isinstance(node, ast.Constant):
+        return repr(float(node.value))  # type: ignore[arg-type]
+    if isinstance(node, ast.BinOp):
+        sides = (_interval_text(side, interval, channels) for side in (node.left, node.right))
+        return "({} {} {})".format(next(sides), _OPERATORS[type(node.op)], next(sides))  # type: ignore[index]
+    if isinstance(node, ast.Name):
+        if node.id == "pressure_difference":
+            difference = ast.parse("mean(p_A) - mean(p_B)", mode="eval").body
+            return _interval_text(difference, interval, channels)
+        return "(1.0 / rate)" if node.id == "dt" else node.id
+    name, value = _call(node)
+    if name == "gradient":
+        after, before = (_interval_text(value, k, channels) for k in ("later", "earlier"))
+        return f"(({after} - {before}) / (later - earlier))"
+    first, second = (_point_text(value, sample, channels) for sample in (interval, f"({interval} + 1)"))
+    return f"({second} - {first})" if name == "change" else f"(0.5 * ({second} + {first}))"
+
+
+def _point_text(node: ast.expr, sample: str, channels: Mapping[str, int]) -> str:
+    """Write an expression at the sample of this name."""
+    if isinstance(node, ast.Constant):
+        return repr(float(node.value))  # type: ignore[arg-type]
+    if isinstance(node, ast.Name):
+        return f"ring[{channels[node.id]}, {sample} % width]"
+    if isinstance(node, ast.BinOp):
+        sides = (_point_text(side, sample, channels) for side in (node.left, node.right))
+        return "({} {} {})".format(next(sides), _OPERATORS[type(node.op)], next(sides))  # type: ignore[index]
+    name, value = _call(node)
+    inner = _point_text(value, sample, channels)
+    return f"max({inner} + {P_ATM!r}, {MIN_ABSOLUTE_PRESSURE!r})" if name == "absolute" else f"math.log({inner})"

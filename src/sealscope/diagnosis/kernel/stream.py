@@ -1,0 +1,663 @@
+"""The leakage of a running actuator, sample by sample, as kernels on one state record of fixed size.
+
+The equations are those of the live volume balance (`diagnosis.live`, `diagnosis.inference`); its terms are the
+expressions of `equations.terms`. A row is this balance, integrated with a test function over `SPAN` strides
+(`rows.weak_form`); a row begins every stride of about 0.125 s. `add_sample` adds the increments of the balance's terms
+to the unfinished rows. At the end of a block of 3 s, its rows are weighted and summed to a Gram matrix, the products of
+all terms, from which the block's leakage conductance is estimated and tested for a step. This work is divided into
+parts of similar length: each call of `advance` does one, so that a controller spreads the end of a block over its
+cycles, until `phase` is 0. Only the last samples are stored, about 2 `HALF_DIFFERENCE` seconds.
+
+The mean conductance G of the last n blocks (at most `WINDOW`) has the interval
+
+    G +- hypot(t_(n-1) sqrt(v/n), 1.96 o),    v = max(s^2, mean of sd^2)
+
+with the standard deviation s of the blocks' estimates, their standard errors sd, Student's t, and the systematic
+standard error o due to the other coefficients and to the machine's sizes (displacement, piston area). The flow is G
+times the mean of abs(p_A - p_B) as recorded; the live balance also subtracts the sensors' noise from this mean, a few
+per cent. A leak is a step of the conductance that the detector of steps finds (`kernel.step`), at a stated rate of
+false alarms.
+
+No counter grows without limit but those of blocks, which last for 200 years of blocks in 32 bits. A state of any
+numbers, even of readings that are none, leads to no index beyond its array.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import lru_cache
+from types import MappingProxyType, SimpleNamespace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.compiled import large_law, law, record_dtype
+from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.equations.expressions import build_increments, channels_of
+from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE
+from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, WITHIN_95
+from sealscope.diagnosis.inference.rows.row_weights import (
+    MAX_ITERATIONS,
+    SUPPORT,
+    Workspace,
+    add_reduced,
+    eliminate_fast,
+    fit_blocks,
+    median,
+    move_sums,
+    reweigh,
+    sum_products,
+    workspace_shapes,
+)
+from sealscope.diagnosis.inference.rows.weak_form import (
+    MAX_READING,
+    MIN_STRIDE,
+    SPAN,
+    STRIDE,
+    stride_samples,
+    test_function,
+)
+from sealscope.diagnosis.kernel import step
+from sealscope.diagnosis.live.balance import (
+    BLOCK_SECONDS,
+    LEARNED,
+    MIN_REST_PRECISION,
+    N_WAKING,
+    live_equations,
+    size_error,
+)
+from sealscope.diagnosis.live.coefficients import (
+    MISFIT,
+    STANDSTILL,
+    Coefficients,
+    add_block,
+    coefficient_shapes,
+    estimate_leak,
+    fit_coefficients,
+    load_block,
+    relative_motion,
+)
+from sealscope.diagnosis.priors.live import LIVE
+from sealscope.errors import InputError
+from sealscope.parameters import Rig
+
+#: Number of blocks of a mean.
+WINDOW = 20
+#: Blocks after a pause of so many seconds are not compared with earlier ones.
+PAUSE = float(LIVE.watch.pause)
+#: Onsets that a call of `advance` weighs, and halvings of the interval of the bound after each block.
+_ONSETS_A_CALL, _HALVINGS = 4, 20
+#: Blocks from which on the times of the detector of steps begin anew, and by how many.
+_MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
+#: Parts of the work at the end of a block: `phase` of the record.
+(
+    IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, WEIGH, DECIDE, BOUND,
+    FINISH,
+) = range(14)  # fmt: skip
+#: Columns of `history`, the results of the last blocks: conductance G estimated with the present coefficients [m^3/(s
+#: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, and the mean
+#: of abs(p_A - p_B) [Pa].
+_G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
+#: Columns of `pressure_sums`: the sum of abs(p_A - p_B) [Pa] over a block's samples, and their number.
+_SUM, _NUMBER = 0, 1
+#: Columns of `waiting_sizes`: number of rows, mean abs(p_A - p_B) [Pa], and number of a block.
+_BLOCK_ROWS, _BLOCK_PRESSURE, _BLOCK_NUMBER = 0, 1, 2
+#: Results, in the order of `write_results`: leakage of pump and piston together with its interval [m^3/s]; leak since its
+#: onset, or 0 without an alarm, with its interval [m^3/s]; bound of an undetected leak [m^3/s]; score (log M) and its
+#: threshold; 1 for an alarm; seconds since the onset; conductance [m^3/(s Pa)]; variance of the last block's rows over the
+#: usual one; number of estimated blocks; reason of `REASONS`, 0 for none.
+RESULTS = (
+    *("q", "q_low", "q_high", "q_leak", "q_leak_low", "q_leak_high", "q_bound", "score", "threshold", "alarm"),
+    *("since", "conductance", "misfit", "blocks", "reason"),
+)
+(
+    _OUT_Q, _OUT_Q_LOW, _OUT_Q_HIGH, _OUT_LEAK, _OUT_LEAK_LOW, _OUT_LEAK_HIGH, _OUT_BOUND, _OUT_SCORE, _OUT_THRESHOLD,
+    _OUT_ALARM, _OUT_SINCE, _OUT_G, _OUT_MISFIT, _OUT_BLOCKS, _OUT_REASON,
+) = range(len(RESULTS))  # fmt: skip
+#: Why there is no result: the number in `reason`, with its words.
+REASONS = MappingProxyType(
+    {
+        0: "",
+        1: "learning: the first blocks are fitted together",
+        2: "at standstill",
+        3: "missing values",
+        4: "the cycle calls `step` too rarely: a block was dropped",
+    }
+)
+_LEARNING, _STANDSTILL, _MISSING, _OVERRUN = 1, 2, 3, 4
+_REAL_NUMBERS = (
+    *("size_error", "leak_error", "displacement", "log_threshold", "angle_sign", "usual_precision", "leak_size"),
+    *("leak_deviation", "leak_onset", "block_end"),
+)
+_WHOLE_NUMBERS = (
+    # samples so far, less whole periods; blocks: ended, weighted (at most `SUPPORT` + 1 exactly), open, being worked on,
+    # that wait for the first fit, successive ones of larger motion, estimated, dropped
+    *("sample_count", "n_ended", "n_weighted", "n_open", "n_closed", "n_waiting", "n_moving", "n_estimated", "n_dropped"),
+    # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, and iterations
+    *("n_rows", "n_closed_rows", "phase", "place", "iteration", "has_converged", "is_fitting", "halvings"),
+    *("alarm", "reason", "first_closed", "first_number"),
+)
+
+
+class StreamSettings(NamedTuple):
+    """What is known of a machine before its stream begins, and becomes constants of the kernels."""
+
+    rate: float  # sampling rate [Hz]
+    channels: tuple[str, ...]  # of a sample, in this order
+    expressions: tuple[str, ...]  # of the terms of the balance, last of its left side
+    bias: int  # index of the constant flow in these
+    # indices into `expressions`: first the `n_fast` terms fitted to each block, then the other terms, last the left side
+    column_order: tuple[int, ...]
+    n_fast: int
+    displacement: float  # of the pump [m^3/rad], 1 if a meter gives the flow
+    size_error: float  # relative standard error of the leakage due to the machine's displacement and piston area
+    log_threshold: float  # of the score
+
+    @classmethod
+    def from_rig(
+        cls, rig: Rig, rate: float, flow: str = "theta", false_alarms_per_1000_h: float = 1.0
+    ) -> StreamSettings:
+        """Choose the settings for a rig, a sampling `rate` [Hz] and the channel of the pump's `flow`.
+
+        Raises InputError if the rate is too low, or the balance needs terms that no stream computes.
+        """
+        if not MIN_STRIDE / STRIDE <= rate < math.inf:
+            raise InputError(f"rate of a stream must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
+        channels = ("p_A", "p_B", flow, "x")
+        balances = live_equations(rig, channels)
+        if len(balances) != 1:
+            circuit = rig.circuit.name
+            raise InputError(f"a stream on a controller must have one volume balance, got {len(balances)} ({circuit})")
+        (balance,) = balances
+        unknown = [term.name for term in balance.terms if not term.expression]
+        if unknown or not balance.left_expression or rig.circuit.feeds_one_chamber:
+            what = ", ".join(unknown) or f"the flow of {rig.circuit.name}"
+            raise InputError(f"a stream on a controller must have terms that are expressions, got {what}")
+        columns = ColumnRoles(balance)
+        fast = columns.fast
+        expressions = (*(term.expression for term in balance.terms), balance.left_expression)
+        assert set().union(*map(channels_of, expressions)) <= set(channels)
+        probability = float(LIVE.watch.step) * false_alarms_per_1000_h * BLOCK_SECONDS / 3600.0 / 1000.0
+        return cls(
+            rate,
+            channels,
+            expressions,
+            bias=int(columns.bias or 0),
+            column_order=(*fast, *columns.slow, columns.left),
+            n_fast=len(fast),
+            displacement=rig.pump.q_b / (2.0 * math.pi) if flow in ("theta", "omega") else 1.0,
+            size_error=size_error(rig),
+            log_threshold=-math.log(probability),
+        )
+
+    @property
+    def counts(self) -> tuple[int, int, int]:
+        """Samples in a stride, strides in a block, and samples in half a difference.
+
+        The difference is the central one of the position, whose sign is the direction of motion.
+        """
+        return stride_samples(self.rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * self.rate))
+
+
+def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
+    """Build the layout of a stream's state: a numpy record of numbers and arrays."""
+    _, block_strides, half = settings.counts
+    n_columns = len(settings.expressions)
+    n_slow = len(settings.column_order) - settings.n_fast - 1  # - 1: the left side
+    support_rows = SUPPORT * block_strides
+    workspace = workspace_shapes(support_rows, SUPPORT, len(settings.column_order), n_slow)
+    arrays = record_dtype(
+        *_REAL_NUMBERS,
+        ring=(len(settings.channels), 2 * half + 2),  # last samples, those that the increments need
+        increments=(n_columns,),  # of each term of the balance over the last sampling interval
+        unfinished=(SPAN, n_columns),  # the rows to which the present sample adds
+        # finished rows: of the blocks that are worked on, then of the open ones
+        rows=(support_rows + block_strides, n_columns),
+        ends=(SUPPORT,),  # index past the last row of each open block
+        closed_ends=(SUPPORT,),  # the same of the blocks that are worked on
+        gram=(SUPPORT, n_columns, n_columns),  # of the blocks weighted last
+        # sum of abs(p_A - p_B), and number of samples; + 1: the last rows of a block end when the next has begun
+        pressure_sums=(SUPPORT + 1, 2),
+        slow_sums=(n_slow + 1, n_slow + 1),  # over earlier blocks, for the coefficients not fitted to each block
+        waiting_grams=(LEARNED, n_columns, n_columns),  # of the blocks that wait for the first fit
+        waiting_sizes=(LEARNED, 3),  # `_BLOCK_ROWS`, `_BLOCK_PRESSURE` and `_BLOCK_NUMBER` of these blocks
+        precisions=(LEARNED,),  # of their estimates
+        history=(WINDOW, 5),  # results of each of the last blocks (`_G` ... `_PRESSURE`)
+        workspace=record_dtype(**dict(zip(Workspace._fields, workspace, strict=True))),
+        # nuisances: all columns but the leak and the left side
+        model=record_dtype(**dict(zip(Coefficients._fields, coefficient_shapes(n_columns - 2), strict=True))),
+        steps=step.LAYOUT,
+    )
+    wholes = [(name, np.dtype("i8")) for name in _WHOLE_NUMBERS]
+    return np.dtype([*wholes, *((name, field[0]) for name, field in (arrays.fields or {}).items())])
+
+
+@lru_cache(maxsize=8)
+def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
+    """Build the kernels of a stream: `start`, `add_sample`, `advance`, `write_results` and `acknowledge`.
+
+    - ``start(m)`` sets the state m to its beginning.
+    - ``add_sample(m, p_A, p_B, flow, x)`` adds a sample in SI units, NaN or a number beyond `MAX_READING` if missing.
+    - ``advance(m)`` does a part of the work at the end of a block, if there is any (`m.phase`).
+    - ``write_results(m, out)`` writes the results, in the order of `RESULTS`.
+    - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew.
+    """
+    from scipy.special import stdtrit
+
+    rate = settings.rate
+    n_stride, block_strides, half = settings.counts
+    n_support, n_block = SPAN * n_stride, n_stride * block_strides
+    block_seconds, pause = n_block / rate, PAUSE * rate / n_block
+    channels, n_columns = settings.channels, len(settings.expressions)
+    row_p_A, row_p_B, row_flow, row_x = range(len(channels))
+    response, leak, bias = n_columns - 1, n_columns - 2, settings.bias
+    column_order, n_fast, all_columns = settings.column_order, settings.n_fast, tuple(range(n_columns))
+    capacity = (SUPPORT + 1) * block_strides
+    width = 2 * half + 2
+    # a number of samples after which all that is counted modulo repeats
+    period = math.lcm(width, n_stride * SPAN, n_block * (SUPPORT + 1))
+    # phi = peak (1 - s^2)^4; the first value of `test_function` is in the middle of the first sampling interval, where
+    # s = 1/n_support - 1
+    peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
+    order = 0.5 + 0.5 * BOUND_PROBABILITY  # of a two-sided interval
+    quantiles = tuple(float(stdtrit(freedom, order)) for freedom in range(1, WINDOW))  # Student's t
+    own_size_error, own_displacement, own_threshold = settings.size_error, settings.displacement, settings.log_threshold
+    leak_error = math.hypot(settings.size_error, float(LIVE.watch.law))
+    increments = build_increments(settings.expressions, {name: k for k, name in enumerate(channels)})
+    compute_increments = large_law(increments)
+
+    @law
+    def start(m: Any) -> None:
+        """Set the state to its beginning."""
+        m.size_error, m.displacement, m.log_threshold = own_size_error, own_displacement, own_threshold
+        m.leak_error, m.angle_sign = leak_error, 1.0
+        m.usual_precision = m.leak_size = m.leak_deviation = m.leak_onset = m.block_end = 0.0
+        m.sample_count = m.n_ended = m.n_weighted = m.n_open = m.n_closed = m.n_waiting = m.n_moving = 0
+        m.n_estimated = m.n_dropped = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = 0
+        m.has_converged = m.is_fitting = m.halvings = m.alarm = m.first_closed = m.first_number = 0
+        m.reason = _LEARNING
+        m.slow_sums[:, :] = 0.0
+        m.model.sums[:, :] = 0.0
+        m.model.values[:] = 0.0
+        m.model.leak_products[:] = 0.0
+        m.model.numbers[:] = 0.0
+        step.start_detector(m.steps)
+
+    @law
+    def add_pressure_difference(m: Any, k: int) -> None:
+        """Add abs(p_A - p_B) [Pa] of sample interval k to the sums of its block."""
+        slot = (k // n_block) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
+        if k % n_block == 0:
+            m.pressure_sums[slot, _SUM] = m.pressure_sums[slot, _NUMBER] = 0.0
+        # the leak's increment: mean of p_A - p_B over the interval, times its duration 1/rate. An interval with a
+        # missing measurement, also of the pump's flow, is left out, as by the volume balance
+        difference = abs(m.increments[leak]) * rate
+        if difference < MAX_READING and abs(m.increments[response]) < MAX_READING:
+            m.pressure_sums[slot, _SUM] += difference
+            m.pressure_sums[slot, _NUMBER] += 1.0
+
+    @law
+    def add_sample(m: Any, p_A: float, p_B: float, flow: float, x: float) -> None:
+        """Add a sample to the state; after the last row of a block, begin the work at its end."""
+        n_samples = int(m.sample_count)
+        newest = n_samples % width
+        m.ring[row_p_A, newest], m.ring[row_p_B, newest] = p_A, p_B
+        m.ring[row_flow, newest], m.ring[row_x, newest] = flow, x
+        m.sample_count = n_samples + 1 if n_samples + 1 < 2 * period else n_samples + 1 - period
+        k = n_samples - half - 1  # the newest interval that has `half` samples after it
+        if k < 0:
+            return
+        compute_increments(m.ring, k, half, rate, m.displacement, m.increments)
+        add_pressure_difference(m, k)
+        stride, k_in_stride = k // n_stride, k % n_stride
+        for age in range(SPAN):  # add to the row that began `age` strides ago, weighted by its test function phi(s)
+            slot = (stride - age) % SPAN  # of this row in `unfinished`
+            s = (age * n_stride + k_in_stride + 0.5) * 2.0 / n_support - 1.0  # -1 .. 1 over the row
+            phi = peak * (1.0 - s * s) ** 4
+            for j in range(n_columns):
+                row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[slot, j]  # a new row begins at 0
+                m.unfinished[slot, j] = row_sum + phi * m.increments[j]
+        # number of the row that is finished at the end of this stride; < 0 if it began before the first sample
+        row = stride - SPAN + 1
+        if k_in_stride < n_stride - 1 or row < 0:
+            return
+        is_finite, place = True, int(m.n_rows)
+        if place < capacity:
+            for j in range(n_columns):
+                m.rows[place, j] = m.unfinished[row % SPAN, j]
+                is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
+            if is_finite:  # a row with a missing measurement is overwritten by the next
+                m.n_rows = place + 1
+        if row % block_strides == block_strides - 1:
+            end_block(m, (row // block_strides) % (SUPPORT + 1))
+
+    @law
+    def end_block(m: Any, slot: int) -> None:
+        """End the newest block, and begin the work on all open ones; `slot`: its place in `pressure_sums`.
+
+        A block is open until its rows are weighted. The first `SUPPORT` blocks stay open until the last of them ends.
+        """
+        m.n_ended += 1
+        if m.phase != IDLE:  # the work on an earlier block is not done: leave this one out
+            m.n_rows = m.n_closed_rows
+            m.n_dropped += 1
+            m.reason = _OVERRUN
+            return
+        m.ends[int(m.n_open)] = m.n_rows
+        m.n_open += 1
+        if m.n_weighted == 0 and m.n_open < SUPPORT:
+            return
+        for b in range(int(m.n_open)):
+            m.closed_ends[b] = m.ends[b]
+        m.n_closed, m.n_closed_rows, m.n_open = m.n_open, m.n_rows, 0
+        m.first_closed, m.first_number = (slot - m.n_closed + 1) % (SUPPORT + 1), m.n_ended - m.n_closed
+        m.n_weighted = min(m.n_weighted + m.n_closed, 1000000)
+        for r in range(int(m.n_closed_rows)):
+            m.workspace.weights[r] = 1.0
+        m.place = m.iteration = 0
+        m.has_converged = 1 if m.n_closed_rows == 0 else 0  # then one pass writes Gram matrices of zeros
+        m.phase = PRODUCTS
+
+    @large_law
+    def weigh_part(m: Any) -> None:
+        """Do a part of the weighting of rows: see `row_weights.weigh_rows`."""
+        b, n_closed, n_closed_rows = int(m.place), int(m.n_closed), int(m.n_closed_rows)
+        if m.phase == PRODUCTS:
+            begin = int(m.closed_ends[max(b - 1, 0)]) if b > 0 else 0
+            sum_products(m.rows, begin, int(m.closed_ends[b]), m.workspace.weights, m.gram[b])
+            m.phase = REDUCE
+        elif m.phase == REDUCE:
+            eliminate_fast(m.gram[b], column_order, n_fast, m.workspace.reduced[b])
+            m.place = b + 1
+            m.phase = PRODUCTS if b + 1 < n_closed else NORMAL
+        elif m.phase == NORMAL:
+            is_last = m.has_converged == 1 or m.iteration == MAX_ITERATIONS
+            add_reduced(m.workspace, m.slow_sums, n_closed, n_fast, is_last)
+            m.place = 0
+            if is_last:
+                # a later block changes the sums less
+                move_sums(m.workspace.normal, m.slow_sums, n_closed, min(1.0, SUPPORT / m.n_weighted))
+                m.phase = BLOCK
+            else:
+                fit_blocks(m.workspace, n_closed, n_fast)
+                m.phase = REWEIGH
+        else:
+            has_converged = reweigh(m.rows[:n_closed_rows], m.closed_ends[:n_closed], column_order, m.workspace)
+            m.has_converged = 1 if has_converged else 0
+            m.iteration += 1
+            m.phase = PRODUCTS
+
+    @law
+    def find_flow_sign(m: Any) -> None:
+        """Find the sign of the pump's recorded flow: `m.angle_sign`, 1 or -1.
+
+        It is the sign of the covariance between p_A - p_B and the pump's flow in the blocks that wait for the first
+        fit: with the right sign, the flow rises with p_A - p_B. Blocks at standstill do not tell the sign.
+        """
+        # sums over the rows; the bias has the same value in each row
+        weight = leak_sum = response_sum = product = 0.0
+        for k in range(LEARNED):
+            gram = m.waiting_grams[k]
+            weight += gram[bias, bias]
+            leak_sum += gram[bias, leak]
+            response_sum += gram[bias, response]
+            product += gram[leak, response]
+        m.angle_sign = -1.0 if product < leak_sum * response_sum / weight else 1.0
+
+    @law
+    def load_signed_block(m: Any, gram: Any) -> None:
+        """Copy the Gram matrix of a block to `m.model.block`; correct the sign of the response by `m.angle_sign`."""
+        load_block(m.model, gram, all_columns)
+        for j in range(response):
+            m.model.block[j, response] *= m.angle_sign
+            m.model.block[response, j] *= m.angle_sign
+
+    @large_law
+    def append_conductance(m: Any, n_rows: float, pressure: float, number: float, is_learned: bool) -> None:
+        """Estimate the leakage conductance of the block loaded in `m.model`, append it to the history, and test it.
+
+        An estimate is left out if its precision (1/variance) is not positive or, at standstill, at most
+        `MIN_REST_PRECISION` times the usual one. `n_rows`, `pressure` [Pa], `number`: rows of the volume balance in the
+        block, its mean abs(p_A - p_B), and its number; `is_learned`: True if the balance's other coefficients are
+        updated with the block.
+        """
+        model = m.model
+        motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
+        # G and the shift are multiplied by the precision, the systematic variance of G by the square of the precision
+        precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
+        if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
+            m.reason = _STANDSTILL
+            return
+        G, history, k = weighted_G / precision, m.history, int(m.n_estimated) % WINDOW
+        comparable_G = G - weighted_shift / precision  # without jumps where the other coefficients improve
+        history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
+        history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (m.size_error * G) ** 2
+        history[k, _PRESSURE] = pressure
+        m.n_estimated += 1
+        m.reason = 0
+        test_estimate(m, number, comparable_G, math.sqrt(1.0 / precision))
+
+    @law
+    def test_estimate(m: Any, number: float, g: float, deviation: float) -> None:
+        """Add the conductance of block `number` to the detector of steps, whose unit of time is a block."""
+        steps = m.steps
+        if steps.has_level == 1 and number - steps.end > pause:
+            step.forget_onsets(steps)
+        if steps.n_blocks > _MOST_BLOCKS:  # times remain small, also in single precision
+            steps.n_blocks -= _SHIFTED_BLOCKS
+            steps.end -= _SHIFTED_BLOCKS
+            m.n_ended -= _SHIFTED_BLOCKS
+            m.leak_onset -= _SHIFTED_BLOCKS
+            for j in range(int(steps.n_onsets)):
+                steps.onsets[j, step.BLOCK] -= _SHIFTED_BLOCKS
+                steps.onsets[j, step.TIME] -= _SHIFTED_BLOCKS
+                steps.onsets[j, step.BLOCK_BEGIN] -= _SHIFTED_BLOCKS
+            number -= _SHIFTED_BLOCKS
+        step.take_estimate(steps, number, number + 1.0, g, deviation)
+        m.block_end = number + 1.0
+
+    @law
+    def forget_standstill(m: Any) -> None:
+        """Discard the coefficients and estimates of a standstill: they do not hold in motion.
+
+        The weighting of the rows (`slow_sums`) remains, as after `LiveBalance.relearn`.
+        """
+        model = m.model
+        model.sums[:, :] = 0.0
+        model.leak_products[:] = 0.0
+        model.numbers[:] = 0.0
+        m.usual_precision = 0.0
+        m.n_moving = m.n_estimated = 0
+        m.reason = _LEARNING
+        step.forget_onsets(m.steps)
+
+    @law
+    def use_block(m: Any) -> None:
+        """Estimate the leakage of the block at `place`, or store it until the first `LEARNED` blocks are fitted together.
+
+        Before the first fit, blocks are only stored, beginning with the first that has motion. After `N_WAKING`
+        successive blocks whose mean square motion is more than 1/`STANDSTILL` times that of earlier blocks, the machine
+        is taken to have stood still before: all estimates are discarded, and the first fit is repeated.
+        """
+        b = int(m.place)
+        n_rows = m.closed_ends[b] - (m.closed_ends[max(b - 1, 0)] if b > 0 else 0.0)
+        slot = (m.first_closed + b) % (SUPPORT + 1)  # of this block in the ring buffer `pressure_sums`
+        pressure = m.pressure_sums[slot, _SUM] / max(m.pressure_sums[slot, _NUMBER], 1.0)
+        number = float(m.first_number + b)
+        if not n_rows > 0.0:
+            m.reason = _MISSING
+            return
+        motion_square = m.gram[b, response, response]
+        if m.usual_precision > 0.0:  # after the first fit
+            motion = relative_motion(motion_square, n_rows, m.model.numbers)
+            m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
+            if m.n_moving >= N_WAKING:
+                forget_standstill(m)
+                return
+            load_signed_block(m, m.gram[b])
+            append_conductance(m, n_rows, pressure, number, is_learned=True)
+            return
+        k = int(m.n_waiting)
+        if k == 0 and not motion_square > 0.0:  # blocks before the first motion are left out
+            m.reason = _STANDSTILL
+            return
+        m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE] = n_rows, pressure
+        m.waiting_sizes[k, _BLOCK_NUMBER] = number
+        for i in range(n_columns):
+            for j in range(n_columns):
+                m.waiting_grams[k, i, j] = m.gram[b, i, j]
+        m.n_waiting = k + 1
+        if k + 1 == LEARNED:
+            find_flow_sign(m)
+            m.is_fitting = 1
+
+    @large_law
+    def fit_part(m: Any) -> None:
+        """Do a part of the first fit: of the balance to the first `LEARNED` blocks, and of the leakage in each."""
+        k, model = int(m.n_waiting) - LEARNED, m.model  # `n_waiting` counts on from `LEARNED` in each part
+        if m.phase == FIT:
+            fit_coefficients(model)
+            m.n_waiting, m.phase = LEARNED, FIT_PRECISION
+            return
+        load_signed_block(m, m.waiting_grams[k])
+        n_rows, pressure = m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE]
+        if m.phase == FIT_ADD:
+            add_block(model, n_rows, weight=1.0, has_stepped=False)
+        elif m.phase == FIT_PRECISION:  # is_learned: False, as the blocks are in the sums already
+            m.precisions[k], _, _, _ = estimate_leak(model, n_rows, is_learned=False)
+        else:
+            append_conductance(m, n_rows, pressure, m.waiting_sizes[k, _BLOCK_NUMBER], is_learned=False)
+        m.n_waiting += 1
+        if k + 1 < LEARNED:
+            return
+        m.n_waiting = LEARNED
+        if m.phase == FIT_ADD:
+            m.phase = FIT
+        elif m.phase == FIT_PRECISION:
+            m.usual_precision = median(m.precisions, LEARNED)
+            m.phase = FIT_APPEND
+        else:
+            m.n_waiting = m.is_fitting = 0
+            m.phase = BLOCK
+
+    @large_law
+    def test_part(m: Any) -> None:
+        """Do a part of the test for a step: weigh the onsets, decide, and find the bound."""
+        steps, n_onsets = m.steps, int(m.steps.n_onsets)
+        first, last = int(m.place), min(int(m.place) + _ONSETS_A_CALL, n_onsets)
+        if m.phase == WEIGH:
+            for j in range(first, last):
+                step.weigh_onset(steps, j)
+            m.place = last
+            if last == n_onsets:
+                m.phase = DECIDE
+        elif m.phase == DECIDE:
+            step.sum_evidence(steps)
+            if steps.log_e > m.log_threshold:
+                m.alarm = 1
+                m.leak_size, m.leak_deviation, m.leak_onset = steps.size, steps.size_deviation, steps.onset
+            step.start_bound(steps)
+            m.place = m.halvings = 0
+            m.phase = BOUND if n_onsets > 0 and m.alarm == 0 else FINISH
+        else:
+            x = 0.5 * (steps.low + steps.high) if m.halvings > 0 else 0.0
+            for j in range(first, last):
+                step.add_exceedance(steps, j, x)
+            m.place = last
+            if last == n_onsets:
+                step.bisect_bound(steps)
+                m.halvings += 1
+                m.place = 0
+                if m.halvings > _HALVINGS:
+                    m.phase = FINISH
+
+    @law
+    def finish_blocks(m: Any) -> None:
+        """End the work on the closed blocks: the rows of open ones move to the beginning."""
+        n_closed_rows, n_rows = int(m.n_closed_rows), int(m.n_rows)
+        for r in range(n_closed_rows, n_rows):
+            for j in range(n_columns):
+                m.rows[r - n_closed_rows, j] = m.rows[r, j]
+        m.n_rows = n_rows - n_closed_rows
+        m.n_closed = m.n_closed_rows = m.place = 0
+        m.phase = IDLE
+
+    @law
+    def advance(m: Any) -> None:
+        """Do a part of the work at the end of a block, if there is any."""
+        if m.phase == IDLE:
+            return
+        if m.phase <= REWEIGH:
+            weigh_part(m)
+        elif m.phase == BLOCK:
+            if m.place >= m.n_closed:
+                m.place = 0
+                m.phase = WEIGH if m.steps.n_onsets > 0 else FINISH
+            else:
+                use_block(m)
+                m.place += 1
+                if m.is_fitting == 1:
+                    m.n_waiting, m.phase = LEARNED, FIT_ADD
+        elif m.phase <= FIT_APPEND:
+            fit_part(m)
+        elif m.phase <= BOUND:
+            test_part(m)
+        else:
+            finish_blocks(m)
+
+    @large_law
+    def mean_of(history: Any, newest: int, n: int, column: int) -> float:
+        """Compute the mean of a `column` of the ring buffer `history` over the n blocks up to block number `newest`."""
+        total = 0.0
+        for k in range(n):
+            total += history[(newest - k) % WINDOW, column] / n
+        return float(total)
+
+    @law
+    def acknowledge(m: Any) -> None:
+        """Withdraw an alarm, and begin the tests anew."""
+        m.alarm = 0
+        m.leak_size = m.leak_deviation = m.leak_onset = 0.0
+        step.forget_onsets(m.steps)
+        if m.phase >= WEIGH:  # the onsets are gone
+            m.phase = FINISH
+
+    @law
+    def write_results(m: Any, out: Any) -> None:
+        """Write the results in the order of `RESULTS`, by the formulas of the module's docstring.
+
+        At most the last `WINDOW` blocks count. The leakage needs two blocks; without them it is 0.
+        """
+        history, n_estimated, newest = m.history, int(m.n_estimated), int(m.n_estimated) - 1
+        for k in range(len(RESULTS)):
+            out[k] = 0.0
+        out[_OUT_MISFIT], out[_OUT_BLOCKS], out[_OUT_REASON] = m.model.numbers[MISFIT], m.n_estimated, m.reason
+        out[_OUT_THRESHOLD], out[_OUT_ALARM] = m.log_threshold, m.alarm
+        out[_OUT_SCORE] = max(m.steps.log_e, 0.0) if m.steps.n_onsets > 0 else 0.0
+        n = min(n_estimated, WINDOW)
+        if n < 2:
+            return
+        G, pressure = mean_of(history, newest, n, _G), mean_of(history, newest, n, _PRESSURE)
+        g, scatter = mean_of(history, newest, n, _COMPARABLE_G), 0.0
+        for k in range(n):
+            scatter += (history[(newest - k) % WINDOW, _COMPARABLE_G] - g) ** 2 / (n - 1.0)
+        variance = max(scatter, mean_of(history, newest, n, _VARIANCE)) / n
+        half_width = math.hypot(  # of random and systematic errors; quantiles[n - 2] has n - 1 degrees of freedom
+            quantiles[n - 2] * math.sqrt(variance),
+            WITHIN_95 * math.sqrt(mean_of(history, newest, n, _SYSTEMATIC_VARIANCE)),
+        )
+        out[_OUT_G], out[_OUT_Q] = G, pressure * G
+        out[_OUT_Q_LOW], out[_OUT_Q_HIGH] = pressure * (G - half_width), pressure * (G + half_width)
+        if m.alarm == 1:
+            half_width = WITHIN_95 * math.hypot(m.leak_deviation, m.leak_error * m.leak_size)
+            out[_OUT_LEAK] = pressure * m.leak_size
+            out[_OUT_LEAK_LOW] = pressure * max(m.leak_size - half_width, 0.0)
+            out[_OUT_LEAK_HIGH] = pressure * (m.leak_size + half_width)
+            out[_OUT_SINCE] = (m.block_end - m.leak_onset) * block_seconds
+        elif m.steps.n_onsets > 0:
+            out[_OUT_BOUND] = pressure * m.steps.bound * (1.0 + WITHIN_95 * m.leak_error)
+
+    return SimpleNamespace(
+        start=start, add_sample=add_sample, advance=advance, write_results=write_results, acknowledge=acknowledge
+    )
