@@ -17,13 +17,13 @@ from sealscope.emit.program import (
     Function,
     If,
     Kind,
+    Local,
     Operation,
     Program,
     Return,
     Statement,
     TableElement,
     Target,
-    Variable,
     While,
     iter_calls,
     iter_expressions,
@@ -98,8 +98,10 @@ class CText:
             kind: Kind = "real" if any(isinstance(value, float) for value in values) else "whole"
             numbers = ", ".join(self._constant(Constant(value, kind)) for value in values)
             chunks.append(f"static const {self._types[kind]} {self._table(name)}[{len(values)}] = {{{numbers}}};\n")
-        for function in self._program.functions:
-            chunks.append("\n".join(self._render_function(function, function.name not in names)) + "\n")
+        functions = self._program.functions
+        chunks += [
+            "\n".join(self._render_function(function, function.name not in names)) + "\n" for function in functions
+        ]
         return "\n".join(chunks)
 
     def _table(self, name: str) -> str:
@@ -176,7 +178,7 @@ class CText:
 
     def _place(self, target: Target) -> str:
         """Render what is assigned to."""
-        return target.name if isinstance(target, Variable) else self._element(target)
+        return target.name if isinstance(target, Local) else self._element(target)
 
     def _element(self, element: Element) -> str:
         """Render a number of the state."""
@@ -205,7 +207,7 @@ class CText:
         """Render an expression, in brackets if it is an operation."""
         if isinstance(value, Constant):
             return self._constant(value)
-        if isinstance(value, Variable):
+        if isinstance(value, Local):
             return value.name
         if isinstance(value, Element):
             return self._element(value)

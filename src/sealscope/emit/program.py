@@ -1,8 +1,8 @@
 """Statements and expressions of a program on one state record: what `specialise` writes, and each language renders.
 
-A program has no pointers and allocates nothing. Its state is a record of numbers and arrays with fixed sizes. An array's
-element has one index, computed from the sizes. Functions have scalars as parameters, and return any number of scalars.
-Expressions have no side effects.
+A program has no pointers and allocates nothing. Its state is a record of numbers and arrays with fixed sizes. An
+array's element has one index, computed from the sizes. Functions have scalars as parameters, and return any number of
+scalars. Expressions have no side effects.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Constant:
 
 
 @dataclass(frozen=True)
-class Variable:
+class Local:
     """A local variable or parameter of a function."""
 
     name: str
@@ -64,9 +64,9 @@ class Operation:
     kind: Kind
 
 
-Expression = Constant | Variable | Element | TableElement | Operation
+Expression = Constant | Local | Element | TableElement | Operation
 #: What a value is assigned to.
-Target = Variable | Element
+Target = Local | Element
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ class If:
 class For:
     """Run `body` for each whole value of `variable` from `start` to `stop` - 1; both are constants or variables."""
 
-    variable: Variable
+    variable: Local
     start: Expression
     stop: Expression
     body: tuple[Statement, ...]
@@ -122,7 +122,7 @@ class Call:
 
     function: str
     arguments: tuple[Expression, ...]
-    results: tuple[Variable | None, ...]
+    results: tuple[Local | None, ...]
 
 
 Statement = Assign | If | For | While | Break | Return | Call
@@ -134,7 +134,7 @@ class Function:
 
     name: str
     summary: str
-    parameters: tuple[Variable, ...] = ()
+    parameters: tuple[Local, ...] = ()
     results: tuple[Kind, ...] = ()
     variables: dict[str, Kind] = field(default_factory=dict)
     body: tuple[Statement, ...] = ()

@@ -39,14 +39,13 @@ from sealscope.emit.program import (
     Function,
     If,
     Kind,
+    Local,
     Operation,
     Program,
     Return,
     StateField,
     Statement,
     TableElement,
-    Target,
-    Variable,
     While,
     iter_expressions,
     parts,
@@ -154,7 +153,7 @@ def _value_of_argument(name: str, kind: Any, layout: np.dtype[Any]) -> Value:
     if isinstance(kind, str) and kind == "state":
         return Record("", layout)
     if isinstance(kind, str) and kind in ("real", "whole", "truth"):
-        return Variable(name, kind)  # type: ignore[arg-type]
+        return Local(name, kind)  # type: ignore[arg-type]
     return Known(kind)
 
 
@@ -217,11 +216,11 @@ def _freeze(value: Value) -> Any:
 def _parameter_value(name: str, value: Value) -> Value:
     """Return the value that an argument has within a function: numbers of the caller become parameters."""
     if isinstance(value, Known) and isinstance(value.value, (bool, int, float, np.number)):
-        return Variable(name, _constant(value.value).kind)
+        return Local(name, _constant(value.value).kind)
     if isinstance(value, View):
-        offset = value.offset if isinstance(value.offset, Constant) else Variable(f"{name}_offset", "whole")
+        offset = value.offset if isinstance(value.offset, Constant) else Local(f"{name}_offset", "whole")
         sizes = tuple(
-            size if isinstance(size, Constant) else Variable(f"{name}_size{k}", "whole")
+            size if isinstance(size, Constant) else Local(f"{name}_size{k}", "whole")
             for k, size in enumerate(value.sizes)
         )
         return replace(value, offset=offset, sizes=sizes)
@@ -229,17 +228,17 @@ def _parameter_value(name: str, value: Value) -> Value:
         return Several(tuple(_parameter_value(f"{name}_{k}", part) for k, part in enumerate(value.values)))
     if isinstance(value, (Known, Record)):
         return value
-    return Variable(name, value.kind)
+    return Local(name, value.kind)
 
 
-def _pairs(inner: Value, outer: Value) -> Iterator[tuple[Variable, Expression]]:
+def _pairs(inner: Value, outer: Value) -> Iterator[tuple[Local, Expression]]:
     """Yield the parameters of an argument within a function, and the caller's expression for each."""
-    if isinstance(inner, Variable):
+    if isinstance(inner, Local):
         yield inner, _constant(outer.value) if isinstance(outer, Known) else outer  # type: ignore[misc]
     elif isinstance(inner, View) and isinstance(outer, View):
-        for mine, theirs in zip((inner.offset, *inner.sizes), (outer.offset, *outer.sizes), strict=True):
-            if isinstance(mine, Variable):
-                yield mine, theirs
+        for parameter, number in zip((inner.offset, *inner.sizes), (outer.offset, *outer.sizes), strict=True):
+            if isinstance(parameter, Local):
+                yield parameter, number
     elif isinstance(inner, Several) and isinstance(outer, Several):
         for mine, theirs in zip(inner.values, outer.values, strict=True):
             yield from _pairs(mine, theirs)  # type: ignore[arg-type]
@@ -332,7 +331,7 @@ class _Body:
         parameters = [inner for key, value in self._arguments.items() for inner in _parameters(value)]
         if not keeps_parameters:
             used = {part.name for value in iter_expressions(self._statements) for part in parts(value)
-                    if isinstance(part, Variable)}  # fmt: skip
+                    if isinstance(part, Local)}  # fmt: skip
             parameters = [parameter for parameter in parameters if parameter.name in used]
         document = (ast.get_docstring(self._tree) or "").partition("\n")[0]
         results = tuple(self._result_kinds or ())
@@ -341,7 +340,7 @@ class _Body:
     def _copy_parameter(self, key: str) -> None:
         """Copy a parameter that the function assigns to into a variable."""
         value = self._arguments[key]
-        if not isinstance(value, Variable):
+        if not isinstance(value, Local):
             raise self._refusal(self._tree, f"{key} is assigned to, and must be a number")
         del self._values[key]
         self._assign_name(key, value, self._tree, f"{key}_now")
@@ -410,7 +409,7 @@ class _Body:
         if isinstance(condition, Known):
             self._block(node.body if condition.value else node.orelse)
             return
-        truth = self._truth(condition, node)
+        truth = self._truth_value(condition, node)
         if isinstance(truth, Constant):
             self._block(node.body if truth.value else node.orelse)
             return
@@ -421,7 +420,7 @@ class _Body:
         if node.orelse:
             raise self._refusal(node, "a loop must have no else")
         self._conditional += 1
-        condition = self._truth(self._value(node.test), node)
+        condition = self._truth_value(self._value(node.test), node)
         self._conditional -= 1
         self._statements.append(While(condition, self._nested(node.body)))
 
@@ -431,13 +430,13 @@ class _Body:
             raise self._refusal(node, "a loop must have one variable and no else")
         name = node.target.id
         if isinstance(node.iter, ast.Call) and isinstance(node.iter.func, ast.Name) and node.iter.func.id == "range":
-            bounds = [self._whole(self._value(bound), node) for bound in node.iter.args]
+            bounds = [self._whole_number(self._value(bound), node) for bound in node.iter.args]
             if len(bounds) > 2 or node.iter.keywords:
                 raise self._refusal(node, "a range must have the step 1")
             start, stop = (Constant(0, "whole"), bounds[0]) if len(bounds) == 1 else bounds
             start, stop = self._steady(start, node), self._steady(stop, node)
             self._declare(name, "whole", node)
-            variable = Variable(name, "whole")
+            variable = Local(name, "whole")
             self._values[name] = variable
             self._statements.append(For(variable, start, stop, self._nested(node.body)))
             return
@@ -494,8 +493,8 @@ class _Body:
         has_state = any(isinstance(target, (ast.Subscript, ast.Attribute)) for target in targets)
 
         def depends(value: Value) -> bool:
-            return isinstance(value, (Operation, Element, Variable, TableElement)) and any(
-                (isinstance(part, Element) and has_state) or (isinstance(part, Variable) and part.name in names)
+            return isinstance(value, (Operation, Element, Local, TableElement)) and any(
+                (isinstance(part, Element) and has_state) or (isinstance(part, Local) and part.name in names)
                 for part in parts(value)
             )
 
@@ -523,7 +522,7 @@ class _Body:
         number = self._number(value, node)
         variable_name = written or self._free_variable(name)
         self._declare(variable_name, number.kind, node)
-        variable = Variable(variable_name, self._kinds[variable_name])
+        variable = Local(variable_name, self._kinds[variable_name])
         self._values[name] = variable
         self._statements.append(Assign(variable, convert(number, variable.kind)))
 
@@ -558,7 +557,7 @@ class _Body:
 
     def _fill(self, view: View, number: Expression, node: ast.AST) -> None:
         """Write loops that set all numbers of a view."""
-        variables = [Variable(self._temporary_name("whole"), "whole") for _ in view.sizes]
+        variables = [Local(self._temporary_name("whole"), "whole") for _ in view.sizes]
         index = view.offset
         for variable, stride in zip(variables, view.strides, strict=True):
             index = self._operate("+", index, self._operate("*", variable, Constant(stride, "whole")))
@@ -576,16 +575,16 @@ class _Body:
         self._variables[name] = kind
         return name
 
-    def _temporary(self, value: Expression) -> Variable:
+    def _temporary(self, value: Expression) -> Local:
         """Store a number in a new variable."""
-        variable = Variable(self._temporary_name(value.kind), value.kind)
+        variable = Local(self._temporary_name(value.kind), value.kind)
         self._statements.append(Assign(variable, value))
         return variable
 
     def _steady(self, value: Value, node: ast.AST) -> Expression:
         """Return a number that later statements do not change: a constant, a parameter, or a new variable."""
         number = self._number(value, node)
-        if isinstance(number, Constant) or (isinstance(number, Variable) and self._is_steady(number.name)):
+        if isinstance(number, Constant) or (isinstance(number, Local) and self._is_steady(number.name)):
             return number
         return self._temporary(number)
 
@@ -601,14 +600,14 @@ class _Body:
             raise self._refusal(node, "a number must stand here")
         return value
 
-    def _whole(self, value: Value, node: ast.AST) -> Expression:
+    def _whole_number(self, value: Value, node: ast.AST) -> Expression:
         """Return the expression of a whole number."""
         number = self._number(value, node)
         if number.kind == "real":
             raise self._refusal(node, "a whole number must stand here")
         return convert(number, "whole")
 
-    def _truth(self, value: Value, node: ast.AST) -> Expression:
+    def _truth_value(self, value: Value, node: ast.AST) -> Expression:
         """Return an expression as a truth value, which is True for a number other than 0."""
         number = self._number(value, node)
         if number.kind == "truth":
@@ -620,7 +619,8 @@ class _Body:
         method = getattr(self, f"_value_{type(node).__name__}", None)
         if method is None:
             raise self._refusal(node, f"an expression must be of the subset, got {type(node).__name__}")
-        return method(node)  # type: ignore[no-any-return]
+        value: Value = method(node)
+        return value
 
     def _lift(self, value: Any) -> Value:
         """Return a value of Python as a known one."""
@@ -631,11 +631,11 @@ class _Body:
         return Known(node.value)
 
     def _value_Name(self, node: ast.Name) -> Value:
-        """Return what a name stands for."""
+        """Return the value of a name."""
         if node.id in self._values:
             value = self._values[node.id]
-            if isinstance(value, Variable) and value.name in self._kinds and node.id in self._stored:
-                return Variable(value.name, self._kinds[value.name])
+            if isinstance(value, Local) and value.name in self._kinds and node.id in self._stored:
+                return Local(value.name, self._kinds[value.name])
             return value
         if node.id in self._stored:
             raise self._refusal(node, f"{node.id} must be assigned to before it is used")
@@ -681,7 +681,8 @@ class _Body:
         index = self._value(node.slice)
         if isinstance(index, Known):
             if isinstance(owner, Several):
-                return owner.values[index.value]
+                part: Value = owner.values[int(index.value)]
+                return part
             if isinstance(owner, Known):
                 return self._lift(owner.value[index.value])
         if isinstance(owner, Known) and isinstance(owner.value, (tuple, np.ndarray)):
@@ -690,7 +691,7 @@ class _Body:
                 raise self._refusal(node, "a table must have one dimension")
             hint = node.value.id if isinstance(node.value, ast.Name) else "table"
             name = self._writer.table(owner.value, hint)
-            return TableElement(name, self._whole(index, node), _constant(values[0]).kind)
+            return TableElement(name, self._whole_number(index, node), _constant(values[0]).kind)
         raise self._refusal(node, "an index must be into an array of the state or a table")
 
     def _part_of_view(self, view: View, node: ast.Subscript) -> Value:
@@ -705,7 +706,7 @@ class _Body:
                 start, stop = self._limits(index, size, node)
                 kept.append((self._operate("-", stop, start), stride))
             else:
-                start = self._counted_from_start(self._whole(self._value(index), node), size)
+                start = self._counted_from_start(self._whole_number(self._value(index), node), size)
             offset = self._operate("+", offset, self._operate("*", start, Constant(stride, "whole")))
         if not kept and not sizes:
             return Element(view.name, offset, view.kind)
@@ -715,8 +716,8 @@ class _Body:
         """Return the first index of a slice, and the one after its last."""
         if index.step is not None:
             raise self._refusal(node, "a slice must have the step 1")
-        start = Constant(0, "whole") if index.lower is None else self._whole(self._value(index.lower), node)
-        stop = size if index.upper is None else self._whole(self._value(index.upper), node)
+        start = Constant(0, "whole") if index.lower is None else self._whole_number(self._value(index.lower), node)
+        stop = size if index.upper is None else self._whole_number(self._value(index.upper), node)
         return self._counted_from_start(start, size), self._counted_from_start(stop, size)
 
     def _counted_from_start(self, index: Expression, size: Expression) -> Expression:
@@ -733,14 +734,13 @@ class _Body:
                 return _constant(_EVALUATE[name](*numbers))
             except ZeroDivisionError:
                 pass
-        first, second = (*operands, None)[:2]
+        first, second = operands[0], operands[1] if len(operands) > 1 else None
         if name in ("+", "-") and isinstance(second, Constant) and second.kind == "whole" and second.value == 0:
-            return first  # type: ignore[return-value]
-        if name == "+" and isinstance(first, Constant) and first.kind == "whole" and first.value == 0:
-            if second is not None and second.kind == "whole":
+            return first
+        if second is not None and first.kind == second.kind == "whole":
+            if name == "+" and isinstance(first, Constant) and first.value == 0:
                 return second
-        if name == "*" and first is not None and second is not None and first.kind == second.kind == "whole":
-            if isinstance(second, Constant) and second.value == 1:
+            if name == "*" and isinstance(second, Constant) and second.value == 1:
                 return first
         kind: Kind = _wider([operand.kind for operand in operands])
         if name == "/":
@@ -783,7 +783,7 @@ class _Body:
 
     def _atom(self, value: Expression) -> Expression:
         """Store a number that is used more than once in a variable, where statements may precede the expression."""
-        if isinstance(value, (Constant, Variable)) or self._conditional:
+        if isinstance(value, (Constant, Local)) or self._conditional:
             return value
         return self._temporary(value)
 
@@ -793,7 +793,7 @@ class _Body:
         if isinstance(node.op, ast.Not):
             if isinstance(value, Known):
                 return self._lift(not value.value)
-            return Operation("not", (self._truth(value, node),), "truth")
+            return Operation("not", (self._truth_value(value, node),), "truth")
         if isinstance(value, Known) and isinstance(node.op, ast.USub):
             return self._lift(-value.value)
         if not isinstance(node.op, ast.USub):
@@ -837,7 +837,7 @@ class _Body:
                     results.append(_constant(decides))
                     break
                 continue
-            results.append(self._truth(value, node))
+            results.append(self._truth_value(value, node))
         if not results:
             return self._lift(not decides)
         result = results[0]
@@ -850,7 +850,7 @@ class _Body:
         condition = self._value(node.test)
         if isinstance(condition, Known):
             return self._value(node.body if condition.value else node.orelse)
-        truth = self._truth(condition, node)
+        truth = self._truth_value(condition, node)
         self._conditional += 1
         values = [self._number(self._value(part), node) for part in (node.body, node.orelse)]
         self._conditional -= 1
@@ -865,12 +865,12 @@ class _Body:
         if not isinstance(function, Known) or isinstance(function.value, ModuleType):
             raise self._refusal(node, "a function must be known before the machine runs")
         called = function.value
-        method = {
+        methods: dict[Any, Callable[[ast.Call, Sequence[Value]], Value]] = {
             **{len: self._call_len, abs: self._call_abs, min: self._call_least, max: self._call_largest},
             **{int: self._call_int, float: self._call_float, bool: self._call_bool},
-        }.get(called if isinstance(called, type) or callable(called) else None)
-        if method is not None:
-            return method(node, [self._value(part) for part in node.args])
+        }
+        if called in methods:
+            return methods[called](node, [self._value(part) for part in node.args])
         if called in OPERATORS:
             name = OPERATORS[called]
             values = [self._value(part) for part in node.args]
@@ -905,7 +905,7 @@ class _Body:
         for name, value in outer.items():
             passed |= {inner.name: theirs for inner, theirs in _pairs(_parameter_value(name, value), value)}
         arguments = [convert(passed[parameter.name], parameter.kind) for parameter in written.parameters]
-        results = tuple(Variable(self._temporary_name(kind), kind) for kind in written.results)
+        results = tuple(Local(self._temporary_name(kind), kind) for kind in written.results)
         self._statements.append(Call(written.name, tuple(arguments), results))
         if not results:
             return Known(None)
@@ -975,15 +975,15 @@ class _Body:
     def _call_bool(self, node: ast.Call, values: Sequence[Value]) -> Value:
         """Return the truth of a number."""
         (value,) = values
-        return Known(bool(value.value)) if isinstance(value, Known) else self._truth(value, node)
+        return Known(bool(value.value)) if isinstance(value, Known) else self._truth_value(value, node)
 
 
-def _parameters(value: Value) -> Iterator[Variable]:
+def _parameters(value: Value) -> Iterator[Local]:
     """Yield the parameters of an argument within a function."""
-    if isinstance(value, Variable):
+    if isinstance(value, Local):
         yield value
     elif isinstance(value, View):
-        yield from (part for part in (value.offset, *value.sizes) if isinstance(part, Variable))
+        yield from (part for part in (value.offset, *value.sizes) if isinstance(part, Local))
     elif isinstance(value, Several):
         for part in value.values:
             yield from _parameters(part)

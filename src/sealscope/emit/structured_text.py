@@ -24,13 +24,13 @@ from sealscope.emit.program import (
     Function,
     If,
     Kind,
+    Local,
     Operation,
     Program,
     Return,
     Statement,
     TableElement,
     Target,
-    Variable,
     While,
     iter_calls,
     iter_expressions,
@@ -42,16 +42,17 @@ _BINARY = {"+": "+", "-": "-", "*": "*", "/": "/", "and": "AND", "or": "OR", "==
 _BINARY |= {name: name for name in ("<", "<=", ">", ">=")}
 _FUNCTIONS = {"absolute": "ABS", "log": "LN", "exp": "EXP", "sqrt": "SQRT"}
 #: Words that a name must not be: keywords, types, standard functions and blocks of IEC 61131-3, and of SFC and IL.
-RESERVED = frozenset(
-    """abs acos action add and andn any array asin at atan bool by byte cal calc calcn case concat configuration constant
-    cos ct ctd ctu ctud cu cv date day dint div do dt dword edge else elsif end eq exit exp expt f_edge f_trig false find
-    for from function function_block ge goto gt if in initial insert int interval jmp jmpc jmpcn ld ldn le left len limit
-    lint ln log lreal lt lword max mid min mod move mul mux ne not of on or orn parameter persistent pointer priority
-    program pt q r r1 r_edge r_trig read_only read_write real ref_to repeat replace resource ret retain retc retcn return
-    right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super tan task
-    then this time tod tof ton to tp transition true trunc type udint uint ulint until usint var while with word
-    wstring xor xorn""".split()
-)
+_RESERVED_TEXT = """\
+abs acos action add and andn any array asin at atan bool by byte cal calc calcn case concat configuration constant
+cos ct ctd ctu ctud cu cv date day dint div do dt dword edge else elsif end eq exit exp expt f_edge f_trig false find
+for from function function_block ge goto gt if in initial insert int interval jmp jmpc jmpcn ld ldn le left len limit
+lint ln log lreal lt lword max mid min mod move mul mux ne not of on or orn parameter persistent pointer priority
+program pt q r r1 r_edge r_trig read_only read_write real ref_to repeat replace resource ret retain retc retcn return
+right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super tan task
+then this time tod tof ton to tp transition true trunc type udint uint ulint until usint var while with word wstring
+xor xorn
+"""
+RESERVED = frozenset(_RESERVED_TEXT.split())
 #: Limit of a literal, and the factor by which larger ones are written.
 _LARGEST = 1e38
 
@@ -89,13 +90,13 @@ class StText:
             if name in used:
                 yield f"{self._prefix}_{name}", text
         for function in self._program.functions:
-            yield self.block_name(function.name), _Block(self, self._program, function, self._field_names).render()
+            yield self.block_name(function.name), _BlockText(self, self._program, function, self._field_names).render()
 
 
-def _unique_names(names: Iterable[str], taken: Iterable[str] = ()) -> dict[str, str]:
+def _unique_names(names: Iterable[str], reserved: Iterable[str] = ()) -> dict[str, str]:
     """Choose names that differ without regard to case, and are no words of the language, for a program's names."""
     chosen: dict[str, str] = {}
-    used = {name.lower() for name in taken}
+    used = {name.lower() for name in reserved}
     for name in names:
         base = re.sub(r"_+", "_", name).strip("_") or "v"
         candidates = (base if k == 0 else f"{base}{'x' if k == 1 else f'x{k}'}" for k in count())
@@ -151,7 +152,7 @@ END_FUNCTION
     return {"log1p": log1p, "hypot": hypot}
 
 
-class _Block:
+class _BlockText:
     """The function block of one function."""
 
     def __init__(self, text: StText, program: Program, function: Function, field_names: dict[str, str]) -> None:
@@ -183,11 +184,11 @@ class _Block:
         if function.results:
             results = (f"    {names[f'result_{k}']} : {_TYPES[kind]};" for k, kind in enumerate(function.results))
             lines += ["VAR_OUTPUT", *results, "END_VAR"]
-        own = [f"    {names[name]} : {_TYPES[kind]};" for name, kind in function.variables.items()]
-        own += [f"    {name} : {_TYPES[kind]};" for name, kind in self._conditions]
-        own += [f"    {names[f'call_{callee}']} : {self._text.block_name(callee)};" for callee in self._callees]
-        if own:
-            lines += ["VAR", *own, "END_VAR"]
+        variables = [f"    {names[name]} : {_TYPES[kind]};" for name, kind in function.variables.items()]
+        variables += [f"    {name} : {_TYPES[kind]};" for name, kind in self._conditions]
+        variables += [f"    {names[f'call_{callee}']} : {self._text.block_name(callee)};" for callee in self._callees]
+        if variables:
+            lines += ["VAR", *variables, "END_VAR"]
         if self._tables:
             lines += ["VAR CONSTANT", *map(self._declare_table, self._tables), "END_VAR"]
         return "\n".join([*lines, *body, "END_FUNCTION_BLOCK", ""])
@@ -268,7 +269,7 @@ class _Block:
         lines: list[str] = []
         callee = self._program.function(statement.function)
         results = [f"result_{k}" for k in range(len(callee.results))]
-        variables = [p.name for p in callee.parameters] + [n for n in callee.variables]
+        variables = [p.name for p in callee.parameters] + list(callee.variables)
         theirs = _unique_names(dict.fromkeys([*results, *variables]), ["state"])
         values = [self._expression(argument, lines, indent) for argument in statement.arguments]
         passed = [f"{theirs[p.name]} := {value}" for p, value in zip(callee.parameters, values, strict=True)]
@@ -281,7 +282,7 @@ class _Block:
 
     def _place(self, target: Target, lines: list[str], indent: str) -> str:
         """Render what is assigned to."""
-        return self._names[target.name] if isinstance(target, Variable) else self._element(target, lines, indent)
+        return self._names[target.name] if isinstance(target, Local) else self._element(target, lines, indent)
 
     def _element(self, element: Element, lines: list[str], indent: str) -> str:
         """Render a number of the state."""
@@ -292,7 +293,7 @@ class _Block:
         """Render an expression; the lines that must precede it are appended to `lines`."""
         if isinstance(value, Constant):
             return _literal(value)
-        if isinstance(value, Variable):
+        if isinstance(value, Local):
             return self._names[value.name]
         if isinstance(value, Element):
             return self._element(value, lines, indent)
@@ -342,7 +343,8 @@ class _Block:
         if name == "is_finite":
             return f"(({first} - {first}) = LREAL#0.0)"
         if name in ("log1p", "hypot"):
-            return f"{self._text.block_name(name)}({', '.join(f'{n} := {o}' for n, o in zip('ab', operands, strict=False))})"
+            arguments = (f"{key} := {operand}" for key, operand in zip("ab", operands, strict=False))
+            return f"{self._text.block_name(name)}({', '.join(arguments)})"
         raise ValueError(f"the operator {name} must be one that Structured Text has")
 
 
@@ -359,8 +361,7 @@ def _conversion(value: Operation, operand: str) -> str:
 def _is_partial(value: Expression) -> bool:
     """Return True for an expression that only a condition before it makes valid, such as an index or a quotient."""
     return any(
-        isinstance(part, (Element, TableElement))
-        and part.index is not None
+        (isinstance(part, (Element, TableElement)) and part.index is not None)
         or (
             isinstance(part, Operation)
             and part.operator in ("/", "floor_div", "floor_mod", "log", "sqrt", "power", "select")

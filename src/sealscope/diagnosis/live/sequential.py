@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval
-from sealscope.diagnosis.kernel.special import LOG_ZERO
-from sealscope.diagnosis.kernel.step import (
+from sealscope.diagnosis.live.kernel.special import LOG_ZERO
+from sealscope.diagnosis.live.kernel.step import (
     ARRAYS,
     LAYOUT,
     RECENT,
@@ -66,7 +66,7 @@ _ARRAYS = ("level", "level_variance", "squares", "log_variances", "log_weights")
 class StepDetector:
     """Detect an increase of one coefficient from its estimates block by block, in bounded memory.
 
-    The module's docstring gives the formulas, whose symbols are used here. Fields of the record `_memory` (1,), of which
+    The module's docstring gives the formulas, whose symbols are used here. Fields of the record `_memory` (1,), whose
     arrays have an entry for each variance q of the coefficient's random walk in a block:
 
     - `level`, `level_variance`: state of each Kalman filter,

@@ -331,8 +331,7 @@ def shut_at_rest(equation: Equation) -> Equation:
     shut = _insert_before_leaks(equation, *_pump_leakage_terms(equation, drift="pump"))
     return shut._replace(
         terms=tuple(
-            term.with_increments(lambda s: s.moving(left) * s.dt) if term.name == BIAS else term
-            for term in shut.terms
+            term.with_increments(lambda s: s.moving(left) * s.dt) if term.name == BIAS else term for term in shut.terms
         )
     )
 

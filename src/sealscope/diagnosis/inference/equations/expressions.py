@@ -1,8 +1,8 @@
 """Terms of a volume balance as expressions, evaluated by NumPy for files and written as a kernel for streams.
 
-An expression computes the increment of a term over one sampling interval, such as ``mean(x) * change(p_A)``. Its words:
+An expression computes the increment of a term over one sampling interval, such as ``mean(x) * change(p_A)``:
 
-- a channel, such as ``p_A`` or ``x``, and ``absolute(p_A)``, an absolute pressure, and ``log(...)``: values at a sample;
+- a channel, such as ``p_A``, ``absolute(p_A)``, an absolute pressure, and ``log(...)`` are values at a sample;
 - ``change(v)`` and ``mean(v)``: difference and mean of a value v at the two ends of the interval;
 - ``dt``: the interval [s]; ``rate``: its inverse [Hz]; ``pressure_difference``: mean of p_A - p_B without the sensors'
   offset; ``out_A``, ``out_B``, ``in_A``, ``in_B``: 1 while the piston moves towards B (out) or A (in) and side A or B
@@ -125,7 +125,8 @@ def build_increments(expressions: Sequence[str], channels: Mapping[str, int]) ->
 
     The function's arguments are `ring` (channels, width), in whose columns sample k stands at k modulo the width; the
     interval k, from sample k to k + 1; `half`, the samples on either side of the central difference that shows the
-    direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`: rows of `ring` by name.
+    direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`:
+    rows of `ring` by name.
     """
     lines = [
         "def compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:",
@@ -161,7 +162,7 @@ def _interval_text(node: ast.expr, interval: str, channels: Mapping[str, int]) -
         return repr(float(node.value))  # type: ignore[arg-type]
     if isinstance(node, ast.BinOp):
         sides = (_interval_text(side, interval, channels) for side in (node.left, node.right))
-        return "({} {} {})".format(next(sides), _OPERATORS[type(node.op)], next(sides))  # type: ignore[index]
+        return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
     if isinstance(node, ast.Name):
         if node.id == "pressure_difference":
             difference = ast.parse("mean(p_A) - mean(p_B)", mode="eval").body
@@ -183,7 +184,7 @@ def _point_text(node: ast.expr, sample: str, channels: Mapping[str, int]) -> str
         return f"ring[{channels[node.id]}, {sample} % width]"
     if isinstance(node, ast.BinOp):
         sides = (_point_text(side, sample, channels) for side in (node.left, node.right))
-        return "({} {} {})".format(next(sides), _OPERATORS[type(node.op)], next(sides))  # type: ignore[index]
+        return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
     name, value = _call(node)
     inner = _point_text(value, sample, channels)
     return f"max({inner} + {P_ATM!r}, {MIN_ABSOLUTE_PRESSURE!r})" if name == "absolute" else f"math.log({inner})"

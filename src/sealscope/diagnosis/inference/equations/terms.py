@@ -173,8 +173,13 @@ def conductance_term(
 _LEAK_CAUSE: Cause = "piston or pump leak"
 LEAKS = (
     expressed_term(
-        LEAK, "m^3/(s Pa)", "pressure_difference * dt", _LEAK_CAUSE,
-        drift="piston", needs=PRESSURES, driver="pressure",
+        LEAK,
+        "m^3/(s Pa)",
+        "pressure_difference * dt",
+        _LEAK_CAUSE,
+        drift="piston",
+        needs=PRESSURES,
+        driver="pressure",
     ),
     Term(ORIFICE, "m^3/(s Pa^0.5)", lambda s: s.pressure_root * s.dt, _LEAK_CAUSE, needs=PRESSURES, driver="root"),
 )
@@ -284,9 +289,7 @@ LINES_TERM = conductance_term(
     drift="pump",
 )
 #: The increments are changes of the piston's speed; the coefficient is the piston's area times the delay.
-LAG_TERM = expressed_term(
-    LAG, "m^2 s", "gradient(change(x) * rate)", "sensor fault", drift="motion", needs=("x",)
-)
+LAG_TERM = expressed_term(LAG, "m^2 s", "gradient(change(x) * rate)", "sensor fault", drift="motion", needs=("x",))
 
 
 def metering_edge_terms(

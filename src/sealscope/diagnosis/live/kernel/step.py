@@ -15,7 +15,7 @@ import numpy as np
 
 from sealscope.compiled import kernel, large_law, law
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
-from sealscope.diagnosis.kernel.special import LOG_ZERO, add_logs, log_gamma, normal_probability
+from sealscope.diagnosis.live.kernel.special import LOG_ZERO, add_logs, log_gamma, normal_probability
 from sealscope.diagnosis.priors.live import LIVE
 
 _PRIORS = LIVE.step
@@ -23,7 +23,7 @@ _PRIORS = LIVE.step
 WALKS: tuple[float, ...] = tuple(map(float, _PRIORS.walks))
 #: v: prior variances of the step's size, in the same unit.
 SIZES: tuple[float, ...] = tuple(map(float, _PRIORS.sizes))
-#: Fractions of the step's first block in which the leak is open, the longest first, so that onsets are in order of time.
+#: Fractions of the step's first block in which the leak is open, the longest first: onsets are in order of time.
 PARTS: tuple[float, ...] = tuple(sorted(map(float, _PRIORS.parts), reverse=True))
 _N_WALKS, _N_SIZES, _N_PARTS = len(WALKS), len(SIZES), len(PARTS)
 #: All onsets of the last `RECENT` blocks are stored, then `RECENT / 4` of each doubling of age, up to `HORIZON` blocks.
@@ -55,8 +55,8 @@ _TAIL = 0.025
 #: Rows of `sums`, for each walk and onset: part of a unit step that the filter has followed (1 - f of the next block),
 #: a, b, T, and log pi_j minus the log likelihood of the blocks before the onset.
 FOLLOWED, A, B, T, LOG_PRIOR = range(5)
-#: Columns of `onsets`: n of the innovations in T, number of the block, time, begin of the block [s], and log evidence of
-#: the blocks before it.
+#: Columns of `onsets`: n of the innovations in T, number of the block, time, begin of the block [s], and log evidence
+#: of the blocks before it.
 N, BLOCK, TIME, BLOCK_BEGIN, EVIDENCE = range(5)
 #: Columns of `views`, what an onset says: log of its part of M; log of its posterior probability, but for the time that
 #: it stands for; mean and mean square of the size given the onset.
@@ -166,7 +166,7 @@ def _add_onsets(d: Any, begin: float, end: float) -> None:
 
 @large_law
 def _select_onsets(d: Any) -> None:
-    """Keep all onsets of the last `RECENT` blocks, and of older ones fewer, at the start of blocks on a coarser grid."""
+    """Keep all onsets of the last `RECENT` blocks, and older ones at the start of blocks on a coarser grid."""
     n_kept = 0
     for j in range(int(d.n_onsets)):
         age = d.n_blocks - int(d.onsets[j, BLOCK])
@@ -244,7 +244,7 @@ def limit_log_e(d: Any) -> float:
             a = max(d.sums[A, q, j], 0.0)
             explained = min(a * a / (d.sums[B, q, j] * d.sums[T, q, j]), _MOST_EXPLAINED)
             largest = max(largest, -0.5 * d.onsets[j, N] * math.log1p(-explained))
-    return largest + math.log(d.n_onsets / _N_PARTS) if d.n_onsets > 0 else LOG_ZERO
+    return float(largest + math.log(d.n_onsets / _N_PARTS)) if d.n_onsets > 0 else LOG_ZERO
 
 
 @large_law
@@ -296,12 +296,12 @@ def _spacing(d: Any, j: int) -> float:
     before, after = max(j - 1, 0), min(j + 1, last)
     if after == before:
         return 1.0
-    return max((d.onsets[after, TIME] - d.onsets[before, TIME]) / (after - before), _TINY)
+    return float(max((d.onsets[after, TIME] - d.onsets[before, TIME]) / (after - before), _TINY))
 
 
 @large_law
 def sum_evidence(d: Any) -> None:
-    """Compute log M (`log_e`), and the posterior of onset [s] and size [unit of g], from onsets that are all weighed."""
+    """Compute log M (`log_e`), and the posterior of onset [s] and size [unit of g], once all onsets are weighed."""
     n_onsets = int(d.n_onsets)
     d.log_e, heaviest = LOG_ZERO, LOG_ZERO
     for j in range(n_onsets):

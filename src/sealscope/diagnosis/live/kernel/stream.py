@@ -25,7 +25,6 @@ numbers, even of readings that are none, leads to no index beyond its array.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from functools import lru_cache
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple
@@ -58,7 +57,6 @@ from sealscope.diagnosis.inference.rows.weak_form import (
     stride_samples,
     test_function,
 )
-from sealscope.diagnosis.kernel import step
 from sealscope.diagnosis.live.balance import (
     BLOCK_SECONDS,
     LEARNED,
@@ -78,6 +76,7 @@ from sealscope.diagnosis.live.coefficients import (
     load_block,
     relative_motion,
 )
+from sealscope.diagnosis.live.kernel import step
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
@@ -103,10 +102,10 @@ _G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
 _SUM, _NUMBER = 0, 1
 #: Columns of `waiting_sizes`: number of rows, mean abs(p_A - p_B) [Pa], and number of a block.
 _BLOCK_ROWS, _BLOCK_PRESSURE, _BLOCK_NUMBER = 0, 1, 2
-#: Results, in the order of `write_results`: leakage of pump and piston together with its interval [m^3/s]; leak since its
-#: onset, or 0 without an alarm, with its interval [m^3/s]; bound of an undetected leak [m^3/s]; score (log M) and its
-#: threshold; 1 for an alarm; seconds since the onset; conductance [m^3/(s Pa)]; variance of the last block's rows over the
-#: usual one; number of estimated blocks; reason of `REASONS`, 0 for none.
+#: Results, in the order of `write_results`: leakage of pump and piston together with its interval [m^3/s]; leak since
+#: its onset, or 0 without an alarm, with its interval [m^3/s]; bound of an undetected leak [m^3/s]; score (log M) and
+#: its threshold; 1 for an alarm; seconds since the onset; conductance [m^3/(s Pa)]; variance of the last block's rows
+#: over the usual one; number of estimated blocks; reason of `REASONS`, 0 for none.
 RESULTS = (
     *("q", "q_low", "q_high", "q_leak", "q_leak_low", "q_leak_high", "q_bound", "score", "threshold", "alarm"),
     *("since", "conductance", "misfit", "blocks", "reason"),
@@ -131,23 +130,33 @@ _REAL_NUMBERS = (
     *("leak_deviation", "leak_onset", "block_end"),
 )
 _WHOLE_NUMBERS = (
-    # samples so far, less whole periods; blocks: ended, weighted (at most `SUPPORT` + 1 exactly), open, being worked on,
-    # that wait for the first fit, successive ones of larger motion, estimated, dropped
-    *("sample_count", "n_ended", "n_weighted", "n_open", "n_closed", "n_waiting", "n_moving", "n_estimated", "n_dropped"),
-    # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, and iterations
+    # samples so far, less whole periods; blocks: ended, weighted, open, being worked on, that wait for the first fit,
+    # successive ones of larger motion, estimated, dropped
+    *(
+        "sample_count",
+        "n_ended",
+        "n_weighted",
+        "n_open",
+        "n_closed",
+        "n_waiting",
+        "n_moving",
+        "n_estimated",
+        "n_dropped",
+    ),
+    # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, iterations
     *("n_rows", "n_closed_rows", "phase", "place", "iteration", "has_converged", "is_fitting", "halvings"),
     *("alarm", "reason", "first_closed", "first_number"),
 )
 
 
 class StreamSettings(NamedTuple):
-    """What is known of a machine before its stream begins, and becomes constants of the kernels."""
+    """The settings of a stream, which become constants of its kernels."""
 
     rate: float  # sampling rate [Hz]
     channels: tuple[str, ...]  # of a sample, in this order
     expressions: tuple[str, ...]  # of the terms of the balance, last of its left side
     bias: int  # index of the constant flow in these
-    # indices into `expressions`: first the `n_fast` terms fitted to each block, then the other terms, last the left side
+    # indices into `expressions`: first the `n_fast` terms fitted to each block, then the others, last the left side
     column_order: tuple[int, ...]
     n_fast: int
     displacement: float  # of the pump [m^3/rad], 1 if a meter gives the flow
@@ -474,7 +483,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
 
     @law
     def use_block(m: Any) -> None:
-        """Estimate the leakage of the block at `place`, or store it until the first `LEARNED` blocks are fitted together.
+        """Estimate the leakage of the block at `place`, or store it until `LEARNED` blocks are fitted together.
 
         Before the first fit, blocks are only stored, beginning with the first that has motion. After `N_WAKING`
         successive blocks whose mean square motion is more than 1/`STANDSTILL` times that of earlier blocks, the machine
