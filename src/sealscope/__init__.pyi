@@ -5,6 +5,8 @@ from sealscope.diagnosis.commissioned.machine_file import read_machine as read_m
 from sealscope.diagnosis.commissioned.machine_file import write_machine as write_machine
 from sealscope.diagnosis.commissioned.scikit_learn import LeakDetector as LeakDetector
 from sealscope.diagnosis.diagnose import diagnose as diagnose
+from sealscope.diagnosis.hold.hold_test import hold_test as hold_test
+from sealscope.diagnosis.hold.result import HoldResult as HoldResult
 from sealscope.diagnosis.live.watch import Watch as Watch
 from sealscope.diagnosis.live.watch import watch as watch
 from sealscope.diagnosis.trend.trend import Trend as Trend

@@ -17,6 +17,7 @@ import typer
 from sealscope.cli import (
     campaign,
     fmu,
+    hold,
     machine,
     monitoring,
     planning,
@@ -45,7 +46,8 @@ app = typer.Typer(
 
 for command in (
     simulation.demo, simulation.simulate, machine.commission, recordings.diagnose, recordings.report, trend.trend,
-    simulation.parameters, planning.plan, recordings.inspect, recordings.convert, reproduction.reproduce, fmu.fmu,
+    hold.hold, simulation.parameters, planning.plan, recordings.inspect, recordings.convert, reproduction.reproduce,
+    fmu.fmu,
 ):  # fmt: skip
     app.command()(command)
 for group in (campaign.campaign, rigs.rigs, monitoring.monitor, plugin.plugin):

@@ -118,6 +118,16 @@ def _lowest_changes() -> Array:
     return np.array([-np.inf, lowest_volume_change, lowest_volume_change, -np.inf])
 
 
+def relative_compression(p: Array) -> Array:
+    """Compute the relative volume that usual oil with free air has lost at absolute pressures `p` [Pa].
+
+    It is c p - a p_0/p with the compressibility c, free air a (Boyle's law) and the atmospheric pressure p_0. Only
+    differences have a meaning.
+    """
+    prior = INFERENCE.held_oil
+    return np.asarray(prior.compressibility * p - prior.air * P_ATM / p)
+
+
 class LeakRegression(NamedTuple):
     """Fit of a leak to the holds: its `coefficient`, the variance of this, and the `variance` of a reading [m^6].
 

@@ -1,0 +1,338 @@
+"""Estimates of one hold: creep and leak with intervals, what may leak, and the result against a limit.
+
+The loaded chamber of area A and volume V loses the volume Q t through a leak. With the piston's travel s towards that
+chamber, the oil's relative compression c(p) and its thermal expansion a,
+
+    s(t) - (V/A) (c(p(t)) - c(p(0))) = (Q/A) I(t) - a (V/A) (T(t) - T(0)) + what settles + noise,
+
+where I(t) is the time, weighted by the leak's law |p_A - p_B|^e. `regression` estimates Q/A, with an interval. The
+creep is the slope of s alone; the temperature enters it only if it was logged or stated.
+
+Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.hold.readings import Readings, average_parts, read_channel
+from sealscope.diagnosis.hold.regression import (
+    Alternative,
+    Column,
+    Mixture,
+    RateFit,
+    fit_rate,
+    pool_mixtures,
+)
+from sealscope.diagnosis.hold.result import HoldCurve
+from sealscope.diagnosis.hold.set_up import SetUp
+from sealscope.diagnosis.inference.circuit.holds.oil import relative_compression
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
+from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.quality import Finding
+from sealscope.recordings.recording import Array, Recording
+from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
+
+#: Lowest absolute pressure [Pa] of oil with free air.
+LOWEST = 2e4
+#: Ratio of the highest to the lowest pressure difference of a hold, above which the law of the leak counts.
+STEADY_PRESSURE = 1.1
+#: Degree of the polynomial that smooths a logged temperature.
+SMOOTH_DEGREE = 3
+#: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
+AT_STOP = 3.0
+#: Standard deviation of the logarithm of a time constant within a step of its grid.
+GRID_DEVIATION = 0.3
+#: Millimetres of a metre.
+_MM = 1e3
+
+
+class LeakEstimate(NamedTuple):
+    """Leak of a hold: `rate` [mm/min] of the piston that it equals, without cooling, and its `flow` [m^3/s]."""
+
+    rate: Mixture | None
+    flow: Mixture | None
+    curve: HoldCurve | None = None
+    fit: RateFit | None = None
+
+
+def _exponential(t: Array, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
+    """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`, at times `t`.
+
+    The second column is its derivative by the logarithm of the time constant, which the grid of these leaves open.
+    """
+    course = np.expm1(-t / time)
+    slope = (t / time) * np.exp(-t / time)
+    return Column(course, mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
+
+
+class HeldLoad:
+    """Estimator of one hold, from the samples of its `recording` and what the caller states (`set_up`)."""
+
+    def __init__(
+        self,
+        recording: Recording | None,
+        set_up: SetUp,
+        file: str,
+        findings: Sequence[Finding] = (),
+        start: str | None = None,
+    ) -> None:
+        """Prepare the estimates; `file`, `findings`, `start`: name of the whole recording, its defects and its date."""
+        self.recording, self.set_up, self.file, self.findings, self.start = recording, set_up, file, findings, start
+        self.t = np.zeros(0) if recording is None else recording.t - recording.t[0]
+        self.duration = float(self.t[-1]) if self.t.size else 0.0
+
+    def _channel(self, name: str) -> Array | None:
+        """Return the samples of a channel; None if it is absent."""
+        return None if self.recording is None else self.recording.channels.get(name)
+
+    @cached_property
+    def loaded(self) -> str:
+        """Side of the higher pressure or, without pressures, the side towards which the piston moves."""
+        pressures = (
+            {} if self.recording is None else {name[-1]: self.recording[name] for name in chambers_of(self.recording)}
+        )
+        if pressures:
+            return max(pressures, key=lambda side: float(np.median(pressures[side])))
+        x = self._channel("x")
+        return "B" if x is not None and self._slope_of(x) > 0.0 else "A"
+
+    @property
+    def unloaded(self) -> str:
+        """Side without the load."""
+        return "B" if self.loaded == "A" else "A"
+
+    def _slope_of(self, values: Array) -> float:
+        """Compute the slope of a channel's readings by least squares, per second."""
+        t, means = average_parts(self.t, values, HOLD.noise.nodes)
+        return float(np.polyfit(t, means, 1)[0])
+
+    @cached_property
+    def travel(self) -> Array | None:
+        """Travel of the piston towards the loaded chamber [mm], (n,)."""
+        x = self._channel("x")
+        return None if x is None else (_MM if self.loaded == "B" else -_MM) * (x - x[0])
+
+    @cached_property
+    def column(self) -> tuple[float, float]:
+        """Length of the loaded side's oil column [mm], and the standard deviation of its logarithm."""
+        x = self._channel("x")
+        length, deviation = self.set_up.column(self.loaded, None if x is None else float(np.mean(x)))
+        return _MM * length, deviation
+
+    def _pressure(self, side: str) -> Array | None:
+        """Return the absolute pressure of a side [Pa], (n,), at least `LOWEST`; None if it is absent."""
+        p = self._channel(f"p_{side}")
+        return None if p is None else np.maximum(p + P_ATM, LOWEST)
+
+    @property
+    def mean_pressure(self) -> float | None:
+        """Mean gauge pressure of the loaded side [Pa]; None if it is not recorded."""
+        p = self._channel(f"p_{self.loaded}")
+        return None if p is None else float(np.mean(p))
+
+    def _settling(self, t: Array, sizes: Sequence[float]) -> list[Alternative]:
+        """List what may settle after the valve has shut, at times `t` [s]; `sizes`: deviations of its amplitude."""
+        prior = HOLD.settling
+        weight = prior.present / (len(prior.times) * len(sizes))
+        terms = [_exponential(t, time * self.duration, size) for time in prior.times for size in sizes]
+        return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
+
+    def _thermal_column(self, t: Array) -> Column | None:
+        """Build the travel [mm] by which a logged temperature explains a hold, at times `t`; None without a log."""
+        T = self._channel("T_oil")
+        if T is None or np.isfinite(T).mean() < 0.5:
+            return None
+        has_T = np.isfinite(T)
+        mean_t, means = average_parts(self.t[has_T], T[has_T], HOLD.noise.nodes)
+        degree = min(SMOOTH_DEGREE, len(means) - 1)
+        scaled = np.polynomial.Polynomial.fit(mean_t, means, degree)
+        length, deviation = self.column
+        travel = -HOLD.cooling.expansion * length * (scaled(t) - scaled(0.0))
+        return Column(travel, 1.0, math.hypot(deviation, HOLD.cooling.expansion_deviation))
+
+    def _cooling(self, t: Array) -> list[Alternative]:
+        """List the alternatives for the travel [mm] due to oil that nobody logs, at times `t`."""
+        prior, set_up = HOLD.cooling, self.set_up
+        if self._thermal_column(t) is not None:
+            return [Alternative(1.0)]
+        sizes = [(0.0, size) for size in prior.sizes]
+        if set_up.oil_course == "steady":
+            sizes = [(0.0, prior.steady)]
+        elif set_up.oil_course:
+            excess = max(prior.sizes)
+            if set_up.oil_temperature is not None and set_up.oil_course == "falling":
+                excess = max(set_up.oil_temperature - prior.ambient, min(prior.sizes))
+            mean, deviation = prior.stated
+            sizes = [((1.0 if set_up.oil_course == "falling" else -1.0) * mean * excess, deviation * excess)]
+        factor = prior.expansion * self.column[0]
+        weight = 1.0 / (len(sizes) * len(prior.times))
+        terms = [_exponential(t, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
+        return [Alternative(weight, term) for term in terms]
+
+    @property
+    def warming(self) -> float:
+        """Standard deviation [K] of a change of the oil's temperature that is neither logged nor stated to be small."""
+        if self._thermal_column(self.t[:1]) is not None:
+            return 0.0
+        return HOLD.cooling.steady if self.set_up.oil_course == "steady" else max(HOLD.cooling.sizes)
+
+    def _clocks(self, t: Array) -> list[tuple[float, Array]]:
+        """List the time [min] weighted by the laws of a leak, at times `t` [s]: (prior probability, clock)."""
+        p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
+        if p is not None:
+            part_t, difference = average_parts(self.t, p - (P_ATM if other is None else other), HOLD.noise.nodes)
+            difference = np.maximum(difference, 1e-3 * float(np.abs(difference).max()))
+            if difference.max() > STEADY_PRESSURE * difference.min():
+                clocks = []
+                for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
+                    flow = difference**exponent / float(np.mean(difference**exponent))
+                    steps = np.diff(part_t, prepend=0.0)
+                    clocks.append((weight, np.interp(t, part_t, np.cumsum(flow * steps)) / 60.0))
+                return clocks
+        return [(1.0, t / 60.0)]
+
+    @cached_property
+    def creep(self) -> RateFit | None:
+        """Speed at which the piston sinks [mm/min], with what settles fitted; None without a position."""
+        if self.travel is None:
+            return None
+        t, thermal = self._travel_readings.t, self._thermal_column(self._travel_readings.t)
+        base = [Column(t / 60.0), Column(np.ones_like(t))]
+        alternatives = [self._settling(t, HOLD.settling.travel)]
+        if thermal is not None:
+            base.append(thermal)
+        elif self.set_up.oil_course:
+            alternatives.append(self._cooling(t))
+        return fit_rate(self._travel_readings, base, alternatives, self.duration)
+
+    @cached_property
+    def _travel_readings(self) -> Readings:
+        """Readings of the travel [mm]."""
+        return read_channel(self.t, np.asarray(self.travel), HOLD.noise.position)
+
+    def _compression_readings(self, p: Array, length: float) -> tuple[Readings, Readings]:
+        """Read an absolute pressure `p` (n,) [Pa], and the travel [mm] that a column of a `length` [mm] gives way."""
+        readings = read_channel(self.t, p, HOLD.noise.pressure * BAR)
+        middle = float(np.mean(p)) + np.array([-0.5, 0.5]) * BAR
+        slope = length * float(np.diff(relative_compression(middle))[0]) / BAR
+        compression = length * relative_compression(readings.values)
+        return readings, Readings(readings.t, compression, slope * readings.loose, slope * readings.quantum)
+
+    @cached_property
+    def gain(self) -> Mixture | None:
+        """Rate [mm/min] at which the other side is compressed, as travel of its own area; None without its pressure."""
+        p = self._pressure(self.unloaded)
+        if p is None:
+            return None
+        length, deviation = self.set_up.column(self.unloaded, None)
+        _, compression = self._compression_readings(p, _MM * length)
+        t = compression.t
+        base = [Column(t / 60.0), Column(np.ones_like(t))]
+        thermal = self._thermal_column(t)
+        if thermal is not None:  # oil that cools in a closed chamber loses pressure
+            base.append(Column(-thermal.values, 1.0, thermal.deviation))
+        sizes = [_MM * length * strain for strain in HOLD.settling.strain]
+        fit = fit_rate(compression, base, [self._settling(t, sizes), self._cooling(t)], self.duration)
+        return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
+
+    @cached_property
+    def leak(self) -> LeakEstimate:
+        """Leak of the hold, by the best of its sources: collected oil, a flow meter, position, pressure."""
+        set_up, area = self.set_up, self.set_up.area(self.loaded)
+        if set_up.collected is not None:
+            volume, time = set_up.collected
+            prior = HOLD.collected
+            deviation = math.hypot(prior.deviation * volume, prior.drop * 1e-6) / time
+            flow = Mixture(np.ones(1), np.array([volume / time]), np.array([deviation]))
+        elif (meter := self._channel("q_leak")) is not None:
+            flow = self._metered_flow(meter)
+        else:
+            leak = (
+                self._leak_by_travel() if self.travel is not None and not self._is_at_stop else self._leak_by_pressure()
+            )
+            if leak.rate is None or area is None:
+                return leak
+            return leak._replace(flow=leak.rate.scale(MM_PER_MINUTE * area))
+        return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow)
+
+    def _metered_flow(self, meter: Array) -> Mixture:
+        """Estimate the mean flow [m^3/s] of a leakage flow meter, with its zero and gain."""
+        readings = read_channel(self.t, meter, ML_PER_MINUTE)
+        scale = float(np.abs(readings.values).max()) or ML_PER_MINUTE
+        t = readings.t
+        scaled = Readings(t, readings.values / scale, readings.loose / scale, readings.quantum / scale)
+        level = Column(np.ones_like(t))
+        fit = fit_rate(scaled, [level], [self._settling(t, (0.1, 1.0))], self.duration, from_first=False)
+        return fit.rate.scale(scale).add_error(INFERENCE.size.meter * abs(fit.rate.mean) * scale)
+
+    def _leak_by_travel(self) -> LeakEstimate:
+        """Estimate the leak from the travel, corrected for the compression of the loaded chamber's oil."""
+        readings = self._travel_readings
+        base, p = [Column(np.ones_like(readings.t))], self._pressure(self.loaded)
+        if p is not None:
+            part_t, compression = average_parts(self.t, relative_compression(p), HOLD.noise.nodes)
+            length, deviation = self.column
+            column = length * (np.interp(readings.t, part_t, compression) - compression[0])
+            base.append(Column(column, 1.0, math.hypot(deviation, INFERENCE.held_oil.deviation)))
+        fit = self._fit_laws(readings, base, HOLD.settling.travel)
+        return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
+
+    def _leak_by_pressure(self) -> LeakEstimate:
+        """Estimate the leak from the fall of the pressure of a chamber whose piston stands still."""
+        p = self._pressure(self.loaded)
+        if p is None:
+            return LeakEstimate(None, None)
+        length, deviation = self.column
+        pressures, compression = self._compression_readings(p, -length)
+        sizes = [length * strain for strain in HOLD.settling.strain]
+        fit = self._fit_laws(compression, [Column(np.ones_like(compression.t))], sizes)
+        rate = fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
+        if self.creep is not None:
+            rate = rate.add_error(self.creep.rate.deviation)
+        # the fit is drawn as a pressure, by the slope of the compression over the hold
+        travelled, fallen = np.ptp(compression.values), np.ptp(pressures.values) / BAR
+        in_bar = pressures._replace(values=(pressures.values - P_ATM) / BAR)
+        slope = -float(fallen / travelled) if travelled > 0.0 else 0.0
+        return LeakEstimate(rate, None, self._make_curve(f"p_{self.loaded}", "bar", in_bar, fit, slope), fit)
+
+    @cached_property
+    def _is_at_stop(self) -> bool:
+        """True if the piston stands still while the loaded chamber's pressure changes."""
+        p = self._pressure(self.loaded)
+        if p is None or self.creep is None:
+            return False
+        _, compression = average_parts(self.t, relative_compression(p), 10)
+        low, high = self.creep.rate.interval
+        travel = abs(self.creep.rate.mean) * self.duration / 60.0
+        return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
+
+    def _fit_laws(self, readings: Readings, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
+        """Fit the rate of the leak [mm/min] under each law, with temperature and settling, and pool the laws."""
+        t = readings.t
+        thermal = self._thermal_column(t)
+        base = [*base, *([] if thermal is None else [thermal])]
+        alternatives = [self._settling(t, sizes), self._cooling(t)]
+        fits, logs = [], []
+        for weight, clock in self._clocks(t):
+            fits.append(fit_rate(readings, [Column(clock), *base], alternatives, self.duration))
+            logs.append(math.log(weight) + fits[-1].log_evidence)
+        weights = np.exp(np.array(logs) - max(logs))
+        weights /= weights.sum()
+        best = fits[int(weights.argmax())]
+        return best._replace(rate=pool_mixtures([fit.rate for fit in fits], weights))
+
+    def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
+        """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""
+        start = float(self.recording.t[0]) if self.recording is not None else 0.0
+        line, half = factor * fit.fit, abs(factor) * WITHIN_95 * fit.band
+        line = line + float(np.mean(readings.values) - np.mean(line))
+        return HoldCurve(channel, unit, readings.t + start, readings.values, line, line - half, line + half)

@@ -1,0 +1,246 @@
+"""Judge a hold: what may leak, pass or fail against a limit, minutes that are still needed, and the reason in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from sealscope.diagnosis.hold.estimates import HeldLoad
+from sealscope.diagnosis.hold.limits import decide_result
+from sealscope.diagnosis.hold.regression import Column, Mixture, Noise, pool_mixtures, predict_deviation
+from sealscope.diagnosis.hold.result import HoldResult
+from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
+from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.paragraphs import join_names
+from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
+
+PISTON, VALVE, ROD_SEAL, LINE, COOLING = "piston", "load-holding valve", "rod seal", "line", "cooling"
+#: Longest hold that is advised [min], the ratio of a tried duration to the one before, and most readings of it.
+LONGEST_ADVISED, TRIED_RATIO, MAX_READINGS = 24 * 60.0, 1.2, 240
+_CAP = "cap the port of side {side} at the cylinder and hold again: if it sinks as before, the piston leaks"
+_SWAP = "hold the load on the other side: a leak of the piston stays, one of the rod seal does not"
+_CAP_LINE = "cap the port of side {side} at the cylinder and hold again: if it still sinks, the rod seal leaks"
+_CLOSE = "close the line at the valve: if it still sinks, the line leaks"
+
+
+def judge_hold(hold: HeldLoad) -> HoldResult:
+    """Judge a hold against the limit that the caller states, if any."""
+    set_up, leak, limit = hold.set_up, hold.leak, hold.set_up.limit
+    creep = None if hold.creep is None else hold.creep.rate
+    pressure = hold.mean_pressure
+    reference = limit.pressure if limit is not None and limit.pressure is not None else set_up.reference
+    converted = None if reference is None or leak.flow is None else _convert_flow(leak.flow, pressure, reference)
+    compared, scale = leak.rate, MM_PER_MINUTE
+    if limit is not None and limit.kind == "flow":
+        compared, scale = (leak.flow if limit.pressure is None else converted), 1.0
+    bound = None if limit is None else limit.value / scale
+    interval = None if compared is None else compared.interval
+    result = None
+    if bound is not None:
+        result = "undecided" if interval is None else decide_result(interval, bound)
+    has_leak = leak.flow is not None and leak.flow.interval[0] > 0.0
+    has_leak |= leak.flow is None and leak.rate is not None and leak.rate.interval[0] > 0.0
+    sinks = creep is not None and creep.interval[0] > 0.0
+    by_cooling = sinks and not has_leak
+    causes = _list_causes(hold) if has_leak else (COOLING,) if by_cooling else ()
+    minutes = None
+    if result == "undecided" and compared is not None and bound is not None:
+        minutes = find_minutes(hold, abs(compared.mean - bound) * scale / _flow_scale(hold, limit))
+    elif by_cooling and leak.rate is not None:
+        minutes = find_minutes(hold, abs(leak.rate.mean))
+    curve = leak.curve
+    t = None if hold.recording is None else hold.recording.t
+    return HoldResult(
+        file=hold.file,
+        start_s=None if t is None else float(t[0]),
+        end_s=None if t is None else float(t[-1]),
+        creep_mm_per_min=None if creep is None else creep.mean,
+        creep_interval_mm_per_min=None if creep is None else creep.interval,
+        leak_lpm=None if leak.flow is None else leak.flow.mean / LITRE_PER_MINUTE,
+        leak_interval_lpm=_interval_lpm(leak.flow),
+        pressure_bar=None if pressure is None else pressure / BAR,
+        leak_at_lpm=None if converted is None else converted.mean / LITRE_PER_MINUTE,
+        leak_at_interval_lpm=_interval_lpm(converted),
+        at_bar=None if converted is None or reference is None else reference / BAR,
+        result=result,
+        limit=None if limit is None else limit.text,
+        causes=causes,
+        second_test=_second_test(hold, causes),
+        minutes_needed=minutes,
+        reason=_describe(hold, result, causes, minutes, compared is None and limit is not None),
+        start=hold.start,
+        areas_mm2=tuple(1e6 * area for area in set_up.areas),
+        oil=describe_oil(hold),
+        quality=tuple(hold.findings),
+        curve=curve,
+    )
+
+
+def _flow_scale(hold: HeldLoad, limit: object) -> float:
+    """Return the factor from a speed [mm/min] to the limit's unit."""
+    kind = getattr(limit, "kind", "creep")
+    area = hold.set_up.area(hold.loaded) if kind == "flow" else 1.0
+    return MM_PER_MINUTE * (area or math.inf)
+
+
+def _interval_lpm(flow: Mixture | None) -> tuple[float, float] | None:
+    """Convert the interval of a flow [m^3/s] to L/min; None for None."""
+    if flow is None:
+        return None
+    low, high = flow.interval
+    return low / LITRE_PER_MINUTE, high / LITRE_PER_MINUTE
+
+
+def _convert_flow(flow: Mixture, pressure: float | None, reference: float) -> Mixture | None:
+    """Convert a flow at the held `pressure` [Pa] to a `reference` pressure, by laws between laminar and orifice."""
+    if pressure is None or not pressure > 0.0:
+        return None
+    ratio = reference / pressure
+    return pool_mixtures([flow.scale(ratio**exponent) for exponent in EXPONENTS], law_priors())
+
+
+def _list_causes(hold: HeldLoad) -> tuple[str, ...]:
+    """List the parts that may leak, by the other side's pressure and the stated set-up."""
+    set_up, loaded, other = hold.set_up, hold.loaded, hold.unloaded
+    if set_up.collected is not None or (hold.recording is not None and "q_leak" in hold.recording):
+        return (PISTON,)
+    outlets = []
+    if loaded not in set_up.capped:
+        outlets = [VALVE] if set_up.valves is None or loaded in set_up.valves else []
+    area, other_area = set_up.area(loaded), set_up.area(other)
+    if len(set_up.areas) < 2 or area is None or other_area is None or area <= other_area:
+        outlets.append(ROD_SEAL)
+    if loaded not in set_up.capped:
+        outlets.append(LINE)
+    evidence = _weigh_piston(hold)
+    if evidence > 0 or not outlets:
+        return (PISTON,)
+    return tuple(outlets) if evidence < 0 else (PISTON, *outlets)
+
+
+def _weigh_piston(hold: HeldLoad) -> int:
+    """Weigh what the other side's pressure tells: 1 for the piston, -1 against it, 0 if it tells nothing.
+
+    A closed other side gains what passes the piston. Its pressure rises by it, and falls as the piston sinks.
+    """
+    gain, leak = hold.gain, hold.leak
+    if gain is None or leak.rate is None:
+        return 0
+    if gain.interval[0] > 0.0:
+        return 1
+    p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
+    is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > HOLD.other.tank * BAR
+    area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
+    ratio = 1.0 if area is None or other_area is None else other_area / area
+    travel = Mixture(np.ones(1), np.zeros(1), np.zeros(1)) if hold.creep is None else hold.creep.rate
+    gained = ratio * (travel.mean + gain.mean)
+    error = ratio * math.hypot(travel.deviation, gain.deviation)
+    falls = gain.interval[1] < 0.0
+    if (is_closed or falls) and gained + WITHIN_95 * error < leak.rate.interval[0]:
+        return -1
+    return 0
+
+
+def _second_test(hold: HeldLoad, causes: Sequence[str]) -> str:
+    """Return the test that separates the causes of a leak; "" if there is one cause only, or none."""
+    outlets = [cause for cause in causes if cause in (VALVE, LINE)]
+    if len(causes) < 2:
+        return ""
+    if PISTON in causes:
+        return _CAP.format(side=hold.loaded) if outlets else _SWAP
+    return _CAP_LINE.format(side=hold.loaded) if ROD_SEAL in causes else _CLOSE
+
+
+def find_minutes(hold: HeldLoad, margin: float) -> float | None:
+    """Find the minutes to hold in addition until the interval's half-width is below a `margin` [mm/min].
+
+    None if that takes more than `LONGEST_ADVISED`, or if nothing was fitted.
+    """
+    fit, minutes = hold.leak.fit, hold.duration / 60.0
+    if fit is None:
+        return None
+    length, _ = hold.column
+    n_readings, total = len(fit.fit), minutes
+    while total < LONGEST_ADVISED:
+        total *= TRIED_RATIO
+        half = WITHIN_95 * predict_rate_error(
+            total, n_readings * total / minutes, fit.noise, fit.s, hold.duration, length, hold.warming
+        )
+        if half < margin:
+            return float(math.ceil(total - minutes))
+    return None
+
+
+def predict_rate_error(
+    minutes: float, n_readings: float, noise: Noise, s: float, duration: float, length: float, warming: float
+) -> float:
+    """Predict the standard deviation of the leak's rate [mm/min] of a hold of so many `minutes`.
+
+    `n_readings`: number of readings with the `noise`, whose white part has the standard deviation `s` [mm] and whose
+    random walk reaches its ratio after `duration` [s]; `length` [mm]: of the oil column; `warming` [K]: standard
+    deviation of a temperature change that is not logged, 0 for none. It is the formula of the fit itself.
+    """
+    m = int(min(max(n_readings, 4.0), MAX_READINGS))
+    t = 60.0 * minutes * (np.arange(m) + 0.5) / m
+    columns = [Column(t / 60.0), Column(np.ones(m))]
+    cooling = HOLD.cooling
+    if warming > 0.0:
+        worst = [Column(-np.expm1(-t / time) * cooling.expansion * length, 0.0, warming) for time in cooling.times]
+        return max(predict_deviation(t, [*columns, column], noise, s, duration, m / n_readings) for column in worst)
+    return predict_deviation(t, columns, noise, s, duration, m / n_readings)
+
+
+def describe_oil(hold: HeldLoad) -> str:
+    """Describe what is known of the oil's temperature."""
+    if hold.recording is not None and "T_oil" in hold.recording:
+        T = hold.recording["T_oil"] - 273.15
+        T = T[np.isfinite(T)]
+        return f"logged, {T[0]:.3g} to {T[-1]:.3g} degC" if T.size else "not logged"
+    stated = hold.set_up.oil_temperature, hold.set_up.oil_course
+    words = ["" if stated[0] is None else f"{stated[0]:.3g} degC", stated[1]]
+    return " ".join(filter(None, words)) + " (stated)" if any(words) else "not logged"
+
+
+def format_estimate(value: float, low: float, high: float) -> str:
+    """Format a value with its interval, "0.674 (0.670 to 0.678)", to two digits of the interval's half-width."""
+    half = 0.5 * (high - low)
+    decimals = min(max(1 - math.floor(math.log10(half)), 0), 6) if half > 0.0 else 3
+    value, low, high = (round(number, decimals) + 0.0 for number in (value, low, high))
+    return f"{value:.{decimals}f} ({low:.{decimals}f} to {high:.{decimals}f})"
+
+
+def _describe(
+    hold: HeldLoad, result: str | None, causes: Sequence[str], minutes: float | None, lacks_area: bool
+) -> str:
+    """Describe the result of a hold in a sentence or two."""
+    parts, leak = [], hold.leak
+    place = "" if hold.mean_pressure is None else f" at {hold.mean_pressure / BAR:.3g} bar"
+    if hold.creep is not None:
+        mean, low, high = hold.creep.rate.mean, *hold.creep.rate.interval
+        if high < 0.0:
+            parts.append(f"rises by {format_estimate(-mean, -high, -low)} mm/min{place}")
+        else:
+            parts.append(f"sinks by {format_estimate(mean, low, high)} mm/min{place}")
+    if leak.flow is not None:
+        mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in leak.flow.interval)
+        if low > 0.0:
+            words = f"leak {format_estimate(mean, low, high)} mL/min"
+        else:
+            words = f"no leak above {max(high, 0.0):.2g} mL/min"
+        parts.append(words + ("" if hold.creep is not None else place))
+    text = "; ".join(parts) or "neither creep nor leak can be estimated"
+    if lacks_area:
+        text += "; the limit needs the piston's area (--area)"
+    wait = f", or hold for {minutes:.0f} min more" if minutes is not None else ""
+    if COOLING in causes and hold.creep is not None:
+        length, _ = hold.column
+        kelvin = hold.creep.rate.mean * hold.duration / 60.0 / (HOLD.cooling.expansion * length)
+        text += f"; cooling by {kelvin:.2g} K would do the same: log the oil's temperature{wait}"
+    elif result == "undecided" and not lacks_area:
+        text += f"; too close to the limit{f': hold for {minutes:.0f} min more' if minutes is not None else ''}"
+    elif causes:
+        text += f"; {' or '.join(causes) if len(causes) < 3 else join_names(causes[:-1]) + ' or ' + causes[-1]}"
+    return text

@@ -1,0 +1,136 @@
+"""Reduce the samples of a hold to some hundred readings with known times, and find the holds of a log.
+
+Means over parts of a hold lose nothing of a line, but the rounding of a position does not average out where its noise
+is smaller than a step of the encoder. Such a position says exactly when it passes from one step to the next, and
+otherwise only that it is within a step: its readings are these passages, and both ends of the hold.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.recordings.motion import estimate_quantum, find_runs
+from sealscope.recordings.recording import Array
+from sealscope.units import BAR
+
+#: Number of parts of a hold in which passages between encoder steps are sought.
+N_PARTS = 960
+#: Largest distance of a mean from a step of the encoder, in steps, at which all samples are at that step.
+AT_STEP = 0.02
+#: Share of parts with the same step as the part before, above which a position is read by its passages.
+SHARE_AT_STEP = 0.3
+#: Number of times between passages at which a position that stands is read.
+N_BETWEEN = 10
+#: Largest number of bins in which holds are sought.
+MAX_BINS = 20_000
+
+
+class Readings(NamedTuple):
+    """Readings of a channel in a hold.
+
+    `t` (m,) [s]: times since the hold's start; `values` (m,); `loose` (m,): standard deviation of readings that are
+    only known to be within a step of the encoder, 0 for others; `quantum`: size of that step, 0 for means.
+    """
+
+    t: Array
+    values: Array
+    loose: Array
+    quantum: float
+
+
+def average_parts(t: Array, values: Array, n_parts: int) -> tuple[Array, Array]:
+    """Average samples (n,) at `t` [s] over `n_parts` equal times; return mean times and means of the parts with any."""
+    width = max(float(t[-1] - t[0]), np.finfo(float).tiny) / n_parts
+    part = np.minimum(((t - t[0]) / width).astype(np.intp), n_parts - 1)
+    counts = np.bincount(part, minlength=n_parts)
+    has_samples = counts > 0
+    sums = (np.bincount(part, weights=series, minlength=n_parts) for series in (t - t[0], values - values[0]))
+    times, means = (total[has_samples] / counts[has_samples] for total in sums)
+    return times + t[0], means + values[0]
+
+
+def read_channel(t: Array, values: Array, least_step: float) -> Readings:
+    """Reduce the finite samples (n,) of a channel at `t` [s since the hold's start] to readings.
+
+    `least_step`: step of the encoder that is assumed where all samples are equal.
+    """
+    quantum = estimate_quantum(values)
+    quantum = quantum or least_step
+    fine_t, fine = average_parts(t, values, N_PARTS)
+    position = (fine - values.min()) / quantum
+    code = np.round(position)
+    is_at_step = np.abs(position - code) < AT_STEP
+    is_same = is_at_step[1:] & is_at_step[:-1] & (code[1:] == code[:-1])
+    if is_same.mean() > SHARE_AT_STEP and np.count_nonzero(np.diff(code)) <= HOLD.noise.nodes:
+        return _read_passages(t, fine_t, position, float(values.min()), quantum)
+    mean_t, means = average_parts(t, values, HOLD.noise.nodes)
+    return Readings(mean_t, means, np.zeros(len(means)), 0.0)
+
+
+def _read_passages(t: Array, fine_t: Array, position: Array, origin: float, quantum: float) -> Readings:
+    """Read a coarsely rounded position where it passes from one step of its encoder to the next, and at both ends.
+
+    `position` (k,): means over parts at `fine_t`, in steps of the size `quantum` above `origin`. Passages through one
+    boundary that follow each other, as noise makes them, are one reading at their mean time. A single passage bounds
+    the slope by the longer part beside it alone.
+    """
+    cell = np.floor(position + 0.5)
+    changes = np.flatnonzero(np.diff(cell))
+    times, boundaries = list[float](), list[float]()
+    for k in changes.tolist():
+        first, last = sorted((cell[k], cell[k + 1]))
+        passed = np.arange(first, last) + 0.5  # boundaries between the two means
+        order = passed if cell[k + 1] > cell[k] else passed[::-1]
+        fractions = (order - position[k]) / (position[k + 1] - position[k])
+        times += (fine_t[k] + fractions * (fine_t[k + 1] - fine_t[k])).tolist()
+        boundaries += order.tolist()
+    starts = [k for k in range(len(boundaries)) if k == 0 or boundaries[k] != boundaries[k - 1]]
+    groups = np.split(np.array(times), starts[1:]) if times else []
+    passage_t = np.array([float(group.mean()) for group in groups])
+    levels = np.array([boundaries[k] for k in starts])
+    ends = [(float(t[0]), cell[0]), (float(t[-1]), cell[-1])]
+    if len(groups) == 1:
+        ends = [max(ends, key=lambda end: abs(end[0] - passage_t[0]))]
+    # between passages the position is known to be within a step, which excludes a motion and its return
+    between = np.linspace(fine_t[0], fine_t[-1], N_BETWEEN + 2)[1:-1]
+    near = np.abs(between[:, None] - passage_t).min(axis=1, initial=np.inf) < 0.5 * (between[1] - between[0])
+    between = between[~near]
+    codes = cell[np.minimum(np.searchsorted(fine_t, between), len(cell) - 1)]
+    all_t = np.concatenate([passage_t, [end[0] for end in ends], between])
+    values = np.concatenate([levels, [end[1] for end in ends], codes]) * quantum + origin
+    loose = np.concatenate([np.zeros(len(groups)), np.full(len(ends), 12.0**-0.5), np.ones(len(between))]) * quantum
+    order_t = np.argsort(all_t, kind="stable")
+    return Readings(all_t[order_t], values[order_t], loose[order_t], quantum)
+
+
+def find_held_parts(t: Array, x: Array | None, p: Array | None) -> list[tuple[int, int]]:
+    """Find the holds of a log: first and last index of the samples between which neither position nor pressure moves.
+
+    `t` [s], `x` [m], `p` [Pa] (n,): samples without gaps, of which x or p may be absent. A hold ends where means over
+    `part.bin` move faster than `part.speed` or `part.pressure` of `priors.toml`.
+    """
+    prior = HOLD.part
+    step = float(np.median(np.diff(t)))
+    n_bins = int(min(max((t[-1] - t[0]) / max(prior.bin, step), 1.0), MAX_BINS))
+    is_moving, bin_t = np.zeros(0, dtype=bool), t
+    limits = ((x, prior.speed * 1e-3, prior.position * 1e-3), (p, prior.pressure * BAR, prior.scatter * BAR))
+    for values, fastest, largest in limits:
+        if values is None:
+            continue
+        bin_t, means = average_parts(t, values, n_bins)
+        changes = np.abs(np.diff(means))
+        scatter = 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / 6.0**0.5
+        moves = changes > fastest * np.diff(bin_t) + prior.noise * 2.0**0.5 * min(scatter, largest)
+        is_moving = moves if not is_moving.size else is_moving | moves
+    runs = find_runs(~is_moving)
+    parts = []
+    for first, length in runs.tolist():
+        # the bins beside a motion may contain some of it
+        begin, end = first + (first > 0), first + length - (first + length < len(is_moving))
+        if end > begin:
+            inside = np.flatnonzero((t >= bin_t[begin]) & (t <= bin_t[end]))
+            parts.append((int(inside[0]) if begin else 0, int(inside[-1]) if end < len(bin_t) - 1 else len(t) - 1))
+    return parts

@@ -1,0 +1,108 @@
+"""What the caller of a hold test states of cylinder, valves and oil, parsed to SI units."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from sealscope.diagnosis.hold.limits import HoldLimit, parse_collected
+from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.errors import InputError
+from sealscope.units import parse_quantity
+
+#: Smallest and largest area of a piston [m^2], of a rod of 4 mm and a bore of 1.1 m; and volume of its oil [m^3].
+AREAS, VOLUMES = (1e-5, 1.0), (1e-6, 1.0)
+#: Courses of a temperature that is not logged.
+COURSES = ("falling", "rising", "steady")
+
+
+class SetUp(NamedTuple):
+    """Statements of the caller on a hold test, in SI units; empty without a statement.
+
+    `areas`, `volumes`: of one side, or of A and B; `valves`: sides with a load-holding valve, None if not stated;
+    `capped`: sides whose port is capped; `reference`: pressure [Pa] to which the leak is converted; `oil_temperature`
+    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s].
+    """
+
+    areas: tuple[float, ...]
+    volumes: tuple[float, ...]
+    limit: HoldLimit | None
+    valves: frozenset[str] | None
+    capped: frozenset[str]
+    reference: float | None
+    oil_temperature: float | None
+    oil_course: str
+    collected: tuple[float, float] | None
+
+    def area(self, side: str) -> float | None:
+        """Return the area of a side [m^2]; None if it is not stated."""
+        return None if not self.areas else self.areas[-1 if side == "B" else 0]
+
+    def column(self, side: str, x: float | None) -> tuple[float, float]:
+        """Estimate the length of a side's oil column, volume over area [m], and the deviation of its logarithm.
+
+        `x` [m]: mean position, if it is recorded; only that of A says how far the column reaches.
+        """
+        prior, area = HOLD.column, self.area(side)
+        if self.volumes and area is not None:
+            return self.volumes[-1 if side == "B" else 0] / area, prior.stated
+        if x is None or side == "B" or not x > 0.0:
+            return prior.unknown, prior.deviation
+        return x + prior.dead, prior.deviation
+
+
+def parse_set_up(
+    area: Any, volume: Any, limit: str | None, oil: str | None, reference: Any, collected: str | None,
+    valve: str | None, capped: str | None,
+) -> SetUp:  # fmt: skip
+    """Parse the arguments of `hold_test`; raise InputError for one that is out of its range."""
+    areas = _parse_sides(area, "m^2", "area")
+    volumes = _parse_sides(volume, "m^3", "volume")
+    for name, numbers, (low, high), unit in (("area", areas, AREAS, "m^2"), ("volume", volumes, VOLUMES, "m^3")):
+        for number in numbers:
+            if not low <= number <= high:
+                raise InputError(
+                    f"{name} must be {low:g} to {high:g} {unit}, got {number:g} {unit}: is its unit right?"
+                )
+    temperature, course = _parse_oil(oil)
+    return SetUp(
+        areas,
+        volumes,
+        None if limit is None else HoldLimit.parse(limit),
+        None if valve is None else _parse_side_names(valve, "valve"),
+        frozenset() if capped is None else _parse_side_names(capped, "capped"),
+        None if reference is None else parse_quantity(reference, "Pa", name="reference"),
+        temperature,
+        course,
+        None if collected is None else parse_collected(collected),
+    )
+
+
+def _parse_sides(value: Any, unit: str, name: str) -> tuple[float, ...]:
+    """Parse one quantity, or those of the sides A and B; raise InputError for more."""
+    if value is None:
+        return ()
+    entries = [value] if isinstance(value, str | int | float) else list(value)
+    if len(entries) not in (1, 2):
+        raise InputError(f"{name} must be one, or those of the sides A and B, got {len(entries)}")
+    return tuple(parse_quantity(entry, unit, name=name) for entry in entries)
+
+
+def _parse_side_names(text: str, name: str) -> frozenset[str]:
+    """Parse the names of sides, such as "A" or "A,B"; "none" gives none."""
+    sides = [part.strip().upper() for part in str(text).replace(";", ",").split(",")]
+    if sides == ["NONE"]:
+        return frozenset()
+    if not set(sides) <= {"A", "B"}:
+        raise InputError(f"{name} must be A, B, 'A,B' or none, got {text}")
+    return frozenset(sides)
+
+
+def _parse_oil(text: str | None) -> tuple[float | None, str]:
+    """Parse the oil's temperature [degC] and its course: "falling", "rising", "steady", or "" if it is not stated."""
+    if text is None:
+        return None, ""
+    words = text.split()
+    course = words.pop() if words and words[-1] in COURSES else ""
+    if not words:
+        return None, course
+    return parse_quantity(" ".join(words), "K", name="oil") - 273.15, course

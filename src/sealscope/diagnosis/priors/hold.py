@@ -1,0 +1,88 @@
+"""Typed tables of `hold/priors.toml`: assumptions on a load that shut valves hold."""
+
+from sealscope.storage.toml_file import PriorTable, read_priors
+
+
+class HeldPart(PriorTable):
+    """The part of a log in which a load is held."""
+
+    speed: float  # [mm/s] largest speed of a held piston
+    pressure: float  # [bar/s] largest rate of a held pressure
+    noise: float  # [standard deviations] largest step that is noise
+    position: float  # [mm] largest noise of a position
+    scatter: float  # [bar] largest noise of a pressure
+    shortest: float  # [s] shortest hold
+    bin: float  # [s] time over which samples are averaged to find holds
+
+
+class SettlingPriors(PriorTable):
+    """An exponential after a valve has shut."""
+
+    present: float  # probability that something settles within the hold
+    times: tuple[float, ...]  # [durations of the hold] time constants
+    travel: tuple[float, ...]  # [mm] standard deviations of the amplitude of a position
+    strain: tuple[float, ...]  # standard deviations of the amplitude of the oil's relative compression
+
+
+class CoolingPriors(PriorTable):
+    """Temperature of oil that is not logged, an exponential."""
+
+    times: tuple[float, ...]  # [s] time constants
+    sizes: tuple[float, ...]  # [K] standard deviations of the whole change
+    stated: tuple[float, float]  # mean and standard deviation of the change of stated oil, over its excess
+    ambient: float  # [degC] temperature that stated oil approaches
+    steady: float  # [K] standard deviation of the change of oil that is stated to be steady
+    expansion: float  # [1/K] thermal expansion of oil in a cylinder
+    expansion_deviation: float  # relative standard deviation
+
+
+class ColumnPriors(PriorTable):
+    """Length of the column of held oil, its volume over the piston's area."""
+
+    dead: float  # [m] added to the position
+    unknown: float  # [m] without a position
+    deviation: float  # standard deviation of the logarithm
+    stated: float  # that of a stated volume
+
+
+class NoisePriors(PriorTable):
+    """Noise of means over parts of a hold."""
+
+    nodes: int  # number of parts
+    white: float  # probability of independent errors
+    walking: float  # probability of a random walk
+    times: tuple[float, float]  # [durations of the hold] correlation times of a wander
+    slow: float  # share of the second of them
+    ratios: tuple[float, ...]  # variance of the wander over that of the white noise
+    walks: tuple[float, ...]  # variance of a random walk at the end of the hold over that of the white noise
+    steps: tuple[float, ...]  # [encoder steps] noise of a reading at the passage from one step to the next
+    position: float  # [mm] step of a constant position
+    pressure: float  # [bar] step of a constant pressure
+
+
+class OtherSide(PriorTable):
+    """Pressure of the side without the load."""
+
+    tank: float  # [bar] largest pressure of a side that may be open to the tank
+
+
+class CollectedOil(PriorTable):
+    """Errors of a collected volume."""
+
+    deviation: float  # relative standard deviation
+    drop: float  # [mL] standard deviation
+
+
+class HeldLoadPriors(PriorTable):
+    """All tables of `hold/priors.toml`, the assumptions on a load that shut valves hold."""
+
+    part: HeldPart
+    settling: SettlingPriors
+    cooling: CoolingPriors
+    column: ColumnPriors
+    noise: NoisePriors
+    other: OtherSide
+    collected: CollectedOil
+
+
+HOLD = read_priors("sealscope.diagnosis.hold", HeldLoadPriors)

@@ -1,0 +1,151 @@
+"""The hold test: creep, leak, cooling, causes and limits of loads that shut valves hold."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.errors import InputError
+
+AREAS = ("3117 mm^2", "2155 mm^2")
+
+
+def record_hold(
+    creep=0.5, minutes=10.0, rate=10.0, noise=2e-5, step=0.0, cooling=0.0, seed=0, before=0.0, log_T=False, **channels
+):
+    """A load on side A that sinks by `creep` [mm/min] and by an oil column of 0.65 m that cools by `cooling` [K]."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, 60.0 * minutes, 1.0 / rate)
+    T = -cooling * -np.expm1(-t / 900.0)
+    x = 0.4 - creep * 1e-3 * t / 60.0 + 7e-4 * 0.65 * T + noise * random.standard_normal(t.size)
+    if before:
+        x = np.where(t < before, 0.4 + 0.02 * (t - before), x)
+    x = np.round(x / step) * step if step else x
+    values = {"x": x, "p_A": 8e6 + 1e4 * random.standard_normal(t.size)}
+    values |= {name: np.asarray(course(t)) for name, course in channels.items()}
+    units = dict.fromkeys(values, "Pa") | {"x": "m"}
+    if log_T:
+        values["T_oil"], units["T_oil"] = 320.0 + T, "K"
+    return ss.Recording(t, values, units, rate=rate)
+
+
+@pytest.mark.parametrize("step", [0.0, 1e-4])
+def test_creep_and_leak_are_within_their_intervals(step):
+    creeps = np.random.default_rng(3).uniform(0.05, 2.0, 12)
+    held = 0
+    for seed, creep in enumerate(creeps):
+        (result,) = ss.hold_test(record_hold(creep, step=step, seed=seed, log_T=True), area=AREAS)
+        low, high = result.creep_interval_mm_per_min
+        held += low <= creep <= high
+        assert result.leak_lpm == pytest.approx(result.creep_mm_per_min * 3117e-6, rel=0.05, abs=1e-4)
+    assert held >= 10
+
+
+def test_white_noise_is_averaged_nearly_as_well_as_possible():
+    noise, minutes, rate = 2e-5, 10.0, 10.0
+    n = 60.0 * minutes * rate
+    bound = 1.96 * 60.0 * noise * 1e3 * (12.0 / n) ** 0.5 / (60.0 * minutes)
+    widths = []
+    for seed in range(5):
+        (result,) = ss.hold_test(record_hold(noise=noise, seed=seed))
+        low, high = result.creep_interval_mm_per_min
+        widths.append(0.5 * (high - low))
+    assert 0.9 * bound < np.median(widths) < 1.3 * bound
+
+
+def test_cooling_that_nobody_logs_is_no_leak_and_no_failure():
+    for seed, cooling in enumerate((2.0, 5.0, 10.0)):
+        recording = record_hold(0.0, cooling=cooling, seed=seed)
+        (result,) = ss.hold_test(recording, area=AREAS, limit="0.05 mm/min")
+        assert result.result != "fail"
+        assert result.causes == ("cooling",)
+        assert "log the oil's temperature" in result.reason
+        (logged,) = ss.hold_test(record_hold(0.0, cooling=cooling, seed=seed, log_T=True), area=AREAS)
+        low, high = logged.leak_interval_lpm
+        assert low <= 0.0 <= high
+        assert logged.causes == ()
+
+
+def test_the_hold_begins_where_the_motion_ends():
+    (result,) = ss.hold_test(record_hold(1.0, before=100.0, seed=5))
+    assert 99.0 <= result.start_s <= 103.0
+    low, high = result.creep_interval_mm_per_min
+    assert low <= 1.0 <= high
+
+
+def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
+    t = np.arange(0.0, 300.0, 0.1)
+    random = np.random.default_rng(2)
+    p_A = 2e7 * np.exp(-t / 2000.0) + 1e4 * random.standard_normal(t.size)
+    # 1 L of oil of 1.25 GPa: Q = V/K dp/dt
+    true_lpm = 1e-3 * 8e-10 * float(np.mean(2e7 * np.exp(-t / 2000.0))) / 2000.0 * 6e4
+    for p_B, causes in ((2e6 + 1e3 * t, ("piston",)), (2e6 + 0.0 * t, ("load-holding valve", "line"))):
+        noise = 1e4 * random.standard_normal(t.size)
+        recording = ss.Recording(t, {"p_A": p_A, "p_B": p_B + noise}, {"p_A": "Pa", "p_B": "Pa"}, rate=10.0)
+        (result,) = ss.hold_test(recording, area=AREAS, volume=("1 L", "1 L"), oil="40 degC steady")
+        low, high = result.leak_interval_lpm
+        assert low <= true_lpm <= high
+        assert result.causes == causes
+
+
+def test_the_other_side_tells_the_piston_where_it_shows_it():
+    (shut,) = ss.hold_test(record_hold(1.0, p_B=lambda t: 1e6 + 1e3 * t), area=AREAS)
+    assert shut.causes == ("piston",)
+    (tank,) = ss.hold_test(record_hold(1.0, p_B=lambda t: 0.0 * t), area=AREAS)
+    assert set(tank.causes) == {"piston", "load-holding valve", "line"}
+    assert "cap the port" in tank.second_test
+    (capped,) = ss.hold_test(record_hold(1.0, p_B=lambda t: 0.0 * t), area=AREAS, capped="A")
+    assert capped.causes == ("piston",)
+
+
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [("1 mm/min", "pass"), ("24 mm in 3 min", "pass"), ("boom: 1 mm in 5 min", "fail"), ("1 mL/min", "fail")],
+)
+def test_a_limit_is_decided_by_the_whole_interval(limit, expected):
+    (result,) = ss.hold_test(record_hold(0.5, log_T=True), area=AREAS, limit=limit)
+    assert (result.result, result.limit) == (expected, limit)
+
+
+def test_a_result_near_its_limit_states_the_minutes_that_are_needed():
+    (result,) = ss.hold_test(record_hold(0.5, minutes=1.0, noise=1e-4, log_T=True), limit="0.505 mm/min")
+    assert result.result == "undecided"
+    (longer,) = ss.hold_test(
+        record_hold(0.5, minutes=1.0 + 2.0 * result.minutes_needed, noise=1e-4, log_T=True), limit="0.505 mm/min"
+    )
+    assert longer.result == "pass"
+
+
+def test_collected_oil_needs_no_log():
+    (result,) = ss.hold_test(collected="12 mL in 10 min", limit="ISO 10100: 0.3 mL/min")
+    low, high = result.leak_interval_lpm
+    assert low < 1.2e-3 < high
+    assert (result.result, result.causes) == ("fail", ("piston",))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"area": "3117 m^2"}, "3117"),
+        ({"limit": "5"}, "5"),
+        ({"limit": "5 bar"}, "5 bar"),
+        ({"oil": "hot"}, "hot"),
+        ({"capped": "C"}, "C"),
+        ({"collected": "12 mL"}, "12 mL"),
+        ({"start": 0.0, "end": 2.0}, "2 s"),
+    ],
+)
+def test_a_wrong_argument_is_named(arguments, named):
+    with pytest.raises(InputError, match=named):
+        ss.hold_test(record_hold(), **arguments)
+
+
+def test_a_moving_cylinder_is_no_hold():
+    t = np.arange(0.0, 60.0, 0.01)
+    recording = ss.Recording(t, {"x": 0.1 * np.sin(t)}, {"x": "m"}, rate=100.0)
+    with pytest.raises(InputError, match="without motion"):
+        ss.hold_test(recording)
+    counts = ss.Recording(t, {"p_A": 8e6 + t}, {"p_A": "count"}, rate=100.0)
+    with pytest.raises(InputError, match="unit"):
+        ss.hold_test(counts)
