@@ -141,6 +141,36 @@ def test_a_channel_that_healthy_days_had_and_a_file_lacks_is_found_doubted_and_m
     assert "Wanne7, mapped to T_oil, must be a column" in call(*judge, "--map", "T_oil=Wanne7").refused(1)
 
 
+def test_one_of_several_actuators_of_a_log_is_commissioned_judged_and_converted(call, tmp_path):
+    """The machine's file keeps the group, which --group replaces in one call."""
+    recording, file, log = record_press(1), tmp_path / "m.toml", tmp_path / "log.csv"
+    headings, columns = ["t [s]"], [recording.t]
+    for part in ("Ausleger", "Stiel"):
+        headings += [f"{part} Druck Kolben [bar]", f"{part} Druck Stange [bar]", f"{part} Weg [mm]"]
+        columns += [recording["p_A"] / 1e5, recording["p_B"] / 1e5, recording["x"] * 1e3]
+    headings, columns = [*headings, "Drehzahl [1/min]"], [*columns, recording["omega"] * 30.0 / np.pi]
+    np.savetxt(
+        log, np.column_stack(columns)[::5], "%.7g", ",", header=",".join(headings), comments="", encoding="utf-8"
+    )
+    for words in (
+        ("inspect", log),
+        ("diagnose", log, "--map", "auto"),
+        ("convert", log, tmp_path / "a.nc", "--map", "auto"),
+    ):
+        complaint = call(*words).err
+        assert "got those of 2 (ausleger: " in complaint
+        assert "--group 'ausleger'" in complaint
+    assert "columns of stiel read" in " ".join(call("inspect", log, "--group", "Stiel").out.split())
+    call("convert", log, tmp_path / "b.nc", "--group", "Stiel")
+    assert ss.read(tmp_path / "b.nc").channels.keys() == {"p_A", "p_B", "x", "omega"}
+    assert ss.read(log, group="Stiel").history == ss.read(log, map={"group": "Stiel"}).history
+    call("commission", log, "-o", file, "--group", "Stiel")
+    assert ss.read_machine(file).channel_map == {"group": "Stiel"}
+    assert "Stiel" in ss.read_machine(file).read(log).provenance["columns"]["p_A"]
+    other = ss.read_machine(file).read(log, map={"group": "Ausleger"})
+    assert "Ausleger" in other.provenance["columns"]["p_A"]
+
+
 @pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="links as POSIX has them")
 def test_a_link_is_written_through(call, commissioned, tmp_path):

@@ -233,7 +233,10 @@ def test_the_oil_s_temperature_is_found_in_any_order_of_words_and_with_any_unit(
     """Words, order, joints and units are drawn; without a unit the numbers are deg C, which the history says."""
     generator = np.random.default_rng(88)
     kelvin = {"degC": 273.15 + 40.0, "C": 273.15 + 40.0, "°C": 273.15 + 40.0, "degF": (40.0 + 459.67) / 1.8, "K": 40.0}
-    oils, temperatures = ("oil", "oel", "Öl", "Oil", "fluid", "huile", "Hydrauliköl"), ("T", "Temp", "temperature")
+    oils, temperatures = (
+        ("oil", "oel", "Öl", "ÖL", "Oil", "fluid", "huile", "Hydrauliköl"),
+        ("T", "Temp", "temperature"),
+    )
     for _ in range(60):
         words = [str(generator.choice(oils)), str(generator.choice(temperatures))]
         joint = str(generator.choice(["", "_", " ", ".", "-"]))

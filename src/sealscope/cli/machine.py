@@ -17,7 +17,7 @@ _KEEP = "Keep recordings that look leaking compared with the others; else they a
 _SINCE = "With --add: forget recordings before DATE, as after a repair."
 
 
-@with_machine_options("rig", "area", "displacement", "maps", "rate", "limit")
+@with_machine_options("rig", "area", "displacement", "maps", "group", "rate", "limit")
 def commission(
     files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],
     output: Annotated[Path, Option("--output", "-o", help="The machine's file to write (.toml).")],

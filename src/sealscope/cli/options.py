@@ -99,6 +99,8 @@ _MAP = (
     "from a formula of columns: 'p_A=ch2*0.0625-0.625 bar'; repeat. `auto`: by the columns' names, also beside others."
 )
 MapOption = Annotated[list[str] | None, Option("--map", metavar="CHANNEL=COLUMN", help=_MAP)]
+_GROUP = "Which of several actuators of the file to read, by its words in the headings: boom, 'cylinder 2', left."
+GroupOption = Annotated[str | None, Option("--group", metavar="WORDS", help=_GROUP)]
 RateOption = Annotated[float | None, Option("--rate", help="Sampling rate [Hz] of files without a time column.")]
 JoinOption = Annotated[bool, Option("--join", help="The files are parts of a single run: join them by their clocks.")]
 _BASELINE = "Leak-free recordings of the same machine."
@@ -144,6 +146,7 @@ class StatedMachine:
         cls,
         machine: MachineOption = None,
         maps: MapOption = None,
+        group: GroupOption = None,
         rate: RateOption = None,
         rig: AssumeOption = None,
         area: AreaOption = None,
@@ -168,11 +171,11 @@ class StatedMachine:
                 if value is not None and value != []:  # []: a repeatable option that the call does not have
                     raise InputError(f"{name} cannot be combined with --machine, whose file states it")
             known_machine = read_machine(machine)
-            added_map = parse_channel_map(maps)
+            added_map = parse_channel_map(maps, group)
             check_request(added_map, None)
             return cls(known_machine, added_map, rig=known_machine.rig, limit=known_machine.limit)
         stated_machine = cls(
-            rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps), rate=rate,
+            rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps, group), rate=rate,
             limit=limit, baseline=tuple(baseline or ()),
         )  # fmt: skip
         check_request(stated_machine.channel_map, rate)
@@ -182,8 +185,11 @@ class StatedMachine:
 
     @property
     def _rig_map(self) -> ChannelMap:
-        """Channel map in the rig's file; empty without a rig or if `--map` is used."""
-        return {} if self.rig is None or self.channel_map else self.rig.channel_map
+        """Channel map in the rig's file; empty without a rig or if `--map` is used, which replaces it."""
+        from sealscope.recordings.formats.columns import GROUP
+
+        has_own_map = isinstance(self.channel_map, str) or self.channel_map.keys() - {GROUP}
+        return {} if self.rig is None or has_own_map else self.rig.channel_map
 
     @property
     def has_map(self) -> bool:
@@ -219,7 +225,7 @@ class StatedMachine:
             return read(file, map=self.channel_map or None, rate=self.rate)
         from sealscope.diagnosis.commissioned.machine import read_by_map
 
-        return read_by_map(file, self._rig_map, self.rate)
+        return read_by_map(file, self._rig_map, self.rate, self.channel_map)
 
     def read_all(self, files: Sequence[Path], *, joined: bool = False) -> Iterator[tuple[Path, Recording | None]]:
         """Yield each file with its recording, or with None after a message on standard error if it is unreadable.
@@ -343,14 +349,14 @@ def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:
     return rig.with_overrides(parse_overrides(overrides), source="set by --set") if overrides else rig
 
 
-def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
-    """Parse the `--map` options to a channel map, which states the column of each channel.
+def parse_channel_map(options: Sequence[str] | None, group: str | None = None) -> ChannelMap:
+    """Parse the `--map` options and `--group` to a channel map, which states the column of each channel.
 
     An option is `CHANNEL=COLUMN`, such as `p_A=PG_1[psi]`, or `auto`, to find other channels by their columns' names.
     `auto` alone gives "auto". Raises InputError for another form, or for a channel that is unknown or given twice.
     """
     from sealscope.recordings import split_map_option
-    from sealscope.recordings.formats.columns import REST
+    from sealscope.recordings.formats.columns import GROUP, REST
 
     columns: dict[str, str] = {}
     for option in options or ():
@@ -358,6 +364,8 @@ def parse_channel_map(options: Sequence[str] | None) -> ChannelMap:
         if channel in columns and channel != REST:
             raise InputError(f"--map {channel} must be given once, got {columns[channel]} and {column}")
         columns[channel] = column
+    if group is not None:
+        columns[GROUP] = group
     return "auto" if set(columns) == {REST} else columns
 
 

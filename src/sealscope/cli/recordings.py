@@ -315,6 +315,7 @@ def _report_machine(files: Sequence[Path], machine: opt.StatedMachine, output: P
 def inspect(
     files: Annotated[list[Path], Argument(metavar="FILE...", help="Recordings, of any format that is read.")],
     maps: opt.MapOption = None,
+    group: opt.GroupOption = None,
     rate: opt.RateOption = None,
     join: opt.JoinOption = False,
     rig: opt.AssumeOption = None,
@@ -326,7 +327,7 @@ def inspect(
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
-    stated = opt.StatedMachine.of(maps=maps, rate=rate, rig=rig)
+    stated = opt.StatedMachine.of(maps=maps, group=group, rate=rate, rig=rig)
     if save_map and (rig is None or not stated.channel_map):
         raise InputError("--save-map needs --rig with a file, and the --map options to be saved")
     machine = stated if stated.has_map else replace(stated, channel_map="auto")
@@ -365,7 +366,7 @@ def _resolve_map(channel_map: ChannelMap, files: Sequence[Path], recording: Reco
     return {**reconstruct_map(recording.provenance), **stated_columns}
 
 
-@opt.with_machine_options("maps", "rate")
+@opt.with_machine_options("maps", "group", "rate")
 def convert(
     source: Annotated[Path, Argument(help="Recording to read.")],
     target: Annotated[Path, Argument(help="Recording to write; its suffix tells the format.")],

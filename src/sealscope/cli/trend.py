@@ -27,7 +27,7 @@ _YEARS = "Machine-years in which a healthy machine has one false alarm."
 _EVERY = "Time from one recording to the next (1d, 12h), of files that state none."
 
 
-@opt.with_machine_options("machine", "maps", "rate", "rig", "area", "displacement", "limit")
+@opt.with_machine_options("machine", "maps", "group", "rate", "rig", "area", "displacement", "limit")
 def trend(
     context: Context,
     files: Annotated[list[Path], Argument(metavar="FILE...", help=_FILES)],

@@ -15,7 +15,7 @@ from typing import Any
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, UnreadableFile
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
-from sealscope.recordings.formats.columns import ChannelMap, Request
+from sealscope.recordings.formats.columns import ChannelMap, Request, with_group
 from sealscope.recordings.formats.structured.archives import is_workbook, unpack
 from sealscope.recordings.formats.table import RecordingFields
 from sealscope.recordings.formats.text import read_text_parts
@@ -103,7 +103,9 @@ def _read_by_format(file: Path, kind: str, request: Request) -> RecordingFields:
 
 
 @checked_call
-def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: float | None = None) -> Recording:
+def read(
+    path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: float | None = None, group: str | None = None
+) -> Recording:
     r"""Read the recording in a file: the text of any logger, or the file of a measurement program.
 
     Formats: MATLAB, TDMS, HDF5, Parquet, JSON, spreadsheets and others (`docs/reference/formats.md`), also inside
@@ -122,6 +124,9 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
         ``{"*": "auto", ...}`` does so for the channels that the mapping does not name.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
+    group : str, optional
+        Which of several actuators in the file to read, by its words in the columns' names, such as ``"boom"`` or
+        ``"cylinder 2"``; implies ``"auto"``. The entry ``"group"`` of `map` does the same.
 
     Returns
     -------
@@ -149,7 +154,7 @@ def read(path: str | os.PathLike[str], *, map: ChannelMap | None = None, rate: f
     [300000.0, 350000.0, 300000.0]
     """
     file = Path(path)
-    return read_file(file, Request(map or {}, rate, file.name, file))
+    return read_file(file, Request(with_group(map or {}, group), rate, file.name, file))
 
 
 def read_file(file: Path, request: Request) -> Recording:
@@ -160,7 +165,12 @@ def read_file(file: Path, request: Request) -> Recording:
 
 @checked_call
 def read_parts(
-    path: str | os.PathLike[str], every: float, *, map: ChannelMap | None = None, rate: float | None = None
+    path: str | os.PathLike[str],
+    every: float,
+    *,
+    map: ChannelMap | None = None,
+    rate: float | None = None,
+    group: str | None = None,
 ) -> Iterator[Recording]:
     r"""Read a long recording part by part.
 
@@ -176,6 +186,8 @@ def read_parts(
         As for `read`.
     rate : float, optional
         Sampling rate [Hz], in place of a time column.
+    group : str, optional
+        As for `read`.
 
     Yields
     ------
@@ -199,7 +211,7 @@ def read_parts(
     [0.8, 0.8, 0.4]
     """
     file = Path(path)
-    request = Request(map or {}, rate, file.name, file)
+    request = Request(with_group(map or {}, group), rate, file.name, file)
     if not (isfinite(every) and every > 0):
         raise InputError(f"every must be > 0 s and finite, got {every:g}")
     return _iter_parts(file, every, request)

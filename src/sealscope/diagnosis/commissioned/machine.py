@@ -33,7 +33,7 @@ from sealscope.paragraphs import format_count
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import read
 from sealscope.recordings.files import read_file
-from sealscope.recordings.formats.columns import REST, ChannelMap, Request, as_mapping
+from sealscope.recordings.formats.columns import GROUP, REST, ChannelMap, Request, as_mapping
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files
@@ -434,9 +434,9 @@ def _read_into_memory(machine: CommissionedMachine, path_of: Mapping[str, Path])
 def _fits_map(recording: SummarisedRecording, channel_map: ChannelMap) -> bool:
     """Return True if a recording has all channels that a map names, so that it was read with the map.
 
-    The entry `REST` and the time `t` name no channel; the map "auto" fits any recording.
+    The entries `REST` and `GROUP` and the time `t` name no channel; the map "auto" fits any recording.
     """
-    return channel_map == "auto" or channel_map.keys() - {REST, "t"} <= recording.units.keys()
+    return channel_map == "auto" or channel_map.keys() - {REST, GROUP, "t"} <= recording.units.keys()
 
 
 def _distinct_names(paths: Sequence[Path]) -> list[str]:

@@ -14,6 +14,7 @@ from sealscope.calls import nearest
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
+from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.formula import Formula, parse_formula
 from sealscope.recordings.formats.headings.labels import Label, split_square_brackets
 from sealscope.recordings.formats.headings.proposal import (
@@ -43,6 +44,8 @@ _PATH_SEPARATORS = re.compile(r"[./\\:<>]")
 #: a mapping does this for the channels that it does not name.
 ChannelMap = Mapping[str, str] | Literal["auto"]
 REST = "*"
+#: Entry of a map that names one of several actuators, as "boom": the columns of the others are not read.
+GROUP = "group"
 #: Label of a file's own sampling times, which come after its columns if none of these is called t.
 CLOCK_LABEL = Label("t [s]", "t", "s")
 
@@ -119,6 +122,9 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
         raise InputError(f"map must be a mapping or the word auto, got {channel_map!r}")
     for channel in explicit_columns(channel_map):
         _check_channel(channel)
+    group = find_group(channel_map)
+    if group is not None and not (isinstance(group, str) and group.strip()):
+        raise InputError(f"group must be the words for one actuator, such as boom, got {group!r}")
     if not isinstance(channel_map, str) and channel_map.get(REST, "auto") != "auto":
         raise InputError(f"map must map {REST} to the word auto, got {channel_map[REST]!r}")
     if rate is not None and not (isfinite(rate) and rate > 0):
@@ -126,8 +132,13 @@ def check_request(channel_map: ChannelMap, rate: float | None) -> None:
 
 
 def uses_names(channel_map: ChannelMap) -> bool:
-    """Test whether a map from channels to columns contains "auto", i.e. whether the columns' names choose channels."""
-    return isinstance(channel_map, str) or REST in channel_map
+    """Test whether the columns' names choose the channels that a map does not name: it has "auto", or a group."""
+    return isinstance(channel_map, str) or REST in channel_map or GROUP in channel_map
+
+
+def find_group(channel_map: ChannelMap) -> str | None:
+    """Find the actuator that a map names, such as "boom"; None if it names none."""
+    return None if isinstance(channel_map, str) else channel_map.get(GROUP)
 
 
 def as_mapping(channel_map: ChannelMap) -> dict[str, str]:
@@ -135,11 +146,16 @@ def as_mapping(channel_map: ChannelMap) -> dict[str, str]:
     return {REST: channel_map} if isinstance(channel_map, str) else dict(channel_map)
 
 
+def with_group(channel_map: ChannelMap, group: str | None) -> ChannelMap:
+    """Add the name of an actuator to a map; without one, return the map unchanged."""
+    return channel_map if group is None else as_mapping(channel_map) | {GROUP: group}
+
+
 def explicit_columns(channel_map: ChannelMap) -> dict[str, str]:
     """Return the entries of a map, channel -> column, that name a column; empty for the map "auto"."""
     if isinstance(channel_map, str):
         return {}
-    return {name: column for name, column in channel_map.items() if name != REST}
+    return {name: column for name, column in channel_map.items() if name not in (REST, GROUP)}
 
 
 def reconstruct_map(provenance: Mapping[str, object]) -> dict[str, str]:
@@ -265,25 +281,68 @@ def _apply_map(choice: ColumnMap, columns: Mapping[str, str]) -> None:
         choice.notes.append(note or f"{kind} {name} read as {channel} in {unit}")
 
 
-def _apply_names(choice: ColumnMap) -> None:
-    """Add to `choice` the channels and the time column that the names of columns show, beside those already chosen."""
-    labels = choice.labels
+def _apply_names(choice: ColumnMap, labels: Sequence[Label]) -> None:
+    """Add to `choice` the channels and the time column that the names of columns show, beside those already chosen.
+
+    `labels`: those of all columns, as the names of one actuator show them (`_select_actuator`).
+    """
+    embedded: list[int] = []  # columns with the name of a channel in a path, or before a unit
     for channel in CHANNEL_UNITS:
         if channel in choice.channels:
             continue
         column = _find_column(labels, channel, f"channel {channel}")
-        column = _find_embedded_name(labels, channel) if column is None else column
+        if column is None and (column := _find_embedded_name(labels, channel)) is not None:
+            embedded.append(column)
         if column is not None and column != choice.time and column not in choice.channel_of:
             found_unit = _find_unit(labels[column], channel)
             unit, note = _choose_unit(channel, found_unit, f"column {labels[column].whole}")
             choice.channels[channel] = Formula({column: 1.0}, 0.0, unit)
-            if labels[column].name != channel:
+            if choice.labels[column].name != channel:
                 choice.names[channel] = labels[column].whole
             choice.notes += [note] if note else []
+    _check_actuator(choice.labels, embedded)
     if choice.time is None and (time := _find_time(labels)) is not None:
         label = labels[time]
         unit_of_name = label.unit or WORDS["time"].get(label.name.casefold()) or unit_of_time(label)
         choice.time, choice.time_label = time, replace(label, unit=unit_of_name)
+
+
+def _select_actuator(choice: ColumnMap, request: Request, mapped_columns: Container[int]) -> Sequence[Label]:
+    """Select the columns of one actuator: return the labels without the others' columns and without words for it.
+
+    It is that of the map's `group`, else that to which the user's `mapped_columns` belong, else the default of
+    `find_actuators`. If the mapped columns are of several, only columns common to all are selected. A note names the
+    columns left out. Raises InputError, a question that names the actuators, if it is not known which is meant.
+    """
+    labels, group = choice.labels, find_group(request.map)
+    folders = {label.whole.rpartition("/")[0] for label in labels if label.name in ("p_A", "p_B")}
+    has_own_names = len(folders) == 1 and {"p_A", "p_B"} <= {label.name for label in labels}
+    if group is None and (has_own_names or not uses_names(request.map)):
+        return labels  # by the channels' own names; `_check_actuator` follows
+    actuators = find_actuators(labels)
+    mapped = [column for column, label in enumerate(actuators.shared) if not label.whole and column in mapped_columns]
+    number = actuators.default if group is None else actuators.find(group)
+    if group is None and mapped:
+        candidates = actuators.find_containing(mapped)
+        if not candidates:
+            return actuators.shared
+        number = candidates[0] if len(candidates) == 1 else number
+    if number is None:
+        if not actuators.names:
+            return labels
+        raise InputError(actuators.question())
+    selected = actuators.labels[number]
+    left_out = [label.whole for label, other in zip(labels, selected, strict=True) if label.whole and not other.whole]
+    if left_out:
+        choice.notes.append(f"columns of {actuators.names[number]} read, not {join_names(left_out, 6)}")
+    return selected
+
+
+def _check_actuator(labels: Sequence[Label], columns: Sequence[int]) -> None:
+    """Raise InputError if `columns` whose names contain a channel's, as `Boom.p_A`, are those of several actuators."""
+    actuators = find_actuators(labels) if len(columns) > 1 else None
+    if actuators is not None and actuators.names and not actuators.find_containing(columns):
+        raise InputError(actuators.question())
 
 
 def _find_embedded_name(labels: Sequence[Label], channel: str) -> int | None:
@@ -359,18 +418,32 @@ def _date_columns(choice: ColumnMap) -> list[int]:
     return [i for i in columns if i not in choice.channel_of]
 
 
-def _note_unused(choice: ColumnMap, used: Container[int | None]) -> None:
+def _format_hint(labels: Sequence[Label], known: Container[str] = (), also: str = "") -> str:
+    """Format a hint on what "auto" would read, but for `known` channels, or the question which actuator is meant.
+
+    `also`: word before "read". Without such a channel the hint is empty.
+    """
+    actuators = find_actuators(labels)
+    if actuators.names and actuators.default is None:
+        return f"; {actuators.question()}"
+    own_labels = labels if actuators.default is None else actuators.labels[actuators.default]
+    proposed = proposed_map(own_labels, labels)
+    proposal = format_map({name: column for name, column in proposed.items() if name not in known})
+    return f"; map auto would {also}read {proposal}" if proposal else ""
+
+
+def _note_unused(choice: ColumnMap, labels: Sequence[Label], used: Container[int | None]) -> None:
     """Add a note on unused columns to `choice`, with a map by which some of them could be read.
 
-    Also set `choice.unused` and, if no column is T_oil, `choice.unused_temperatures`. `used`: numbers of used columns.
+    Also set `choice.unused` and, if no column is T_oil, `choice.unused_temperatures`. `labels`: those of all columns,
+    empty for those of other actuators; `used`: numbers of used columns.
     """
-    unused = [label for i, label in enumerate(choice.labels) if i not in used and label.whole]
+    unused = [label for i, label in enumerate(labels) if i not in used and label.whole]
     choice.unused = tuple(label.whole for label in unused if is_measured(label))
     if not unused:
         return
-    channel_names, proposed = {*choice.channels, "t"}, proposed_map(choice.labels)
-    proposal = format_map({name: column for name, column in proposed.items() if name not in channel_names})
-    hint = f"; map auto would also read {proposal}" if proposal else ""
+    channel_names = {*choice.channels, "t"}
+    hint = _format_hint(labels, channel_names, "also ")
     if "T_oil" not in channel_names:
         choice.unused_temperatures = tuple(label.whole for label in unused if is_temperature(label))
     if choice.unused_temperatures:
@@ -395,23 +468,23 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         except _MissingColumnError:
             choice.notes.append(f"{columns[channel]}, which the machine's map reads as {channel}, is not in this file")
             del columns[channel]
+    mapped_columns: dict[int, str] = {}
+    for channel, column_text in columns.items():
+        with suppress(InputError):  # raised again by `_apply_map`
+            mapped_columns.update(dict.fromkeys(_parse_mapping(labels, channel, column_text).factors, channel))
+    named_labels = _select_actuator(choice, request, mapped_columns)
     if uses_names(request.map):
-        mapped_columns: set[int] = set()
-        for channel, column_text in columns.items():
-            with suppress(InputError):  # raised again by `_apply_map`
-                mapped_columns.update(_parse_mapping(labels, channel, column_text).factors)
         # no channel is proposed for an empty heading
-        other_labels = [Label("", "") if column in mapped_columns else label for column, label in enumerate(labels)]
-        columns = {**proposed_map(other_labels), **columns}
+        other_labels = [Label("", "") if k in mapped_columns else label for k, label in enumerate(named_labels)]
+        columns = {**proposed_map(other_labels, labels), **columns}
     _apply_map(choice, columns)
-    _apply_names(choice)
+    _apply_names(choice, named_labels)
     if rate is None:
         _choose_time_columns(choice)
     if not choice.channels:
-        proposal = format_map(proposed_map(labels))
         raise InputError(
             f"a recording must have a channel ({', '.join(CHANNEL_UNITS)}) or be given a map such as p_A=COLUMN, "
-            f"got columns {_format_columns(labels)}" + (f"; map auto would read {proposal}" if proposal else "")
+            f"got columns {_format_columns(labels)}{_format_hint(labels)}"
         )
     used = {*choice.channel_of, choice.time, *choice.parts.values()}
     if rate is not None:
@@ -428,7 +501,7 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         choice.notes.append(f"no time column: sampled at {stated_rate:g} Hz, as the file says")
     if choice.time is not None:  # a column of dates completes a time column that has only times of day
         choice.date = next((i for i in _date_columns(choice) if i not in used), None)
-    _note_unused(choice, {*used, choice.date})
+    _note_unused(choice, named_labels, {*used, choice.date})
     if rate is not None:  # the time is named in the notes, but not read
         choice.time = choice.time_label = choice.date = None
     elif "t" not in columns and not choice.parts and choice.time is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import unicodedata
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import repeat
 from typing import NamedTuple
 
@@ -47,6 +47,8 @@ _MAX_NAME = 80
 _UMLAUTS = str.maketrans(
     {"ä": "ae", "ö": "oe", "ü": "ue", "ß": "ss", "Ä": "Ae", "Ö": "Oe", "Ü": "Ue", "ł": "l", "Ł": "L"}
 )
+#: A capital umlaut within capital letters, which become two capital letters: `LÖFFEL`.
+_CAPITAL_UMLAUT = re.compile(r"[ÄÖÜ](?=[A-ZÄÖÜ])")
 
 
 class _Guess(NamedTuple):
@@ -64,14 +66,17 @@ class _Guess(NamedTuple):
         return _PRESSURES.get(self.side) if self.kind == "pressure" else _CHANNELS[self.kind]
 
 
-def proposed_map(labels: Sequence[Label]) -> dict[str, str]:
+def proposed_map(labels: Sequence[Label], company: Sequence[Label] = ()) -> dict[str, str]:
     """Propose a map, channel (or ``t``) -> column, for the columns whose names reveal their meaning.
+
+    `company`: all columns of the file, if `labels` are only those of one actuator; the meaning of some words depends on
+    the others (`find_sides`).
 
     Left out are columns that already have a channel's name, and channels for which several columns are equally likely.
     A unit at the end of a name (``PA_bar``) becomes the unit of the column. A map of the time alone is left out, too.
     """
     channel_names = {label.name.casefold() for label in labels} & {name.casefold() for name in CHANNEL_UNITS}
-    sides = _find_sides(labels)
+    sides = find_sides(company or labels)
     candidates: dict[str, list[tuple[Label, _Guess]]] = {}
     for label in labels:
         guess = None if label.name.casefold() in channel_names else _guess_meaning(label, sides)
@@ -178,7 +183,7 @@ def find_name_and_unit(label: Label) -> tuple[str, str | None]:
 
 def ends_in(name: str, words: str) -> bool:
     """Test whether the name of a column ends in `words` that begin with a letter, as `ADC1_Channel_2` ends in `ch2`."""
-    token_lists = ([token.casefold() for token in _TOKEN.findall(_strip_accents(text))] for text in (name, words))
+    token_lists = ([token.casefold() for token in _TOKEN.findall(strip_accents(text))] for text in (name, words))
     # `ch`, `channel` and the like are equal
     name_tokens, ending = (["channel" if word in WORDS["input"] else word for word in tokens] for tokens in token_lists)
     return words[:1].isalpha() and 0 < len(ending) <= len(name_tokens) and name_tokens[-len(ending) :] == ending
@@ -239,10 +244,24 @@ def is_measured(label: Label) -> bool:
     return len(name) > 1 and any(words & known for known in kinds)
 
 
-def _strip_accents(text: str) -> str:
+def strip_accents(text: str) -> str:
     """Remove accents from a text, and write umlauts as two letters: `ä` becomes `ae`."""
+    text = _CAPITAL_UMLAUT.sub(lambda match: match[0].translate(_UMLAUTS).upper(), text)
     decomposed = unicodedata.normalize("NFKD", text.translate(_UMLAUTS))
     return "".join(character for character in decomposed if not unicodedata.combining(character))
+
+
+def iter_tokens(text: str) -> Iterator[tuple[str, tuple[int, int]]]:
+    """Yield the words and numbers of a text in lower case, each with the positions where it begins and ends.
+
+    Accents must have been removed (`strip_accents`). `pa` and `pb` are two words, p and the chamber.
+    """
+    for match in _TOKEN.finditer(text):
+        token, (begin, end) = match[0].casefold(), match.span()
+        if token in ("pa", "pb"):
+            yield from (("p", (begin, begin + 1)), (token[1], (begin + 1, end)))
+        else:
+            yield token, (begin, end)
 
 
 def _split_words(name: str) -> set[str]:
@@ -252,7 +271,7 @@ def _split_words(name: str) -> set[str]:
     without a linking n or s; both letters of `pa` and `pb`; and known words of languages without spaces.
     """
     words = {word for word in _UNSPACED if word in name}
-    for token in (token.casefold() for token in _TOKEN.findall(_strip_accents(name))):
+    for token in (token.casefold() for token in _TOKEN.findall(strip_accents(name))):
         words |= {token, "p", token[1:]} if token in ("pa", "pb") else {token}
         for ending in (ending for ending in WORDS["endings"] if token.endswith(ending)):
             first = token.removesuffix(ending)
@@ -260,7 +279,7 @@ def _split_words(name: str) -> set[str]:
     return words
 
 
-def _find_sides(labels: Sequence[Label]) -> dict[str, str]:
+def find_sides(labels: Sequence[Label]) -> dict[str, str]:
     """Find the chamber, "A" or "B", of words that mean one only in the company of others: word -> chamber.
 
     - "head" is the chamber opposite to that of the rod (B) or the cap (A), if a heading names these by a word.
@@ -287,10 +306,19 @@ def _find_sides(labels: Sequence[Label]) -> dict[str, str]:
     return sides
 
 
+def guess_channel(label: Label, sides: Mapping[str, str] | None = None) -> str | None:
+    """Guess the channel of a column from its name and unit; None if they do not tell, and for a time.
+
+    `sides`: chamber of the words that mean one only in the company of others, as from `find_sides`.
+    """
+    guess = None if _is_named_time(label) else _guess_meaning(label, sides)
+    return None if guess is None else guess.channel
+
+
 def _guess_meaning(label: Label, sides: Mapping[str, str] | None = None) -> _Guess | None:
     """Guess the meaning of a column from its name and unit; None if they do not tell.
 
-    `sides`: chamber of the words that mean one only in the company of others, as from `_find_sides`.
+    `sides`: chamber of the words that mean one only in the company of others, as from `find_sides`.
     """
     if len(label.name) > _MAX_NAME:
         return None
