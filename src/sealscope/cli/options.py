@@ -159,6 +159,7 @@ class StatedMachine:
         Raises InputError for an invalid option, and for another option than `maps` together with `machine`: maps add to
         that in the machine's file.
         """
+        from sealscope.diagnosis.verdict.machine import build_stated_rig
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
 
@@ -175,7 +176,7 @@ class StatedMachine:
             check_request(added_map, None)
             return cls(known_machine, added_map, rig=known_machine.rig, limit=known_machine.limit)
         stated_machine = cls(
-            rig=_build_assumed_rig(rig, area, displacement), channel_map=parse_channel_map(maps, group), rate=rate,
+            rig=build_stated_rig(rig, area, displacement), channel_map=parse_channel_map(maps, group), rate=rate,
             limit=limit, baseline=tuple(baseline or ()),
         )  # fmt: skip
         check_request(stated_machine.channel_map, rate)
@@ -320,25 +321,6 @@ def _replace_parameter(
         return call
 
     return decorate
-
-
-def _build_assumed_rig(name: str | None, area: Sequence[str] | None, displacement: str | None) -> Rig | None:
-    """Build the rig that `--rig`, `--area` and `--displacement` describe; return None without these options."""
-    from sealscope.diagnosis.verdict.machine import unstated_rig
-    from sealscope.parameters import load_rig
-    from sealscope.units import parse_quantity
-
-    rig = None if name is None else load_rig(name)
-    source = "set by the call (--area, --displacement)"
-    if area:
-        if len(area) > 2:
-            raise InputError(f"--area must be given once, or twice for sides A and B, got {len(area)} times")
-        areas = [parse_quantity(text, "m^2", name="--area") for text in area]  # one, or those of the sides A and B
-        rig = (rig or unstated_rig()).with_areas(areas[0], areas[-1], source=source)
-    if displacement is not None:
-        overrides = {"pump.q_b": parse_quantity(displacement, "m^3/rev", name="--displacement")}
-        rig = (rig or unstated_rig()).with_overrides(overrides, source=source)
-    return rig
 
 
 def load_rig_with(name: str, overrides: Sequence[str] | None) -> Rig:

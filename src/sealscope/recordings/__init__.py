@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from sealscope.recordings.files import write as write
     from sealscope.recordings.formats.columns import split_map_option as split_map_option
     from sealscope.recordings.joining import join as join
+    from sealscope.recordings.mending import mend as mend
     from sealscope.recordings.quality import Finding as Finding
     from sealscope.recordings.quality import inspect as inspect
     from sealscope.recordings.quality import uniform_segments as uniform_segments
@@ -23,6 +24,7 @@ _NAMES = {
     "files": ("read", "read_parts", "write"),
     "formats.columns": ("split_map_option",),
     "joining": ("join",),
+    "mending": ("mend",),
     "quality": ("Finding", "inspect", "uniform_segments"),
 }
 

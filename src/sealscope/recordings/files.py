@@ -8,7 +8,7 @@ import tomllib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
-from math import isfinite
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +217,25 @@ def read_parts(
     return _iter_parts(file, every, request)
 
 
+def iter_columns(
+    path: str | os.PathLike[str], *, time: str | None = None, rate: float | None = None, rows: float = inf
+) -> Iterator[RecordingFields]:
+    """Yield every column of a file as it is: in parts of `rows` rows if it is a text log, else at once.
+
+    `time`: column of the time, with its unit, such as ``"clock[ms]"``, and `rate`: sampling rate [Hz], where the file
+    does not tell. The entries of `channels` are called by their headings, in the order of the columns; words are
+    infinite in a text log, else missing. Without a time the rows are counted at 1 Hz. Raises UnreadableFile and
+    InputError as `read` does.
+    """
+    file = Path(path)
+    request = Request({} if time is None else {"t": time}, rate, file.name, file, every_column=True)
+    with _unpacked_file(file) as (inner, kind), raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
+        if kind == "text":
+            yield from read_text_parts(inner, request, inf, rows)
+        else:
+            yield _read_fields(inner, kind, request)
+
+
 def _iter_parts(file: Path, every: float, request: Request) -> Iterator[Recording]:
     """Yield a recording in parts of `every` [s]; formats other than text are read as a whole and cut."""
     with _unpacked_file(file) as (inner, kind):
@@ -254,21 +273,32 @@ def _unpacked_file(file: Path) -> Iterator[tuple[Path, str]]:
             raise UnreadableFile(str(error).replace(str(inner), f"{inner.name} in {file}")) from error
 
 
-def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
-    """Read a recording from a file of the format `kind` that is not packed in an archive.
+@contextmanager
+def unpacked_text(file: Path) -> Iterator[Path]:
+    """Yield the path of a text log, or of the one unpacked from an archive; raise UnreadableFile for other formats."""
+    with _unpacked_file(file) as (inner, kind):
+        if kind != "text":
+            raise UnreadableFile(f"a text log must be text, got a {_FORMATS[kind]['words']} file ({file})")
+        yield inner
+
+
+def _read_fields(file: Path, kind: str, request: Request) -> RecordingFields:
+    """Read the fields of a recording from a file of the format `kind` that is not packed in an archive.
 
     Formats that `formats.toml` does not call `safe` are read in a subprocess with limited time, memory and disk space.
     """
+    if kind in _SAFE_FORMATS:
+        return _read_by_format(file, kind, request)
+    size = file.stat().st_size
+    limit = _BASE_TIME + size / (_MIN_SPEED_SLOW if _FORMATS[kind].get("slow") else _MIN_SPEED)
+    memory = _BASE_MEMORY + _MEMORY_RATIO * size
+    return run_on_file(_read_by_format, file, kind, request, limit=limit, memory=memory, disk=max_unpacked_size(file))
+
+
+def _read_unpacked(file: Path, kind: str, request: Request) -> Recording:
+    """Read a recording from a file of the format `kind` that is not packed in an archive."""
     with raising_unreadable(f"{_FORMATS[kind]['words']} file", file):
-        if kind in _SAFE_FORMATS:
-            fields = _read_by_format(file, kind, request)
-        else:
-            size = file.stat().st_size
-            limit = _BASE_TIME + size / (_MIN_SPEED_SLOW if _FORMATS[kind].get("slow") else _MIN_SPEED)
-            memory = _BASE_MEMORY + _MEMORY_RATIO * size
-            fields = run_on_file(
-                _read_by_format, file, kind, request, limit=limit, memory=memory, disk=max_unpacked_size(file)
-            )
+        fields = _read_fields(file, kind, request)
         if _SUFFIXES.get(file.suffix.lower(), kind) != kind:
             fields = fields.with_note(f"name ends in {file.suffix}, content is {fields.kind}")
         return make_recording(fields)

@@ -1,7 +1,8 @@
-"""Read TOML files: those that come from others, with limits and errors of one line, and the priors of a package."""
+"""Read and write TOML files: those of others, with limits and errors of one line, and the priors of a package."""
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Callable, Collection, Mapping
@@ -147,6 +148,48 @@ def _check_keys(keys: Collection[str], names: Collection[str], optional: Collect
     for name in names:
         if name not in keys and name not in optional:
             raise InputError(f"{place} must be {', '.join(names)}, got none called {name!r}")
+
+
+def format_tables(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
+    """Format a table as lines of TOML: first plain values, then inner tables; None and empty tables are not written.
+
+    `path` is the table's dotted name, "" for the whole file. In the file a list of tables becomes an array of tables;
+    in a table, an inner table of plain values only takes one line. `heading` is the line before the table's values.
+    """
+    lines, inner_lines = list[str](), list[str]()
+    for name, value in tree.items():
+        inner_path = f"{path}.{_format_key(name)}" if path else _format_key(name)
+        is_table = isinstance(value, Mapping)
+        is_plain = is_table and all(isinstance(member, str | float | int | None) for member in value.values())
+        is_inline = is_plain and bool(path) and len(value) > 0
+        if is_table and not is_inline:
+            inner_lines += format_tables(value, inner_path, f"[{inner_path}]")
+        elif isinstance(value, list) and not path and all(isinstance(row, Mapping) for row in value):
+            inner_lines += [line for row in value for line in format_tables(row, inner_path, f"[[{inner_path}]]")]
+        elif value is not None:
+            lines.append(f"{_format_key(name)} = {_format_value(value)}")
+    return [*(["", heading, *lines] if lines else []), *inner_lines]
+
+
+def _format_key(name: str) -> str:
+    """Format a key for TOML, in quotes if TOML requires them."""
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _format_value(name)
+
+
+def _format_value(value: Any) -> str:
+    """Format a plain value as TOML; entries of a table that are None are left out."""
+    if hasattr(value, "tolist"):  # an array of numpy
+        value = value.tolist()
+    if isinstance(value, Mapping):
+        members = (f"{_format_key(name)} = {_format_value(item)}" for name, item in value.items() if item is not None)
+        return "{ " + ", ".join(members) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(map(_format_value, value)) + "]"
+    if isinstance(value, float):  # as TOML, unlike JSON, has nan and inf
+        return repr(value)
+    if isinstance(value, str):  # names of files may contain bytes that are not UTF-8
+        value = value.encode("utf-8", "backslashreplace").decode()
+    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")  # TOML forbids a bare DEL
 
 
 def _estimate_memory(text: str) -> int:

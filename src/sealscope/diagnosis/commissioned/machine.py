@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -339,6 +339,7 @@ def commission(
     limit: str | None = None,
     name: str = "machine",
     keep: bool = False,
+    progress: Callable[[int, int, str], None] = lambda done, total, file: None,
 ) -> CommissionedMachine:
     """Commission a machine: learn from its healthy recordings once, for every later diagnosis.
 
@@ -361,6 +362,9 @@ def commission(
         Name of the machine.
     keep : bool, optional
         True to keep recordings in which a comparison with the others finds a leak; by default they are left out.
+    progress : callable, optional
+        Function that is called with the number of steps done, their total and the recording's name, before each step:
+        two a recording. An exception that it raises ends the commissioning.
 
     Returns
     -------
@@ -395,7 +399,9 @@ def commission(
     path_of = dict(zip(_distinct_names(files), files, strict=True))  # by label
     recording_of = _read_into_memory(machine, path_of)  # by label, too
     machine = replace(machine, rig=infer_rig(stated_rig, list(recording_of.values())))
-    for label, path in path_of.items():
+    n_steps = 2 * len(path_of)
+    for number, (label, path) in enumerate(path_of.items()):
+        progress(number, n_steps, label)
         try:
             recording = recording_of.get(label) or machine.read(path)
             machine = machine._with_recording(recording, label)
@@ -406,8 +412,11 @@ def commission(
     if stated_map is not None and not any(_fits_map(recording, stated_map) for recording in machine.healthy):
         read(files[0], map=stated_map, rate=rate)  # raises the error of the map, without which the others were read
 
+    labels = list(path_of)
+
     def judge(healthy: SummarisedRecording, reference: tuple[SummarisedRecording, ...]) -> Diagnosis:
         """Diagnose a healthy recording against others; its samples are read again unless they were kept in memory."""
+        progress(len(labels) + labels.index(healthy.file), n_steps, healthy.file)
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 

@@ -23,7 +23,6 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from sealscope.calls import checked_call
@@ -47,7 +46,7 @@ from sealscope.recordings.formats.columns import REST, check_request
 from sealscope.storage.atomic import atomic_write, check_folder
 from sealscope.storage.folders import lock_file
 from sealscope.storage.plain_values import convert_type
-from sealscope.storage.toml_file import parse_toml, read_toml
+from sealscope.storage.toml_file import format_tables, parse_toml, read_toml
 
 #: Format that this version writes and reads.
 _FORMAT = 3
@@ -203,7 +202,7 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
     """
     new_lines = [format_summary(recording) for recording in machine.healthy]
     tree = _build_tree(machine, target, new_lines)
-    data = (_HEAD + "\n".join(_format_table(tree)) + "\n").encode()
+    data = (_HEAD + "\n".join(format_tables(tree)) + "\n").encode()
     new_tree = parse_toml(data, "a machine's file", str(target))  # as it will be read back
     _convert_tree(new_tree, str(target))  # raises InputError
     if change := _find_change(machine.origin, target, new_tree):
@@ -297,7 +296,7 @@ def _summaries_path(path: Path, tree: Mapping[str, Any]) -> Path:
 def _build_tree(machine: CommissionedMachine, path: Path, summaries: Sequence[Line]) -> dict[str, Any]:
     """Build the nested tables of a machine's file at `path`, with the `summaries` of its healthy recordings.
 
-    Values that are None are not written (`_format_table`).
+    Values that are None are not written (`format_tables`).
     """
     from importlib.metadata import version
 
@@ -334,48 +333,6 @@ def _build_tree(machine: CommissionedMachine, path: Path, summaries: Sequence[Li
         for alarm in machine.alarms
     ]
     return tree
-
-
-def _format_table(tree: Mapping[str, Any], path: str = "", heading: str = "") -> list[str]:
-    """Format a table as lines of TOML: first plain values, then inner tables; None and empty tables are not written.
-
-    `path` is the table's dotted name, "" for the whole file. In the file a list becomes an array of tables; in a table,
-    an inner table of plain values only takes one line. `heading` is the line before the table's values.
-    """
-    lines, inner_lines = list[str](), list[str]()
-    for name, value in tree.items():
-        inner_path = f"{path}.{_format_key(name)}" if path else _format_key(name)
-        is_table = isinstance(value, Mapping)
-        is_plain = is_table and all(isinstance(member, str | float | int | None) for member in value.values())
-        is_inline = is_plain and bool(path) and len(value) > 0
-        if is_table and not is_inline:
-            inner_lines += _format_table(value, inner_path, f"[{inner_path}]")
-        elif isinstance(value, list) and not path:
-            inner_lines += [line for row in value for line in _format_table(row, inner_path, f"[[{inner_path}]]")]
-        elif value is not None:
-            lines.append(f"{_format_key(name)} = {_format_value(value)}")
-    return [*(["", heading, *lines] if lines else []), *inner_lines]
-
-
-def _format_key(name: str) -> str:
-    """Format a key for TOML, in quotes if TOML requires them."""
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _format_value(name)
-
-
-def _format_value(value: Any) -> str:
-    """Format a plain value as TOML; entries of a table that are None are left out."""
-    if isinstance(value, np.ndarray):
-        value = value.tolist()
-    if isinstance(value, Mapping):
-        members = (f"{_format_key(name)} = {_format_value(item)}" for name, item in value.items() if item is not None)
-        return "{ " + ", ".join(members) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(map(_format_value, value)) + "]"
-    if isinstance(value, float):  # as TOML, unlike JSON, has nan and inf
-        return repr(value)
-    if isinstance(value, str):  # names of files may contain bytes that are not UTF-8
-        value = value.encode("utf-8", "backslashreplace").decode()
-    return json.dumps(value, ensure_ascii=False, default=str).replace("\x7f", "\\u007f")  # TOML forbids a bare DEL
 
 
 @checked_call

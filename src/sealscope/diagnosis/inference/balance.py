@@ -289,7 +289,7 @@ class BlockStream(SavedAttributes):
             name: values[first * length - self._first : end * length - self._first] for name, values in samples.items()
         }
         if self._absolute_offsets is None:
-            self._absolute_offsets = {name: _absolute_offset(group[name]) for name in ("p_A", "p_B") if name in group}
+            self._absolute_offsets = {name: absolute_offset(group[name]) for name in ("p_A", "p_B") if name in group}
             self._learn_limits(group)
         elif not self.left_signs:
             self._learn_limits(group)
@@ -623,7 +623,7 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
     return extend_both_ways(is_lowering)
 
 
-def _absolute_offset(pressure: Array) -> float:
+def absolute_offset(pressure: Array) -> float:
     """Compute absolute minus gauge pressure [Pa] for a sensor with the readings `pressure` (n,) [Pa].
 
     It is the atmospheric pressure, or more where the lowest reading would otherwise lie below `MIN_ABSOLUTE_PRESSURE`.

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
 from sealscope.parameters.rig import ASSUMED
 from sealscope.recordings.channels import METERS, flow_source
+from sealscope.units import parse_quantity
 
 #: Who stated the rig: the caller, the recording's provenance, or nobody.
 StatedBy = Literal["call", "recording", "nobody"]
@@ -96,3 +99,24 @@ def healthy_leakage(rig: Rig) -> float:
 def unstated_rig() -> Rig:
     """Return the default rig, with every value marked as an assumption."""
     return load_rig(DEFAULT).as_assumed(UNSTATED)
+
+
+def build_stated_rig(
+    rig: str | os.PathLike[str] | None = None, areas: Sequence[str] | None = None, displacement: str | None = None
+) -> Rig | None:
+    """Build the rig that a person states: a rig's name or file, sizes as texts, or both; None if nothing is stated.
+
+    `areas`: area of the piston such as "633 mm^2", or those of sides A and B; `displacement`: that of the pump, such as
+    "4.9 cm^3/rev". Raises InputError for an invalid text, which it calls by the option of the command line.
+    """
+    stated_rig = None if rig is None else load_rig(rig)
+    source = "set by the call (--area, --displacement)"
+    if areas:
+        if len(areas) > 2:
+            raise InputError(f"--area must be given once, or twice for sides A and B, got {len(areas)} times")
+        values = [parse_quantity(text, "m^2", name="--area") for text in areas]  # one, or those of the sides A and B
+        stated_rig = (stated_rig or unstated_rig()).with_areas(values[0], values[-1], source=source)
+    if displacement is not None:
+        overrides = {"pump.q_b": parse_quantity(displacement, "m^3/rev", name="--displacement")}
+        stated_rig = (stated_rig or unstated_rig()).with_overrides(overrides, source=source)
+    return stated_rig

@@ -59,6 +59,7 @@ class Request:
     file: str = ""  # name of the file for the provenance
     path: Path | None = None  # the file, if others beside it may tell whether dates begin with the day
     optional: frozenset[str] = frozenset()  # entries of the map that do not count in a file that lacks their columns
+    every_column: bool = False  # read every column as it is, without a channel's meaning; of the map only `t` counts
 
     def __post_init__(self) -> None:
         check_request(self.map, self.rate)
@@ -81,6 +82,8 @@ class ColumnMap:
     unused: tuple[str, ...] = ()  # names of columns with measured quantities that are in no channel
     unused_temperatures: tuple[str, ...] = ()  # names of columns with temperatures, unless one is the oil's
     notes: list[str] = field(default_factory=list)  # lines for the history of the recording
+    #: Kind of the cells of columns that are no time: "numbers" or, for infinity in place of words, "any".
+    cells: Literal["numbers", "any"] = "numbers"
 
     @property
     def channel_of(self) -> dict[int, str]:
@@ -89,12 +92,12 @@ class ColumnMap:
 
     @property
     def columns(self) -> dict[int, str]:
-        """Mapping from each column to read to its kind, "numbers" or "time"; the time column comes last."""
+        """Mapping from each column to read to its kind, `cells` or "time"; the time column comes last."""
         # a time column that is also a channel is read as numbers
         number_columns = {*self.channel_of, *self.parts.values()} - {self.time}
-        columns = dict.fromkeys(sorted(number_columns), "numbers")
+        columns: dict[int, str] = dict.fromkeys(sorted(number_columns), self.cells)
         if self.time is not None:
-            columns[self.time] = "numbers" if self.time in self.channel_of else "time"
+            columns[self.time] = self.cells if self.time in self.channel_of else "time"
         return columns
 
 
@@ -451,6 +454,36 @@ def _note_unused(choice: ColumnMap, labels: Sequence[Label], used: Container[int
     choice.notes.append(f"{UNUSED}: {join_names((label.whole for label in unused), 40)}{hint}")
 
 
+def _choose_every_column(labels: Sequence[Label], request: Request, stated_rate: float | None) -> ColumnMap:
+    """Choose all columns of a table, each as numbers without a meaning under its heading, and their time.
+
+    The time is that of `choose_columns`. Without one, the rate is that of the request or of the file, else 1 Hz.
+    """
+    choice = ColumnMap(labels, stated_rate if request.rate is None else request.rate, cells="any")
+    if request.rate is None:
+        if time := explicit_columns(request.map).get("t"):
+            _apply_map(choice, {"t": time})
+        elif (column := _find_time(labels)) is not None:
+            label = labels[column]
+            unit = label.unit or WORDS["time"].get(label.name.casefold()) or unit_of_time(label)
+            choice.time, choice.time_label = column, replace(label, unit=unit)
+        _choose_time_columns(choice)
+    used = {choice.time, *choice.parts.values()}
+    if choice.time is not None:
+        choice.date = next((i for i in _date_columns(choice) if i not in used), None)
+    elif choice.rate is None:
+        choice.rate = 1.0
+        choice.notes.append("neither a time nor a rate: drawn over the number of the row")
+    for column, label in enumerate(labels):
+        if column not in {*used, choice.date}:
+            name = label.whole or f"column {column + 1}"
+            name = f"{name} (column {column + 1})" if name in choice.channels else name
+            choice.channels[name] = Formula({column: 1.0}, 0.0, COUNTS)
+    if not choice.channels:
+        raise InputError(f"a table must have a column beside its time, got columns {_format_columns(labels)}")
+    return choice
+
+
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
     """Choose the columns of a table to read, and the channel of each.
 
@@ -460,6 +493,8 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     entry is `optional`, if no column is a channel, there is neither a time nor a rate, or a unit has the wrong
     dimension.
     """
+    if request.every_column:
+        return _choose_every_column(labels, request, stated_rate)
     choice = ColumnMap(labels, stated_rate)
     columns, rate = explicit_columns(request.map), request.rate
     for channel in request.optional & columns.keys():

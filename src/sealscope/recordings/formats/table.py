@@ -170,7 +170,10 @@ def build_fields(
             if member.count != last.count:
                 required = f"{last.path} ({last.count})"
                 raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
-        columns = {column: _read_samples(members[column], as_time=kinds[column] == "time") for column in kinds}
+        columns = {
+            column: _read_samples(members[column], as_time=kinds[column] == "time", any_cell=kinds[column] == "any")
+            for column in kinds
+        }
     table = convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
     return table._replace(provenance=table.provenance | clock) if clock else table
 
@@ -396,12 +399,18 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     return members, notes
 
 
-def _read_samples(series: Series, *, as_time: bool = False) -> NDArray[Any]:
+def _read_samples(series: Series, *, as_time: bool = False, any_cell: bool = False) -> NDArray[Any]:
     """Read the samples (n,) of a series as doubles; with `as_time`, read date stamps as datetime64.
 
     Durations become seconds. In a column of texts, words become NaN if they are at most the fraction
-    `MAX_WORD_FRACTION` of the cells. Raises InputError for more words, and for other types.
+    `MAX_WORD_FRACTION` of the cells. Raises InputError for more words, and for other types; with `any_cell`, the
+    samples of such a column are missing.
     """
+    if any_cell:
+        try:
+            return _read_samples(series)
+        except InputError:
+            return np.full(series.count, np.nan)
     values = series.values()
     if values.dtype.kind in "OSU":
         cells = [str(cell) for cell in values.tolist()]
@@ -447,7 +456,7 @@ def _align_clocks(
     columns: dict[int, NDArray[Any]] = {}
     notes: list[str] = []
     for column, member in used.items():
-        values = _read_samples(member)
+        values = _read_samples(member, any_cell=choice.cells == "any")
         if member.clock is None and member.count != base.count:
             raise InputError(
                 f"{member.path} must have a clock or as many samples as {base.path} ({base.count}), got {member.count}"

@@ -92,12 +92,12 @@ def read_text(path: Path, request: Request) -> RecordingFields:
     return next(read_text_parts(path, request, inf))
 
 
-def read_text_parts(path: Path, request: Request, every: float) -> Iterator[RecordingFields]:
+def read_text_parts(path: Path, request: Request, every: float, rows: float | None = None) -> Iterator[RecordingFields]:
     """Yield a text log in parts of `every` [s], each as the fields of a recording, in bounded memory.
 
-    All parts but the last have the same number of rows: `every` times the sampling rate of the first rows. The log is a
-    single part if `every` = inf, if it begins with the last sample, if each channel has a time column, or if it is a
-    long table, in which each row is one sample of a named channel.
+    All parts but the last have the same number of rows: `rows` or, without it, `every` times the sampling rate of the
+    first rows. The log is a single part if these are infinite, if it begins with the last sample, if each channel has a
+    time column, or if it is a long table, in which each row is one sample of a named channel.
     """
     layout = read_layout(path)
     description = None if layout.description is None else parse_description(layout.description)
@@ -129,9 +129,10 @@ def read_text_parts(path: Path, request: Request, every: float) -> Iterator[Reco
     rows_per_part, state = inf, TimeState()
     first = next(blocks, None)
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
-    if first is not None and every < inf and not is_reversed:
+    if first is not None and min(every, inf if rows is None else rows) < inf and not is_reversed:
         # convert a copy of the first block to know its rate (`join_blocks` empties it); then forget its last time
-        rows_per_part = max(1, round(every * make_part([first[:]], state).rate))
+        rate = make_part([first[:]], state).rate
+        rows_per_part = max(1, round(every * rate)) if rows is None else rows
         state = TimeState(state.head, state.rate, state.resolution)
     pending: list[_Block] = []
     for part_blocks in _split_blocks([] if first is None else chain([first], blocks), rows_per_part):
