@@ -103,6 +103,31 @@ class MappedTable:
         return {"t": times, "lines": lines, "first": t[0], "last": t[-1], "whole": size <= 2}
 
 
+def mean_rates(
+    table: MappedTable, indices: Sequence[int], begin: float | None, end: float | None, pixels: int, shortest: float
+) -> dict[str, Any]:
+    """Compute the mean rate of change a minute of columns that accumulate, in bins of `shortest` [s] or longer.
+
+    Arguments and result are as of `MappedTable.window`.
+    """
+    t = table.column(-1)
+    if len(t) < 2:
+        return {"t": [], "lines": [[] for _ in indices], "first": 0.0, "last": 0.0, "whole": True}
+    start = 0 if begin is None else max(0, int(np.searchsorted(t, begin, "left")) - 1)
+    stop = len(t) - 1 if end is None else min(len(t) - 1, int(np.searchsorted(t, end, "right")))
+    start = min(start, len(t) - 2)
+    stop = max(stop, start + 1)
+    step = (float(t[-1]) - float(t[0])) / (len(t) - 1)
+    least = max(1, round(shortest / max(step, 1e-12)))
+    size = max(least, -(-(stop - start) // max(1, min(pixels, _MAX_PIXELS))))
+    edges = np.append(np.arange(start, stop, size), stop)
+    times = np.array(t[edges])
+    spans = np.maximum(np.diff(times), 1e-12) / 60.0
+    lines = [np.diff(np.array(table.column(k)[edges])) / spans for k in indices]
+    middle = 0.5 * (times[1:] + times[:-1])
+    return {"t": middle, "lines": lines, "first": t[0], "last": t[-1], "whole": size == least}
+
+
 def reduce_extremes(values: Array, start: int, stop: int, size: int) -> tuple[Array, Array]:
     """Compute minimum and maximum of each `size` values from `start` to `stop`; NaN where there is no finite value."""
     whole = (stop - start) // size

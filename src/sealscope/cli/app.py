@@ -27,6 +27,7 @@ from sealscope.cli import (
     rigs,
     simulation,
     trend,
+    workbench,
 )
 from sealscope.cli.options import complain
 from sealscope.errors import InputError, SealscopeError, UnreadableFile
@@ -46,8 +47,8 @@ app = typer.Typer(
 
 for command in (
     simulation.demo, simulation.simulate, machine.commission, recordings.diagnose, recordings.report, trend.trend,
-    hold.hold, simulation.parameters, planning.plan, recordings.inspect, recordings.convert, reproduction.reproduce,
-    fmu.fmu,
+    hold.hold, simulation.parameters, planning.plan, recordings.inspect, recordings.convert, workbench.mend,
+    workbench.app, reproduction.reproduce, fmu.fmu,
 ):  # fmt: skip
     app.command()(command)
 for group in (campaign.campaign, rigs.rigs, monitoring.monitor, plugin.plugin):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from math import sqrt
 from typing import Any, NamedTuple
 
@@ -91,15 +91,31 @@ def schematic(recording: Recording, diagnosis: Diagnosis, circuit: Circuit) -> s
     """Draw the schematic of a machine as SVG, with its sensors, their columns in the file, and the leak if any."""
     leaking = diagnosis.verdict == "leak"
     amount = f"{messages.number(diagnosis.leak_lpm)} L/min" if leaking and diagnosis.leak_lpm is not None else ""
+    leak_label = f"leak {amount}".strip() if leaking else ""
+    return draw_circuit(circuit, recording.channels, channel_columns(recording), diagnosis.verdict, leak_label)
+
+
+def draw_circuit(
+    circuit: Circuit,
+    recorded: Container[str],
+    columns: Mapping[str, str] | None = None,
+    verdict: str = "",
+    leak_label: str = "",
+) -> str:
+    """Draw a machine as SVG: its parts, its sensors by the channels that are `recorded`, and their `columns` in a file.
+
+    `verdict`: words of the seal's state, "" for none; `leak_label`: words of the leak if the verdict is "leak". Each
+    sensor has its channel as the attribute `data-channel`.
+    """
     return template.render(
         "schematic.svg.j2",
-        leaking=leaking,
-        leak_label=f"leak {amount}".strip() if leaking else "",
-        recorded={name: name in recording for name in CHANNEL_UNITS},
-        column=channel_columns(recording),
+        leaking=verdict == "leak",
+        leak_label=leak_label,
+        recorded={name: name in recorded for name in CHANNEL_UNITS},
+        column=columns or {},
         c=circuit,
         values=circuit.values,
-        verdict=diagnosis.verdict,
+        verdict=verdict,
     )
 
 

@@ -1,0 +1,235 @@
+"""What the workbench says of each log: when, how long, which channels, which defects, a small picture, its duty."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sealscope.app.session import SessionMachine
+from sealscope.app.tables import Source, cache_folder, reduce_extremes
+from sealscope.diagnosis.commissioned.duty import measure_duty
+from sealscope.diagnosis.commissioned.machine import read_by_map
+from sealscope.diagnosis.flow_curves import compute_flow_curves
+from sealscope.errors import SealscopeError, UnreadableFile
+from sealscope.parameters import Rig
+from sealscope.recordings.files import iter_columns
+from sealscope.recordings.formats.columns import reconstruct_map
+from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.proposal import proposed_map
+from sealscope.recordings.joining import start_seconds
+from sealscope.recordings.quality import inspect
+from sealscope.recordings.recording import Array, Recording
+from sealscope.reporting.charts import display_values
+from sealscope.storage.atomic import atomic_write
+from sealscope.storage.plain_values import to_plain
+from sealscope.units import LITRE_PER_MINUTE
+
+#: Rows of a text log that are read at a time, for its first picture.
+PART_ROWS = 100_000
+#: Points of a small picture, and format of the stored rows.
+_PICTURE, _VERSION = 64, 2
+_ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
+#: Separators after the name of an actuator in a column's heading, such as `Press 2 / p_A`.
+_GROUP = re.compile(r"[\s._/:|-]+")
+
+
+def file_stamp(path: Path) -> str:
+    """Format what identifies the content of a file: its path, size and time of change."""
+    status = path.stat()
+    return f"{path}|{status.st_size}|{status.st_mtime_ns}"
+
+
+def read_log(path: Path, machines: Sequence[SessionMachine]) -> Recording:
+    """Read a log by the first of the machines' maps that fits it, else by the names of its columns."""
+    error: SealscopeError | None = None
+    for channel_map, rate in [*((m.channel_map, m.rate) for m in machines if m.map or m.rate), ("auto", None)]:
+        try:
+            return read_by_map(path, channel_map, rate)
+        except UnreadableFile as reason:
+            error = reason
+    assert error is not None
+    raise error
+
+
+def read_for(machine: SessionMachine, path: Path) -> Recording:
+    """Read a log by the map of a machine, as its commissioning does."""
+    return read_by_map(path, machine.channel_map, machine.rate)
+
+
+def describe_log(path: Path, machines: Sequence[SessionMachine]) -> dict[str, Any]:
+    """Describe a log for the table, from the cache if neither the log nor the maps have changed.
+
+    An unreadable log is described by its `error`.
+    """
+    try:
+        maps = [(m.channel_map, m.rate) for m in machines if m.map or m.rate]
+        stamp = json.dumps([_VERSION, file_stamp(path), maps], sort_keys=True)
+        stored = cache_folder() / "rows" / f"{sha256(stamp.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}.json"
+        with suppress(OSError, ValueError):
+            return json.loads(stored.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
+        row = describe_recording(read_log(path, machines), path.name)
+        with suppress(SealscopeError, OSError):
+            stored.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+            with atomic_write(stored) as temporary:
+                temporary.write_text(json.dumps(row), encoding="utf-8")
+        return row
+    except (SealscopeError, OSError, MemoryError) as error:
+        return {"state": "unreadable", "error": " ".join((str(error) or "out of memory").split())}
+    except Exception as error:  # a defect concerns this row alone
+        return {"state": "unreadable", "error": f"cannot read, got {type(error).__name__}: {error}"[:500]}
+
+
+def describe_recording(recording: Recording, name: str) -> dict[str, Any]:
+    """Describe a recording as plain values: start, length, rate, channels, findings, small picture and duty."""
+    start = str(recording.provenance.get("start", ""))
+    findings = [
+        {"severity": finding.severity, "text": finding.text, "channel": finding.channel, "t": finding.first_t}
+        for finding in inspect(recording)
+    ]
+    row = {
+        "state": "read",
+        "start_s": start_seconds(recording, name),
+        "zone": match[0] if (match := _ZONE.search(start)) and "T" in start else "",
+        "seconds": recording.duration,
+        "rate": recording.rate,
+        "samples": len(recording),
+        "channels": list(recording.channels),
+        "unused": list(recording.unused),
+        "format": str(recording.provenance.get("format", "")),
+        "findings": findings,
+        "picture": _draw_small(recording),
+        "duty": measure_duty(recording),
+    }
+    return to_plain(row)  # type: ignore[no-any-return]
+
+
+def _draw_small(recording: Recording) -> dict[str, Any]:
+    """Reduce the channels that tell most to lines of a small picture, each scaled to 0 .. 1."""
+    chosen = [name for name in ("p_A", "p_B", "x") if name in recording] or list(recording.channels)[:2]
+    lines = {}
+    for name in chosen:
+        values = recording[name]
+        low, high = reduce_extremes(values, 0, len(values), max(1, -(-len(values) // _PICTURE)))
+        lines[name] = np.column_stack([low, high]).ravel()
+    pressures = [lines[name] for name in lines if name.startswith("p_")]
+    for name, line in lines.items():
+        scale = np.concatenate(pressures) if name.startswith("p_") and pressures else line
+        finite = scale[np.isfinite(scale)]
+        least, most = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
+        lines[name] = np.round((line - least) / (most - least or 1.0), 3)
+    return {name: line.tolist() for name, line in lines.items()}
+
+
+def propose_maps(path: Path, rate: float | None) -> tuple[dict[str, str], list[dict[str, Any]], str]:
+    """Propose the column of each channel of a log, and a map for each actuator if its columns show several.
+
+    Returns the map, the maps of groups of columns, as {"name", "map"}, and why a map alone does not read the log, "" if
+    it does.
+    """
+    headings = next(iter(iter_columns(path, rate=rate, rows=1000))).channels
+    labels = [Label.parse(heading) for heading in headings]
+    groups = find_groups(labels)
+    try:
+        recording = read_by_map(path, "auto", rate)
+    except SealscopeError as error:
+        return proposed_map(labels), groups, str(error)
+    return reconstruct_map(recording.provenance) or {name: name for name in recording.channels}, groups, ""
+
+
+def find_groups(labels: Sequence[Label]) -> list[dict[str, Any]]:
+    """Find several actuators in the columns of a log: headings that begin with a common word and are channels after it.
+
+    Returns a map for each group with both chamber pressures; empty unless there are two or more.
+    """
+    members: dict[str, list[tuple[Label, Label]]] = {}
+    for label in labels:
+        words = _GROUP.split(label.whole.strip(), maxsplit=2)
+        for count in (1, 2):
+            if len(words) > count:
+                prefix = label.whole.strip()[: label.whole.strip().index(words[count], len(" ".join(words[:count])))]
+                inner = Label.parse(label.whole.strip()[len(prefix) :])
+                members.setdefault(_GROUP.sub(" ", prefix).strip(), []).append((inner, label))
+    groups = []
+    for name, pairs in members.items():
+        inner_labels = [inner for inner, _ in pairs]
+        wholes = {inner.whole: label.whole for inner, label in pairs}
+        found = {
+            inner.name: inner.whole
+            for inner in inner_labels
+            if inner.name in ("p_A", "p_B", "x", "theta", "omega", "u")
+        }
+        for channel, column in proposed_map(inner_labels).items():
+            found.setdefault(channel, column)
+        if {"p_A", "p_B"} <= found.keys():
+            columns = {channel: wholes.get(column, column) for channel, column in found.items()}
+            groups.append({"name": name, "map": columns})
+    return groups if len(groups) > 1 else []
+
+
+def columns_source(path: Path, time: str | None, rate: float | None) -> Source:
+    """Make the source of a table of every column of a log, as it is written."""
+
+    def iter_parts() -> Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]:
+        for fields in iter_columns(path, time=time, rate=rate, rows=PART_ROWS):
+            about = {"rate": fields.rate, "format": fields.kind, "notes": list(fields.history)[:40]}
+            about["start_s"] = fields.provenance.get("start_epoch_s")
+            yield list(fields.channels), to_plain(about), fields.t, list(fields.channels.values())
+
+    return iter_parts
+
+
+def channels_source(read: Callable[[], Recording]) -> Source:
+    """Make the source of a table of a recording's channels, in the units in which they are shown."""
+
+    def iter_parts() -> Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]:
+        recording = read()
+        shown = [display_values(recording, name, recording.pressure_unit) for name in recording.channels]
+        names = [f"{name} [{unit}]" for name, (unit, _) in zip(recording.channels, shown, strict=True)]
+        yield names, {"rate": recording.rate}, recording.t, [values for _, values in shown]
+
+    return iter_parts
+
+
+def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
+    """Make the source of a table of a recording's volume balance: volumes [L] since the first sample.
+
+    Without true flows, the volumes are fractions [%] of what the pump delivers in a minute.
+    """
+
+    def iter_parts() -> Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]:
+        curves = compute_flow_curves(read(), rig)
+        if curves is None:
+            raise UnreadableFile("its channels allow no balance of volumes: it needs pressures, position and pump flow")
+        duration = max(float(curves.t[-1] - curves.t[0]), 1e-9)
+        mean = float(np.abs(np.diff(curves.delivered)).sum()) / duration  # [m^3/s]
+        scale = 1.0 / (60.0 * LITRE_PER_MINUTE) if curves.states_flow else 100.0 / 60.0 / max(mean, 1e-30)
+        about = {
+            "unit": "L/min" if curves.states_flow else "% of the pump's flow",
+            "source": curves.source,
+            "blocks": np.round(curves.blocks, 4).tolist(),
+            "delay": curves.delay,
+            "offset": curves.offset,
+            "volumes": {"delivered": float(np.abs(np.diff(curves.delivered)).sum()) * scale * 60.0},
+        }
+        names = [curves.source, *curves.parts]
+        yield (
+            names,
+            to_plain(about),
+            curves.t,
+            [scale * values for values in (curves.delivered, *curves.parts.values())],
+        )
+
+    return iter_parts
+
+
+def is_hidden(name: str) -> bool:
+    """Return True for a name that no log has in the workbench: hidden, or with a separator or control characters."""
+    return name.startswith(".") or not name.isprintable() or os.sep in name or "/" in name or "\\" in name or not name
