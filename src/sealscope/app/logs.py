@@ -17,7 +17,7 @@ from sealscope.app.session import SessionMachine
 from sealscope.app.tables import Source, cache_folder, reduce_extremes
 from sealscope.diagnosis.commissioned.duty import measure_duty
 from sealscope.diagnosis.commissioned.machine import read_by_map
-from sealscope.diagnosis.flow_curves import compute_flow_curves
+from sealscope.diagnosis.flow_curves import FlowCurves, compute_flow_curves
 from sealscope.errors import SealscopeError, UnreadableFile
 from sealscope.parameters import Rig
 from sealscope.recordings.files import iter_columns
@@ -217,7 +217,7 @@ def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
             "blocks": np.round(curves.blocks, 4).tolist(),
             "delay": curves.delay,
             "offset": curves.offset,
-            "volumes": {"delivered": float(np.abs(np.diff(curves.delivered)).sum()) * scale * 60.0},
+            "closure": _closure(curves),
         }
         names = [curves.source, *curves.parts]
         yield (
@@ -228,6 +228,17 @@ def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
         )
 
     return iter_parts
+
+
+def _closure(curves: FlowCurves) -> float | None:
+    """Compute the range of the volume that does not move the piston, over that of the delivered one.
+
+    None behind a servo valve, where the piston is the only measured volume.
+    """
+    if "piston" not in curves.parts:
+        return None
+    extent = float(np.ptp(curves.delivered))
+    return float(np.ptp(curves.delivered - curves.parts["piston"])) / extent if extent > 0.0 else None
 
 
 def is_hidden(name: str) -> bool:

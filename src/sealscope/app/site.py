@@ -101,7 +101,7 @@ def _find_refusal(guard: LaunchGuard, request: Request) -> Response | None:
     if path == "/start" or guard.knows(request.cookies.get(_COOKIE)):
         return None
     if path in ("/", "/base.css", "/app.css"):
-        return None if path != "/" else HTMLResponse(str(read_package_file("closed.html", _PACKAGE)), 401)
+        return None if path != "/" else HTMLResponse(str(read_package_file("page/closed.html", _PACKAGE)), 401)
     return make_refusal("start the workbench anew: sealscope app", 401)
 
 
@@ -153,14 +153,14 @@ class _Pages:
         if not self._guard.use_token(address, request.query_params.get("token", "")):
             if self._guard.knows(request.cookies.get(_COOKIE)):
                 return RedirectResponse("/", 303)
-            return HTMLResponse(str(read_package_file("closed.html", _PACKAGE)), 401)
+            return HTMLResponse(str(read_package_file("page/closed.html", _PACKAGE)), 401)
         answer = RedirectResponse("/", 303)
         answer.set_cookie(_COOKIE, self._guard.session, httponly=True, samesite="strict")
         return answer
 
     def file(self, request: Request) -> Response:
         name = request.url.path.removeprefix("/")
-        return Response(read_package_file(name, _PACKAGE), media_type=_FILES[request.url.path])
+        return Response(read_package_file(f"page/{name}", _PACKAGE), media_type=_FILES[request.url.path])
 
     def report(self, request: Request) -> Response:
         """Answer with a page of results, which is of no origin and so cannot reach this one."""

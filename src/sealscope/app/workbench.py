@@ -360,10 +360,10 @@ class Workbench:
         return {"map": proposed, "groups": groups, "problem": problem}
 
     def table(self, kind: str, key: str, name: str = "", stated_time: str | None = None) -> MappedTable:
-        """Open a table of a log: its "columns", the "channels" of a machine, or its "balance" of volumes."""
+        """Open a table of a log: its "columns", the "channels" of a machine, or its "balance" of flows or "volumes"."""
         path = self.find_log(key)
         machine = self.folder.read().find_machine(name) if name else SessionMachine(name="machine")
-        stamp = f"{kind}|{file_stamp(path)}"
+        stamp = f"{'balance' if kind == 'volumes' else kind}|{file_stamp(path)}"
 
         def read() -> Recording:
             return read_for(machine, path)
@@ -376,11 +376,11 @@ class Workbench:
         elif kind == "channels":
             source = channels_source(read)
             stamp += f"|{machine.channel_map}|{machine.rate}"
-        elif kind == "balance":
+        elif kind in ("balance", "volumes"):
             source = balance_source(read, machine.build_rig())
             stamp += f"|{machine.channel_map}|{machine.rate}|{machine.rig}|{machine.area}|{machine.displacement}"
         else:
-            raise InputError(f"a table must be columns, channels or balance, got {kind[:40]!r}")
+            raise InputError(f"a table must be columns, channels, balance or volumes, got {kind[:40]!r}")
         return self.cache.open(stamp, source, _WAIT_S)
 
     def window(

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
+from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.inference.balance import (
     CLIPPED_DIFFERENCE,
     HOLE,
@@ -77,7 +78,7 @@ def compute_flow_curves(recording: Recording, rig: Rig | None = None) -> FlowCur
     """
     part = inspect_recording(recording).part
     detector = VolumeBalance(assumed_rig(rig, recording)[0])
-    with np.errstate(all="ignore"):
+    with limit_threads(), np.errstate(all="ignore"):
         if detector.usable(part) is not None or (balance := detector.balance(part)) is None:
             return None
         equation, roles, blocks = balance.equations[0], balance.columns[0], balance.blocks

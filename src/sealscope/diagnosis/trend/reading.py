@@ -14,6 +14,7 @@ import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.detector import unusable_reason
+from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
@@ -99,7 +100,7 @@ def estimate_reading(
     )
     if reading.problem:
         return reading
-    with np.errstate(all="ignore"):  # numbers of impossible readings may overflow
+    with limit_threads(), np.errstate(all="ignore"):  # numbers of impossible readings may overflow
         reading = replace(reading, **_estimate_level(part, used_rig, machine))
     if reading.basis is not None and not np.isfinite([reading.level, reading.error]).all():
         return replace(reading, basis=None, problem=f"the {reading.basis} states no finite level")

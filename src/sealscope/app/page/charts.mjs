@@ -1,0 +1,311 @@
+// Charts over time: a labelled figure whose window is asked of the server, with a cursor by arrow keys, a spoken
+// reading and a table of what is seen; and a plot of single results over dates.
+import { make, drawn } from "./main.mjs";
+
+const digits = (value) => (value === null || value === undefined || Number.isNaN(value) ? "–" : String(Number(value.toPrecision(4))).replace("-", "−"));
+const seconds = (t) => `${Number(t.toFixed(4))} s`;
+
+// charts whose time axes move together
+export class Linked {
+  constructor() {
+    this.charts = [];
+    this.begin = null;
+    this.end = null;
+    this.first = 0;
+    this.last = 1;
+    this.waiting = 0;
+  }
+
+  move(begin, end) {
+    const shortest = Math.max(1e-6, (this.last - this.first) * 1e-9);
+    const length = Math.min(Math.max(end - begin, shortest), this.last - this.first);
+    this.begin = Math.min(Math.max(begin, this.first), this.last - length);
+    this.end = this.begin + length;
+    for (const chart of this.charts) chart.place(this.begin, this.end);
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(() => this.charts.forEach((chart) => chart.load()), 60);
+  }
+
+  whole() {
+    this.move(this.first, this.last);
+  }
+
+  zoom(factor, at = (this.begin + this.end) / 2) {
+    this.move(at - (at - this.begin) * factor, at + (this.end - at) * factor);
+  }
+
+  pan(share) {
+    const step = share * (this.end - this.begin);
+    this.move(this.begin + step, this.end + step);
+  }
+
+  close() {
+    for (const chart of this.charts.splice(0)) chart.close();
+  }
+}
+
+// options: title, unit, lines [{name, colour, column, dash}], fetch(begin, end, pixels), marks [{t, label}],
+// shades [[begin, end, weight]], level {value, label}, height
+export class Trace {
+  constructor(place, link, options) {
+    Object.assign(this, { link, options, data: null, plot: null, cursor: null });
+    link.charts.push(this);
+    this.key = make("span", { class: "keys" });
+    const tool = (text, label, work) => make("button", { type: "button", text, "aria-label": `${label}: ${options.title}`, title: label, onclick: work });
+    this.tools = make("span", { class: "tools" },
+      tool("◀", "earlier", () => link.pan(-0.5)), tool("▶", "later", () => link.pan(0.5)),
+      tool("+", "closer", () => link.zoom(0.5)), tool("−", "farther", () => link.zoom(2)), tool("whole", "whole recording", () => link.whole()));
+    const help = "Left and right arrow move the cursor, with Shift the window, plus and minus zoom, 0 shows the whole.";
+    this.box = make("div", { class: "plot", tabindex: "0", role: "group", "aria-roledescription": "chart", "aria-label": `${options.title}, ${options.unit}. ${help}` });
+    this.reading = make("p", { class: "reading", role: "status", "aria-live": "polite" });
+    this.table = make("details", {}, make("summary", { text: "Table of what is seen" }), make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Table: ${options.title}` }));
+    this.table.addEventListener("toggle", () => this.fillTable());
+    this.figure = make("figure", { class: "trace" }, make("figcaption", {}, make("span", { text: options.title }), this.key, this.tools), this.box, this.reading, this.table);
+    place.append(this.figure);
+    this.box.addEventListener("keydown", (event) => this.press(event));
+    this.watcher = new ResizeObserver(() => this.resize());
+    this.watcher.observe(this.box);
+    this.ready = this.load();
+  }
+
+  get width() {
+    return Math.max(240, this.box.clientWidth || 240);
+  }
+
+  async load() {
+    const asked = (this.asked = Symbol());
+    let data;
+    try {
+      data = await this.options.fetch(this.link.begin, this.link.end, Math.round(this.width));
+    } catch (error) {
+      this.reading.textContent = error.message;
+      return;
+    }
+    if (asked !== this.asked) return;
+    if (data.error && !data.t.length) {
+      this.reading.textContent = data.error;
+      return;
+    }
+    this.data = data;
+    if (!this.options.lines.length) return;
+    this.link.first = Math.min(data.first, this.link.begin === null ? data.first : this.link.first);
+    this.link.last = Math.max(data.last, this.link.begin === null ? data.last : this.link.last);
+    const following = this.link.begin === null || this.partial;
+    this.partial = data.complete === false;
+    if (following && !this.partial) Object.assign(this.link, { begin: data.first, end: data.last });
+    if (following && this.partial) Object.assign(this.link, { begin: data.first, end: data.last, last: data.last });
+    this.draw();
+    if (this.partial) {
+      this.reading.textContent = `reading: ${data.count} rows so far`;
+      this.again = setTimeout(() => this.load(), 300);
+    }
+  }
+
+  draw() {
+    const { options, data, link } = this;
+    const rows = [data.t, ...options.lines.map((line) => data.lines[line.column])];
+    const tone = colour("--ink");
+    if (this.plot && this.tone === tone) {
+      this.plot.setData(rows, false);
+      this.place(link.begin, link.end);
+    } else {
+      if (this.plot) this.plot.destroy();
+      this.tone = tone;
+      const grid = { stroke: colour("--line"), width: 1 };
+      const axis = { stroke: colour("--quiet"), grid, ticks: grid, font: "12px system-ui" };
+      this.plot = new uPlot(
+        {
+          width: this.width,
+          height: options.height || 190,
+          legend: { show: false },
+          scales: { x: { time: false, range: () => [link.begin, link.end] }, y: { range: (plot, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.06, true)) } },
+          axes: [{ ...axis, size: 28, values: (plot, at) => at.map(seconds) }, { ...axis, size: 62, values: (plot, at) => at.map(digits) }],
+          series: [{}, ...options.lines.map((line) => ({ label: line.name, stroke: colour(line.colour), width: line.width || 1.2, dash: line.dash, spanGaps: false, points: { show: false } }))],
+          cursor: { sync: { key: "evidence", scales: ["x", null] }, drag: { x: true, y: false, setScale: false } },
+          hooks: {
+            drawClear: [(plot) => this.shade(plot)],
+            draw: [(plot) => this.markOver(plot)],
+            setCursor: [(plot) => this.read(plot.cursor.idx)],
+            setSelect: [(plot) => {
+              if (plot.select.width < 4) return;
+              const [begin, end] = [plot.select.left, plot.select.left + plot.select.width].map((x) => plot.posToVal(x, "x"));
+              plot.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+              link.move(begin, end);
+            }],
+          },
+        },
+        rows,
+        this.box,
+      );
+      this.key.replaceChildren(...options.lines.map((line) => {
+        const sample = make("i");
+        sample.style.borderTopColor = colour(line.colour);
+        if (line.dash) sample.style.borderTopStyle = "dashed";
+        return make("span", { class: "key" }, sample, make("span", { text: line.name }));
+      }));
+    }
+    this.fillTable();
+  }
+
+  place(begin, end) {
+    if (this.plot) this.plot.setScale("x", { min: begin, max: end });
+  }
+
+  shade(plot) {
+    const { left, top, width, height } = plot.bbox;
+    const context = plot.ctx;
+    context.save();
+    context.beginPath();
+    context.rect(left, top, width, height);
+    context.clip();
+    context.fillStyle = colour("--total");
+    const most = Math.max(...(this.options.shades || []).map((shade) => shade[2]), 1e-12);
+    for (const [begin, end, weight] of this.options.shades || []) {
+      context.globalAlpha = 0.22 * (weight / most) ** 2;
+      const x = plot.valToPos(begin, "x", true);
+      context.fillRect(x, top, Math.max(1, plot.valToPos(end, "x", true) - x), height);
+    }
+    context.restore();
+  }
+
+  markOver(plot) {
+    const { left, top, width, height } = plot.bbox;
+    const context = plot.ctx;
+    context.save();
+    context.strokeStyle = context.fillStyle = colour("--leak");
+    context.lineWidth = 1.5 * devicePixelRatio;
+    context.font = `${11 * devicePixelRatio}px system-ui`;
+    (this.options.marks || []).forEach((mark, k) => {
+      const x = plot.valToPos(mark.t, "x", true);
+      if (!(x >= left && x <= left + width)) return;
+      context.setLineDash([5, 4]);
+      context.beginPath();
+      context.moveTo(x, top);
+      context.lineTo(x, top + height);
+      context.stroke();
+      const wide = x + 4 + context.measureText(mark.label).width > left + width;
+      context.textAlign = wide ? "right" : "left";
+      context.fillText(mark.label, x + (wide ? -4 : 4), top + (12 + 13 * (k % 5)) * devicePixelRatio);
+    });
+    const level = this.options.level;
+    if (level) {
+      const y = plot.valToPos(level.value, "y", true);
+      if (y >= top && y <= top + height) {
+        context.setLineDash([9, 5]);
+        context.beginPath();
+        context.moveTo(left, y);
+        context.lineTo(left + width, y);
+        context.stroke();
+        context.textAlign = "right";
+        context.fillText(level.label, left + width - 4, y - 4);
+      }
+    }
+    context.restore();
+  }
+
+  read(index) {
+    if (index === null || index === undefined || !this.data) return;
+    this.cursor = index;
+    const values = this.options.lines.map((line) => `${line.name} ${digits(this.data.lines[line.column][index])}`);
+    this.reading.textContent = `${seconds(this.data.t[index])}: ${values.join(", ")} ${this.options.unit}`;
+  }
+
+  press(event) {
+    if (!this.plot || !this.data) return;
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (step && event.shiftKey) this.link.pan(0.25 * step);
+    else if (step) {
+      const t = this.data.t;
+      const inside = (index) => t[index] >= this.link.begin && t[index] <= this.link.end;
+      let index = (this.cursor ?? (step > 0 ? -1 : t.length)) + step * (event.ctrlKey ? 20 : 1);
+      if (!inside(index)) index = step > 0 ? t.findIndex((value) => value >= this.link.begin) : t.findLastIndex((value) => value <= this.link.end);
+      if (index < 0) return;
+      this.plot.setCursor({ left: this.plot.valToPos(t[index], "x"), top: 20 });
+      this.read(index);
+    } else if (event.key === "+" || event.key === "=") this.link.zoom(0.5, this.at());
+    else if (event.key === "-") this.link.zoom(2, this.at());
+    else if (event.key === "0" || event.key === "Home") this.link.whole();
+    else return;
+    event.preventDefault();
+  }
+
+  at() {
+    const t = this.cursor === null ? null : this.data.t[this.cursor];
+    return t === null || t < this.link.begin || t > this.link.end ? undefined : t;
+  }
+
+  fillTable() {
+    if (!this.table.open || !this.data) return;
+    const { t, lines } = this.data;
+    const step = Math.max(1, Math.ceil(t.length / 200));
+    const head = make("tr", {}, make("th", { scope: "col", text: "t [s]" }), ...this.options.lines.map((line) => make("th", { scope: "col", text: `${line.name} [${this.options.unit}]` })));
+    const body = [];
+    for (let k = 0; k < t.length; k += step) body.push(make("tr", {}, make("td", { text: digits(t[k]) }), ...this.options.lines.map((line) => make("td", { text: digits(lines[line.column][k]) }))));
+    this.table.lastChild.replaceChildren(make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
+  }
+
+  resize() {
+    clearTimeout(this.sizing);
+    this.sizing = setTimeout(() => {
+      if (this.plot && this.box.clientWidth && this.plot.width !== this.width) this.plot.setSize({ width: this.width, height: this.plot.height });
+    }, 80);
+  }
+
+  close() {
+    this.asked = null;
+    clearTimeout(this.again);
+    this.watcher.disconnect();
+    if (this.plot) this.plot.destroy();
+    this.figure.remove();
+  }
+}
+
+// single results over dates; points: {t, value, low, high, bound, label, leak, chosen, go}; options: title, unit, limit,
+// log, join, repairs, lines of several machines by `series`
+export function dotPlot(points, options) {
+  const width = Math.max(330, Math.min(1400, document.querySelector("main").clientWidth - 34)), height = width < 600 ? 240 : 270, left = 62, right = 14, top = 14, bottom = 34;
+  const known = points.filter((point) => point.t !== null && point.t !== undefined && (point.value ?? point.bound) !== null);
+  const svg = drawn("svg", { class: "dots", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `${options.title}, ${options.unit}` });
+  if (!known.length) return make("p", { class: "quiet", text: options.empty || "Nothing to draw yet." });
+  const times = [...known.map((point) => point.t), ...(options.repairs || [])];
+  const margin = (Math.max(...times) - Math.min(...times)) * 0.04 || 43200;
+  const [begin, end] = [Math.min(...times) - margin, Math.max(...times) + margin];
+  const levels = known.flatMap((point) => [point.value, point.high, point.bound].filter((value) => value !== null && value !== undefined));
+  const limit = options.limit ?? null;
+  const highest = Math.max(...levels, limit ?? 0, 1e-9) * 1.12;
+  const positive = levels.filter((value) => value > 0);
+  const lowest = options.log ? Math.min(...(positive.length ? positive : [highest / 100]), limit || highest) / 2 : Math.min(0, ...known.map((point) => point.low ?? 0));
+  const x = (t) => left + ((t - begin) / (end - begin)) * (width - left - right);
+  const scale = (value) => (options.log ? Math.log(Math.max(value, lowest) / lowest) / Math.log(highest / lowest) : (value - lowest) / (highest - lowest));
+  const y = (value) => height - bottom - scale(value) * (height - top - bottom);
+  const text = (value, at, down, anchor, kind) => {
+    const made = drawn("text", { x: at, y: down, "text-anchor": anchor, class: kind });
+    made.textContent = value;
+    return made;
+  };
+  const ticks = options.log ? [0, 0.25, 0.5, 0.75, 1].map((share) => lowest * (highest / lowest) ** share) : [0, 0.25, 0.5, 0.75, 1].map((share) => lowest + share * (highest - lowest));
+  for (const tick of ticks) svg.append(drawn("path", { class: "axis", d: `M${left} ${y(tick)}H${width - right}` }), text(digits(Number(tick.toPrecision(2))), left - 6, y(tick) + 4, "end"));
+  for (const share of [0, 0.5, 1]) svg.append(text(isoTime(begin + share * (end - begin), true).slice(0, 10), left + share * (width - left - right), height - 10, ["start", "middle", "end"][share * 2]));
+  svg.append(text(options.unit, left, 11, "start"));
+  if (limit !== null) svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${width - right}` }), text(`limit ${digits(limit)}`, width - right, y(limit) - 5, "end", "limit-text"));
+  for (const t of options.repairs || []) svg.append(drawn("path", { class: "repair", d: `M${x(t)} ${top}V${height - bottom}` }), text("repair", x(t) + 4, top + 10, "start"));
+  const ordered = [...known].sort((a, b) => a.t - b.t);
+  if (options.join) {
+    const steps = ordered.slice(1).map((point, k) => point.t - ordered[k].t).sort((a, b) => a - b);
+    const gap = 4 * (steps[Math.floor(steps.length / 2)] || Infinity);
+    const path = ordered.map((point, k) => `${k && point.t - ordered[k - 1].t <= gap ? "L" : "M"}${x(point.t).toFixed(1)} ${y(point.value ?? point.bound).toFixed(1)}`).join("");
+    svg.append(drawn("path", { class: "line", d: path }));
+  }
+  for (const point of ordered) {
+    const at = x(point.t), level = point.value ?? point.bound;
+    const link = drawn(point.go ? "a" : "g", point.go ? { href: point.go, "aria-label": point.label, class: point.chosen ? "chosen" : "" } : { role: "img", "aria-label": point.label });
+    const title = drawn("title");
+    title.textContent = point.label;
+    link.append(title);
+    if (point.low !== null && point.low !== undefined) link.append(drawn("path", { class: `bar ${point.leak ? "leak" : ""}`, d: `M${at} ${y(point.low)}V${y(point.high)}` }));
+    if (point.value === null || point.value === undefined) link.append(drawn("path", { class: "dot bound", d: `M${at - 7} ${y(level)}H${at + 7}M${at} ${y(level)}v14m-4 -5l4 5l4 -5` }));
+    else link.append(drawn("circle", { class: `dot ${point.leak ? "leak" : ""}`, cx: at, cy: y(level), r: 6.5 }));
+    svg.append(link);
+  }
+  return svg;
+}
