@@ -21,10 +21,10 @@ class Cancelled(Exception):  # noqa: N818 - no error
 
 
 class Job:
-    """A piece of work: `kind` and `about` name it, `done` of `total` steps are done, `state` says how it goes."""
+    """A piece of work: `kind` and `subject` name it, `done` of `total` steps are done, `state` says how it goes."""
 
-    def __init__(self, number: int, kind: str, about: str, work: Callable[[Job], Any]) -> None:
-        self.number, self.kind, self.about, self._work = number, kind, about, work
+    def __init__(self, number: int, kind: str, subject: str, work: Callable[[Job], Any]) -> None:
+        self.number, self.kind, self.subject, self._work = number, kind, subject, work
         self.done, self.total, self.note = 0, 0, ""
         self.state, self.error = "waiting", ""
         self._cancelled = threading.Event()
@@ -59,7 +59,7 @@ class Job:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the job's progress as plain values for JSON."""
-        names = ("number", "kind", "about", "done", "total", "note", "state", "error")
+        names = ("number", "kind", "subject", "done", "total", "note", "state", "error")
         return {name: getattr(self, name) for name in names}
 
 
@@ -73,10 +73,10 @@ class JobQueue:
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
-    def submit(self, kind: str, about: str, work: Callable[[Job], Any]) -> Job:
+    def submit(self, kind: str, subject: str, work: Callable[[Job], Any]) -> Job:
         """Append a job; `work` is called with it."""
         with self._wake:
-            job = Job(next(self._numbers), kind, about, work)
+            job = Job(next(self._numbers), kind, subject, work)
             self._waiting.append(job)
             self._jobs.append(job)
             ended = [other for other in self._jobs if other.state not in ("waiting", "running")]

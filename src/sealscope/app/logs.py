@@ -179,9 +179,9 @@ def columns_source(path: Path, time: str | None, rate: float | None) -> Source:
 
     def iter_parts() -> Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]:
         for fields in iter_columns(path, time=time, rate=rate, rows=PART_ROWS):
-            about = {"rate": fields.rate, "format": fields.kind, "notes": list(fields.history)[:40]}
-            about["start_s"] = fields.provenance.get("start_epoch_s")
-            yield list(fields.channels), to_plain(about), fields.t, list(fields.channels.values())
+            details = {"rate": fields.rate, "format": fields.kind, "notes": list(fields.history)[:40]}
+            details["start_s"] = fields.provenance.get("start_epoch_s")
+            yield list(fields.channels), to_plain(details), fields.t, list(fields.channels.values())
 
     return iter_parts
 
@@ -211,7 +211,7 @@ def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
         duration = max(float(curves.t[-1] - curves.t[0]), 1e-9)
         mean = float(np.abs(np.diff(curves.delivered)).sum()) / duration  # [m^3/s]
         scale = 1.0 / (60.0 * LITRE_PER_MINUTE) if curves.states_flow else 100.0 / 60.0 / max(mean, 1e-30)
-        about = {
+        details = {
             "unit": "L/min" if curves.states_flow else "% of the pump's flow",
             "source": curves.source,
             "blocks": np.round(curves.blocks, 4).tolist(),
@@ -222,7 +222,7 @@ def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
         names = [curves.source, *curves.parts]
         yield (
             names,
-            to_plain(about),
+            to_plain(details),
             curves.t,
             [scale * values for values in (curves.delivered, *curves.parts.values())],
         )

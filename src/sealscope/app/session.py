@@ -63,7 +63,7 @@ class ReachedVerdict:
 
 @dataclass(frozen=True, kw_only=True)
 class SessionMachine:
-    """What is stated of a machine, by the texts of the command line's options, and its recordings by their keys.
+    """A machine of a session: what is stated of it, as texts of the command line's options, and its recordings' keys.
 
     `map` has the column of each channel, "auto" for the entry "*"; `bore`, `rod` and `rods` (the sides with a rod) are
     kept to be shown again: `area` follows from them. `repairs`: dates.
@@ -114,8 +114,8 @@ class SessionMachine:
 
     def keep_verdict(self, verdict: ReachedVerdict) -> SessionMachine:
         """Return the machine with a verdict in place of an earlier one on the same recording."""
-        others = [other for other in self.verdicts if other.file != verdict.file]
-        return replace(self, verdicts=(*others, verdict))
+        verdicts = [other for other in self.verdicts if other.file != verdict.file]
+        return replace(self, verdicts=(*verdicts, verdict))
 
 
 @dataclass(frozen=True, kw_only=True)

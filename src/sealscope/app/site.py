@@ -107,7 +107,7 @@ def _find_refusal(guard: LaunchGuard, request: Request) -> Response | None:
 
 def make_site(workbench: Workbench, guard: LaunchGuard) -> Starlette:
     """Build the web application of a workbench."""
-    pages = _Pages(workbench, guard)
+    pages = _Screens(workbench, guard)
     routes = [
         Route("/", pages.page),
         Route("/start", pages.start),
@@ -135,7 +135,7 @@ def make_site(workbench: Workbench, guard: LaunchGuard) -> Starlette:
     return Starlette(routes=routes, middleware=middleware)
 
 
-class _Pages:
+class _Screens:
     """The request handlers of the page."""
 
     def __init__(self, workbench: Workbench, guard: LaunchGuard) -> None:
@@ -187,7 +187,7 @@ class _Pages:
         """Append the body to a dropped file. Query: `name`, `size`, `offset`; status 409 for another offset."""
         try:
             name, size = _name_and_size(request)
-            offset = _whole(request, "offset")
+            offset = _parse_whole(request, "offset")
             data = await read_body(request, _MAX_PIECE)
             if offset != (known := self._bench.received(name, size)):
                 return _answer({"error": f"the next piece begins at {known}", "offset": known}, 409)
@@ -254,10 +254,10 @@ class _Query:
 
 
 def _name_and_size(request: Request) -> tuple[str, int]:
-    return request.query_params.get("name", ""), _whole(request, "size")
+    return request.query_params.get("name", ""), _parse_whole(request, "size")
 
 
-def _whole(request: Request, name: str) -> int:
+def _parse_whole(request: Request, name: str) -> int:
     text = request.query_params.get(name, "")
     if not (text.isascii() and text.isdigit() and len(text) < 16):
         raise InputError(f"{name} must be a whole number, got {text[:40]!r}")

@@ -42,13 +42,13 @@ def cache_folder() -> Path:
 class MappedTable:
     """Columns of numbers over time in a folder, of which `count` rows are written so far.
 
-    `about`: what the reader says of the file, as plain values; `names`: headings of the columns; `error`: why reading
+    `details`: what the reader says of the file, as plain values; `names`: headings of the columns; `error`: why reading
     ended early; `complete`: True once all rows are written; `begun`: set once there are rows, or an error.
     """
 
     folder: Path
     names: list[str] = field(default_factory=list)
-    about: dict[str, Any] = field(default_factory=dict)
+    details: dict[str, Any] = field(default_factory=dict)
     count: int = 0
     complete: bool = False
     error: str = ""
@@ -74,7 +74,7 @@ class MappedTable:
 
     def finish(self) -> None:
         """Write the index, which makes the table complete for later processes."""
-        index = {"names": self.names, "about": self.about, "count": self.count}
+        index = {"names": self.names, "details": self.details, "count": self.count}
         with atomic_write(self.folder / _INDEX) as temporary:
             temporary.write_text(json.dumps(index), encoding="utf-8")
         self.complete = True
@@ -144,7 +144,7 @@ def reduce_extremes(values: Array, start: int, stop: int, size: int) -> tuple[Ar
     return low, high
 
 
-#: Function that yields the parts of a table: names and `about`, times, and values of each column.
+#: Function that yields the parts of a table: names and `details`, times, and values of each column.
 Source = Callable[[], Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]]
 
 
@@ -184,7 +184,7 @@ class TableCache:
         folder = self._folder / digest
         try:
             index = json.loads((folder / _INDEX).read_text(encoding="utf-8"))
-            table = MappedTable(folder, index["names"], index["about"], index["count"], complete=True)
+            table = MappedTable(folder, index["names"], index["details"], index["count"], complete=True)
             for number in range(-1, len(table.names)):
                 table.column(number)
             table.begun.set()
@@ -211,8 +211,8 @@ class TableCache:
     def _fill(self, table: MappedTable, folder: Path, source: Source) -> None:
         """Write the rows of a source to a table; an error becomes the table's `error`."""
         try:
-            for names, about, t, columns in source():
-                table.names, table.about = list(names), dict(about)
+            for names, details, t, columns in source():
+                table.names, table.details = list(names), dict(details)
                 table.append(t, columns)
                 table.begun.set()
             table.finish()

@@ -246,7 +246,7 @@ class Workbench:
         return folder / name, folder / f".{name}.{size}.part"
 
     def received(self, name: str, size: int) -> int:
-        """Return how many bytes of a dropped file have come, from where it goes on."""
+        """Count the bytes of a dropped file that have come."""
         target, part = self._part_of(name, size)
         if target.exists() and target.stat().st_size == size and not part.exists():
             return size
@@ -277,23 +277,23 @@ class Workbench:
 
     def preview(self, key: str, layout: Mapping[str, Any]) -> dict[str, Any]:
         """Show the first lines of a log, and how they are read with a stated layout."""
-        preview = preview_text(self.folder.folder / self._known(key), StatedLayout(**layout))
+        preview = preview_text(self.folder.folder / self._check_log(key), StatedLayout(**layout))
         return to_plain(preview)  # type: ignore[no-any-return]
 
-    def _known(self, key: str) -> str:
+    def _check_log(self, key: str) -> str:
         self.find_log(key)
         return key
 
     def mend_log(self, key: str, layout: Mapping[str, Any]) -> int:
         """Rewrite a log with a stated layout, and use the new file in place of the log."""
-        source = self.folder.folder / self._known(key)
+        source = self.folder.folder / self._check_log(key)
         folder = self.folder.folder / MENDED
         make_folder(folder)
         stated = asdict(StatedLayout(**layout))
         target = folder / f"{Path(key).stem[:150]}.csv"
-        others = {log.target for log in self.folder.read().mended if log.file != key}
+        used_targets = {log.target for log in self.folder.read().mended if log.file != key}
         for number in itertools.count(2):
-            if self.folder.key_of(target) not in others:
+            if self.folder.key_of(target) not in used_targets:
                 break
             target = folder / f"{Path(key).stem[:150]} ({number}).csv"
         n_rows = mend(source, target, **stated)
@@ -395,13 +395,13 @@ class Workbench:
     ) -> dict[str, Any]:
         """Return a window of a table (`MappedTable.window`), of the flows in a balance as means, with its headings."""
         table = self.table(kind, key, name)
-        about: dict[str, Any] = {"names": table.names, "about": table.about, "complete": table.complete}
-        about |= {"error": table.error, "count": table.count}
+        state: dict[str, Any] = {"names": table.names, "about": table.details, "complete": table.complete}
+        state |= {"error": table.error, "count": table.count}
         if any(not 0 <= index < len(table.names) for index in indices):
             raise InputError(f"a column must be one of {len(table.names)}, got {max(indices)}")
         if kind == "balance":
-            return mean_rates(table, indices, begin, end, pixels, _FLOW_S) | about
-        return table.window(indices, begin, end, pixels) | about
+            return mean_rates(table, indices, begin, end, pixels, _FLOW_S) | state
+        return table.window(indices, begin, end, pixels) | state
 
     def describe_channels(self, name: str, key: str) -> dict[str, Any]:
         """Describe a log as read by a machine's map: channels with their units, findings, duty and history."""
@@ -417,7 +417,7 @@ class Workbench:
         return row
 
     def draw_machine(self, name: str, channels: Sequence[str]) -> str:
-        """Draw the machine as SVG, with the sizes that are stated, and the given channels as recorded."""
+        """Draw the machine as SVG, with its stated sizes and its recorded `channels`."""
         machine = self.folder.read().find_machine(name)
         rig = machine.build_rig()
         if rig is None or states_rig(rig):
@@ -490,7 +490,7 @@ class Workbench:
             return self._machines[name]
 
     def learnt(self, name: str) -> dict[str, Any]:
-        """Say what was learnt of a machine: its text, the smallest leak, the problems, and which days stand out."""
+        """Return the summary of a commissioned machine: its text, the smallest leak, and the days that stand out."""
         machine = self.machine(name)
         if machine is None:
             return {"known": False}
@@ -647,17 +647,17 @@ class Workbench:
             {"file": p.file, "start": p.start, "value": p.value, "low": p.low, "high": p.high, "note": p.note}
             for p in result.points
         ]
-        about: dict[str, Any] = {
+        figures: dict[str, Any] = {
             "unit": result.unit,
             "limit": result.limit,
             "verdict": result.verdict,
             "reason": result.reason,
         }
-        about |= {"next": result.next_check, "state": result.state, "pressure": result.pressure}
+        figures |= {"next": result.next_check, "state": result.state, "pressure": result.pressure}
         repairs = [*stated.repairs]
-        seen = [p.start for p in result.repairs]
+        found = [p.start for p in result.repairs]
         return to_plain(  # type: ignore[no-any-return]
-            {"known": True, "points": points, "recorded": recorded, "repairs": repairs, "seen": seen} | about
+            {"known": True, "points": points, "recorded": recorded, "repairs": repairs, "seen": found} | figures
         )
 
     def write_trend(self, name: str) -> str:

@@ -33,7 +33,7 @@ from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array, Recording
 
 #: Part of the balance that a term belongs to, by the kind of its coefficient; others are `other`.
-_PARTS = {"motion": "piston", "compliance": "compression", "air": "compression", "edge": "valve", "piston": "leak"}
+_PARTS = {"motion": "piston", "compliance": "compression", "air": "compression", "edge": "valve", "piston": "leakage"}
 
 
 class FlowCurves(NamedTuple):
@@ -49,8 +49,8 @@ class FlowCurves(NamedTuple):
     source : {"pump", "piston", "creep"}
         Which of these it is.
     parts : mapping of str to array of float, shape (n,)
-        Volumes of the terms since the first sample [m^3]: "piston", "valve", "compression", "leak" and "other", as far
-        as the balance has them, and "residual". Their sum is `delivered`.
+        Volumes of the terms since the first sample [m^3]: "piston", "valve", "compression", "leakage" and "other",
+        as far as the balance has them, and "residual". Their sum is `delivered`.
     blocks : array of float, shape (k, 3)
         Begin and end [s] of each block, and the fraction of the information on the leakage that it carries.
     states_flow : bool

@@ -33,7 +33,7 @@ _MAX_LINE, _MAX_CELLS = 2**20, 4096
 
 @dataclass(frozen=True)
 class StatedLayout:
-    """What a person states of a text log's layout; None for what is detected.
+    """Layout of a text log as stated by a person; None for values that are detected.
 
     - `first_row`: number of the line of the first sample, from 1; `heading_row`: that of the headings, by default the
       last line before the first row that has as many cells; 0 if there are no headings;
@@ -196,7 +196,7 @@ def mend(
     time_format: str | None = None,
     time_column: int = 1,
 ) -> int:
-    r"""Rewrite a text log as a plain CSV file, with the layout that a person states where the detected one is wrong.
+    r"""Rewrite a text log as a plain CSV file, with a stated layout where the detected one is wrong.
 
     Parameters
     ----------

@@ -284,7 +284,7 @@ export function dotPlot(points, options) {
     return made;
   };
   const ticks = options.log ? [0, 0.25, 0.5, 0.75, 1].map((share) => lowest * (highest / lowest) ** share) : [0, 0.25, 0.5, 0.75, 1].map((share) => lowest + share * (highest - lowest));
-  for (const tick of ticks) svg.append(drawn("path", { class: "axis", d: `M${left} ${y(tick)}H${width - right}` }), text(digits(Number(tick.toPrecision(2))), left - 6, y(tick) + 4, "end"));
+  for (const tick of ticks) svg.append(drawn("path", { class: "axis", d: `M${left} ${y(tick)}H${width - right}` }), text(Math.abs(tick) < 0.004 * highest && !options.log ? "0" : digits(Number(tick.toPrecision(2))), left - 6, y(tick) + 4, "end"));
   for (const share of [0, 0.5, 1]) svg.append(text(isoTime(begin + share * (end - begin), true).slice(0, 10), left + share * (width - left - right), height - 10, ["start", "middle", "end"][share * 2]));
   svg.append(text(options.unit, left, 11, "start"));
   if (limit !== null) svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${width - right}` }), text(`limit ${digits(limit)}`, width - right, y(limit) - 5, "end", "limit-text"));

@@ -145,10 +145,10 @@ function showJobs() {
     ...busy.map((job) => {
       const bar = make("progress", { max: Math.max(1, job.total), "aria-label": `progress: ${job.kind}` });
       if (job.state === "running") bar.value = job.done;
-      const text = `${job.kind} ${job.about}: ${job.state === "waiting" ? "waits" : `${job.done} of ${job.total} ${job.note}`}`;
+      const text = `${job.kind} ${job.subject}: ${job.state === "waiting" ? "waits" : `${job.done} of ${job.total} ${job.note}`}`;
       return make("div", {}, bar, make("span", { text }), make("button", { type: "button", class: "small", text: "Cancel", onclick: () => attempt(() => tell("cancel", { number: job.number, kind: job.kind })) }));
     }),
-    ...ended.map((job) => make("div", { class: "bad", text: `${job.kind} ${job.about}: ${job.error}` })),
+    ...ended.map((job) => make("div", { class: "bad", text: `${job.kind} ${job.subject}: ${job.error}` })),
   );
 }
 

@@ -2,7 +2,7 @@
 import { app, ask, attempt, dateOf, ensureMachine, fillSelect, go, machineNow, make, rowsRead, say, tell } from "./main.mjs";
 import { Linked, Trace, dotPlot } from "./charts.mjs";
 
-const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--ink", piston: "--total", creep: "--ink", valve: "--d1", compression: "--compression", leak: "--leak", other: "--other", residual: "--residual" };
+const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--ink", piston: "--total", creep: "--ink", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
 let link = new Linked();
 let result = null;
 let drawnFor = "";
@@ -23,11 +23,11 @@ export async function update() {
   byId("judge").disabled = !others.length;
   byId("judge").onclick = () => attempt(() => tell("judge", { machine: machine.name, files: others.map((row) => row.key) }));
   fillSelect(byId("verdict-file"), rows.map((row) => [row.key, `${row.name}${verdicts.has(row.key) ? `: ${verdicts.get(row.key).summary || verdicts.get(row.key).verdict}` : ""}`]), app.file);
-  showDates(machine, verdicts, rows);
   const key = app.file;
   const answer = verdicts.has(key) ? await ask("verdict", { machine: machine.name, file: key }).catch((error) => say(error.message)) : { verdict: null };
   if (!answer || key !== app.file) return;
   result = answer.verdict;
+  showDates(machine, verdicts, rows);
   showHead(machine, verdicts.get(key), key);
   if (app.rows.get(key)?.state === "read") await draw(machine, key);
   byId("evidence").hidden = app.rows.get(key)?.state !== "read";
@@ -94,14 +94,24 @@ async function draw(machine, key) {
   const place = byId("evidence-charts");
   place.replaceChildren();
   const window = (table, columns, file = key, moved = 0) => (begin, end, pixels) => ask("window", { table, file, machine: machine.name, columns: columns.join(","), pixels, ...(begin === null ? {} : { from: begin - moved, to: end - moved }) });
-  const [head, flows] = await Promise.all([window("channels", [])(null, null, 10), window("balance", [])(null, null, 10)]);
+  const settled = async (table) => {
+    for (;;) {
+      const data = await window(table, [])(null, null, 10);
+      if (data.complete || data.error || drawnFor !== now) return data;
+      await new Promise((later) => setTimeout(later, 300));
+    }
+  };
+  place.append(make("p", { class: "quiet", text: "Reading the signals and balancing the volumes …" }));
+  const [head, flows] = await Promise.all([settled("channels"), settled("balance")]);
   if (drawnFor !== now) return;
+  place.replaceChildren();
+  Object.assign(link, { first: head.first, last: head.last, begin: head.first, end: head.last });
   const blocks = (flows.about && flows.about.blocks) || [];
   const marks = result && result.onset_s !== null ? [{ t: result.onset_s, label: "onset" }] : [];
   const columnOf = (name) => head.names.findIndex((text) => text.startsWith(`${name} [`));
   const unitOf = (name) => /\[(.*)\]$/.exec(head.names[columnOf(name)] || "")?.[1] || "";
   const add = (title, names, table, unit, columns, options = {}) => {
-    const lines = names.map((name, k) => ({ name, colour: TONES[name] || "--d3", column: k, width: ["leak", "pump"].includes(name) ? 2 : 1.2, dash: name === "piston" ? [7, 4] : undefined }));
+    const lines = names.map((name, k) => ({ name, colour: TONES[name] || "--d3", column: k, width: ["leakage", "pump"].includes(name) ? 2 : 1.2, dash: name === "piston" ? [7, 4] : undefined }));
     if (!overlay) return new Trace(place, link, { title, unit, lines, marks, shades: blocks, fetch: window(table, columns), ...options });
     const other = app.rows.get(overlay).name;
     const both = [...lines, ...lines.map((line) => ({ ...line, name: `${line.name} of ${other}`, dash: [4, 4], column: line.column + lines.length }))];
@@ -117,16 +127,10 @@ async function draw(machine, key) {
   if (flows.names.length) {
     const parts = flows.names;
     add(`Where the oil goes: ${parts[0]} = ${parts.slice(1).join(" + ")}`, parts.filter((name) => name !== "residual"), "balance", flows.about.unit, parts.map((name, k) => k).filter((k) => parts[k] !== "residual"), { height: 230 });
-    const leak = parts.indexOf("leak");
+    const leak = parts.indexOf("leakage");
     const rest = parts.indexOf("residual");
-    add("Leakage of pump and piston, and what no term explains", ["leak", "residual"], "balance", flows.about.unit, [leak, rest]);
-  } else place.append(make("p", { class: "quiet", text: flows.error || "The balance is being computed …" }));
-  if (!flows.names.length && !flows.error) setTimeout(() => {
-    if (drawnFor === now) {
-      drawnFor = "";
-      draw(machine, key);
-    }
-  }, 700);
+    add("Leakage of pump and piston, and what no term explains", ["leakage", "residual"], "balance", flows.about.unit, [leak, rest]);
+  } else place.append(make("p", { class: "quiet", text: flows.error }));
   if (result && result.course) {
     const { t, lpm, low, high } = result.course;
     const title = result.course.whole ? "Leakage estimated block by block" : "Leak since its onset, block by block";

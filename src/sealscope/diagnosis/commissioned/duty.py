@@ -17,7 +17,7 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR
 
 
-class Duty(NamedTuple):
+class MachineDuty(NamedTuple):
     """Figures of a recording's duty, None where they are not known.
 
     `oil_degC`: oil temperature; `load_bar`: mean of abs(p_A - p_B); `speed`: root mean square speed of the piston
@@ -33,7 +33,7 @@ class Duty(NamedTuple):
     minutes: float
 
 
-def measure_duty(recording: Recording) -> Duty:
+def measure_duty(recording: Recording) -> MachineDuty:
     """Measure the duty of a machine in a recording."""
     load = speed = moving = None
     unit = "mm/s"
@@ -55,7 +55,7 @@ def measure_duty(recording: Recording) -> Duty:
             speed = None if mean_square is None else scale * float(np.sqrt(mean_square))
             rests = find_rests(increments, recording.rate, max_rest_rate(increments, recording.rate))
             moving = float(1.0 - rests.mean())
-    return Duty(oil_temperature(recording), load, speed, unit, moving, recording.duration / 60.0)
+    return MachineDuty(oil_temperature(recording), load, speed, unit, moving, recording.duration / 60.0)
 
 
 def _mean(values: Array) -> float | None:
