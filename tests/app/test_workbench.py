@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.app.logs import find_groups
 from sealscope.app.scripts import write_script
 from sealscope.app.server import replay_session
 from sealscope.app.workbench import areas_of, to_point
 from sealscope.diagnosis.flow_curves import compute_flow_curves
 from sealscope.errors import InputError
-from sealscope.recordings.formats.headings.labels import Label
 
 from .conftest import settle, tell
 
@@ -185,12 +183,17 @@ def test_a_rod_must_be_thinner_than_the_bore() -> None:
         areas_of("36 mm", "63 mm", "B")
 
 
-def test_groups_of_actuators_are_kept_apart() -> None:
-    names = [
-        "t [s]",
-        *(f"{machine} {name}" for machine in ("Press 1", "Press 2") for name in ("pA [bar]", "pB [bar]", "x [mm]")),
-    ]
-    groups = find_groups([Label.parse(name) for name in names])
-    assert [group["name"] for group in groups] == ["Press 1", "Press 2"]
-    assert groups[1]["map"] == {"p_A": "Press 2 pA [bar]", "p_B": "Press 2 pB [bar]", "x": "Press 2 x [mm]"}
-    assert find_groups([Label.parse(name) for name in ("t [s]", "p_A [bar]", "p_B [bar]")]) == []
+def test_groups_of_actuators_are_kept_apart(bench, client, tmp_path: Path) -> None:
+    quantities = ("pA [bar]", "pB [bar]", "x [mm]")
+    heading = ",".join(["t [s]", *(f"Press {number} {quantity}" for number in (1, 2) for quantity in quantities)])
+    log = tmp_path / "two.csv"
+    log.write_text("\n".join([heading, *(f"{k / 100},{k},{k % 7},1,{2 * k},{k % 5},2" for k in range(500))]) + "\n")
+    tell(client, "open", path=str(log))
+    settle(bench)
+    tell(client, "machine", machine="press", values={})
+    groups = client.get("/api/proposal", params={"file": str(log), "machine": "press"}).json()["groups"]
+    assert len(groups) == 2
+    for number, group in enumerate(groups, 1):
+        tell(client, "machine", machine=f"press {number}", values={"map": {"*": "auto", "group": group}})
+        read = client.get("/api/channels", params={"file": str(log), "machine": f"press {number}"}).json()
+        assert read["channels"] == ["p_A", "p_B", "x"] and all(f"Press {number}" in c for c in read["columns"].values())

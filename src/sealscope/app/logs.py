@@ -21,7 +21,8 @@ from sealscope.diagnosis.flow_curves import FlowCurves, compute_flow_curves
 from sealscope.errors import SealscopeError, UnreadableFile
 from sealscope.parameters import Rig
 from sealscope.recordings.files import iter_columns
-from sealscope.recordings.formats.columns import reconstruct_map
+from sealscope.recordings.formats.columns import GROUP, REST, reconstruct_map
+from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import proposed_map
 from sealscope.recordings.joining import start_seconds
@@ -37,8 +38,6 @@ PART_ROWS = 100_000
 #: Points of a small picture, and format of the stored rows.
 _PICTURE, _VERSION = 64, 2
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
-#: Separators after the name of an actuator in a column's heading, such as `Press 2 / p_A`.
-_GROUP = re.compile(r"[\s._/:|-]+")
 
 
 def file_stamp(path: Path) -> str:
@@ -128,50 +127,20 @@ def _draw_small(recording: Recording) -> dict[str, Any]:
     return {name: line.tolist() for name, line in lines.items()}
 
 
-def propose_maps(path: Path, rate: float | None) -> tuple[dict[str, str], list[dict[str, Any]], str]:
-    """Propose the column of each channel of a log, and a map for each actuator if its columns show several.
+def propose_map(path: Path, rate: float | None, group: str | None) -> tuple[dict[str, str], tuple[str, ...], str]:
+    """Propose the column of each channel of a log, and find the actuators to which its columns belong.
 
-    Returns the map, the maps of groups of columns, as {"name", "map"}, and why a map alone does not read the log, "" if
-    it does.
+    Returns the map, the names of the actuators, and why the log is not read without one of them or a map by hand, "" if
+    it is. `group`: actuator whose columns are proposed.
     """
     headings = next(iter(iter_columns(path, rate=rate, rows=1000))).channels
     labels = [Label.parse(heading) for heading in headings]
-    groups = find_groups(labels)
+    groups = find_actuators(labels).names
     try:
-        recording = read_by_map(path, "auto", rate)
+        recording = read_by_map(path, "auto" if group is None else {REST: "auto", GROUP: group}, rate)
     except SealscopeError as error:
         return proposed_map(labels), groups, str(error)
     return reconstruct_map(recording.provenance) or {name: name for name in recording.channels}, groups, ""
-
-
-def find_groups(labels: Sequence[Label]) -> list[dict[str, Any]]:
-    """Find several actuators in the columns of a log: headings that begin with a common word and are channels after it.
-
-    Returns a map for each group with both chamber pressures; empty unless there are two or more.
-    """
-    members: dict[str, list[tuple[Label, Label]]] = {}
-    for label in labels:
-        words = _GROUP.split(label.whole.strip(), maxsplit=2)
-        for count in (1, 2):
-            if len(words) > count:
-                prefix = label.whole.strip()[: label.whole.strip().index(words[count], len(" ".join(words[:count])))]
-                inner = Label.parse(label.whole.strip()[len(prefix) :])
-                members.setdefault(_GROUP.sub(" ", prefix).strip(), []).append((inner, label))
-    groups = []
-    for name, pairs in members.items():
-        inner_labels = [inner for inner, _ in pairs]
-        wholes = {inner.whole: label.whole for inner, label in pairs}
-        found = {
-            inner.name: inner.whole
-            for inner in inner_labels
-            if inner.name in ("p_A", "p_B", "x", "theta", "omega", "u")
-        }
-        for channel, column in proposed_map(inner_labels).items():
-            found.setdefault(channel, column)
-        if {"p_A", "p_B"} <= found.keys():
-            columns = {channel: wholes.get(column, column) for channel, column in found.items()}
-            groups.append({"name": name, "map": columns})
-    return groups if len(groups) > 1 else []
 
 
 def columns_source(path: Path, time: str | None, rate: float | None) -> Source:

@@ -9,6 +9,7 @@ from typing import Any
 
 from sealscope.app.session import REPORTS, SessionMachine
 from sealscope.app.workbench import Workbench
+from sealscope.recordings.formats.columns import GROUP, REST
 
 _IMPORT = "import sealscope as ss"
 _IMPORT_RIG = "from sealscope.diagnosis.verdict.machine import build_stated_rig"
@@ -138,9 +139,15 @@ def _map_options(machine: SessionMachine) -> list[str]:
     if isinstance(columns, str):
         options = ["--map", columns]
     else:
-        entries = ("auto" if channel == "*" else f"{channel}={column}" for channel, column in columns.items())
-        options = [text for entry in entries for text in ("--map", entry)]
+        options = [text for channel, column in columns.items() for text in _map_words(channel, column)]
     return [*options, *(["--rate", f"{machine.rate:g}"] if machine.rate else [])]
+
+
+def _map_words(channel: str, column: str) -> tuple[str, str]:
+    """Return an entry of a map as an option of the command line."""
+    if channel == GROUP:
+        return "--group", column
+    return "--map", column if channel == REST else f"{channel}={column}"
 
 
 def _options(machine: SessionMachine) -> list[str]:

@@ -65,8 +65,8 @@ class ReachedVerdict:
 class SessionMachine:
     """A machine of a session: what is stated of it, as texts of the command line's options, and its recordings' keys.
 
-    `map` has the column of each channel, "auto" for the entry "*"; `bore`, `rod` and `rods` (the sides with a rod) are
-    kept to be shown again: `area` follows from them. `repairs`: dates.
+    `map` has the column of each channel, with the entries "*" and "group" as for `sealscope.read`; `bore`, `rod` and
+    `rods` (the sides with a rod) are kept to be shown again: `area` follows from them. `repairs`: dates.
     """
 
     name: str

@@ -25,7 +25,7 @@ from starlette.routing import Route
 
 from sealscope.app.scripts import write_report_command, write_script, write_watch
 from sealscope.app.session import REPORTS
-from sealscope.app.workbench import Workbench, to_point
+from sealscope.app.workbench import Workbench
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 from sealscope.reporting.template import read_package_file, render
@@ -295,7 +295,7 @@ _READERS: dict[str, Callable[[Workbench, _Query], Any]] = {
     "state": lambda bench, query: bench.state(int(query.number("since") or -1)),
     "preview": lambda bench, query: bench.preview(query("file"), _layout_of(query._values)),
     "window": _read_window,
-    "proposal": lambda bench, query: bench.propose(query("file"), to_point(query("rate"))),
+    "proposal": lambda bench, query: bench.propose(query("machine"), query("file")),
     "channels": lambda bench, query: bench.describe_channels(query("machine"), query("file")),
     "drawing": lambda bench, query: {
         "svg": bench.draw_machine(query("machine"), [name for name in query("channels").split(",") if name])

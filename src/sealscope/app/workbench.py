@@ -23,7 +23,7 @@ from sealscope.app.logs import (
     describe_recording,
     file_stamp,
     is_hidden,
-    propose_maps,
+    propose_map,
     read_for,
 )
 from sealscope.app.session import (
@@ -45,6 +45,7 @@ from sealscope.diagnosis.trend.trend import Trend, trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine import AssumedMachine, states_rig
 from sealscope.errors import InputError, SealscopeError
+from sealscope.recordings.formats.columns import GROUP
 from sealscope.recordings.joining import file_seconds, start_seconds
 from sealscope.recordings.mending import StatedLayout, mend, preview_text
 from sealscope.recordings.recording import Recording
@@ -354,10 +355,11 @@ class Workbench:
         )
         self.note_change()
 
-    def propose(self, key: str, rate: str = "") -> dict[str, Any]:
-        """Propose a map of a log's columns, and maps of several actuators."""
-        proposed, groups, problem = propose_maps(self.find_log(key), float(rate) if rate else None)
-        return {"map": proposed, "groups": groups, "problem": problem}
+    def propose(self, name: str, key: str) -> dict[str, Any]:
+        """Propose a map of a log's columns for a machine, and name the actuators of the log if there are several."""
+        machine = self.folder.read().find_machine(name)
+        proposed, groups, problem = propose_map(self.find_log(key), machine.rate, machine.map.get(GROUP))
+        return {"map": proposed, "groups": groups if len(groups) > 1 else (), "problem": problem}
 
     def table(self, kind: str, key: str, name: str = "", stated_time: str | None = None) -> MappedTable:
         """Open a table of a log: its "columns", the "channels" of a machine, or its "balance" of flows or "volumes"."""

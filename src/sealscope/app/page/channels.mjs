@@ -47,15 +47,15 @@ async function loadColumns(file, machine) {
 }
 
 async function loadProposal(file, machine) {
-  proposal = await ask("proposal", { file, rate: machine.rate ?? "" }).catch((error) => ({ map: {}, groups: [], problem: error.message }));
-  const others = proposal.groups.filter((group) => !app.machines.some((known) => known.name === group.name));
+  proposal = await ask("proposal", { file, machine: machine.name }).catch((error) => ({ map: {}, groups: [], problem: error.message }));
+  const others = proposal.groups.filter((group) => !app.machines.some((known) => known.map.group === group));
   byId("groups").hidden = !others.length;
   byId("groups").replaceChildren(
-    make("p", { text: `The columns are those of ${proposal.groups.length} actuators: ${proposal.groups.map((group) => group.name).join(", ")}.` }),
+    make("p", { text: `The columns are those of ${proposal.groups.length} actuators: ${proposal.groups.join(", ")}.` }),
     make("button", { type: "button", text: "Keep them apart, a machine each", onclick: () => attempt(async () => {
-      for (const group of others) await tell("machine", { machine: group.name, values: { map: group.map } });
+      for (const group of others) await tell("machine", { machine: group, values: { map: { "*": "auto", group } } });
       await refresh();
-      go("channels", app.file, proposal.groups[0].name);
+      go("channels", app.file, others[0]);
     }) }),
   );
 }
@@ -63,8 +63,8 @@ async function loadProposal(file, machine) {
 // the map in force: what the machine states, completed by the proposal where it says auto
 function mapNow() {
   const stated = machineNow()?.map || {};
-  const isAuto = !Object.keys(stated).length || stated["*"] === "auto";
-  const entries = Object.entries(stated).filter(([channel]) => channel !== "*");
+  const isAuto = !Object.keys(stated).length || stated["*"] === "auto" || "group" in stated;
+  const entries = Object.entries(stated).filter(([channel]) => !["*", "group"].includes(channel));
   return isAuto ? { ...proposal.map, ...Object.fromEntries(entries) } : Object.fromEntries(entries);
 }
 
