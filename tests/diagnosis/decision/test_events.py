@@ -24,7 +24,8 @@ from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
-from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING
+from sealscope.diagnosis.inference.delays import DELAYED
+from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, delay_name
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -64,6 +65,7 @@ def known_names() -> frozenset[str]:
     names |= {f"levels: {name}" for name, _ in PATTERNS} | {"levels: what feeds both chambers"}
     names |= {f"{FRICTION}: {FRICTION}"} | {f"drift: {name}" for name in (*DRIFTS, ZEROS, FALL)}
     names |= {f"drift: {LOW.format(side)}" for side in "AB"}
+    names |= {f"delays: {delay_name(channel)}" for channel in (*DELAYED, "theta", "omega", "q_pump", "q_supply", "u")}
     names |= {"motion: motion", "sides: filter of p_A", "sides: filter of p_B", f"{TURNING_DATA}: {TURNING}"}
     names.add(f"volumes: {TURNING}")  # behind valves that shut at rest
     names |= {f"rise: {name}" for name in volume_names() if name == AIR or name.startswith("external leak")}

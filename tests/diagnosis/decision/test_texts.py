@@ -48,4 +48,5 @@ def test_every_remark_has_a_text_and_is_made() -> None:
     """A remark is a key with its values."""
     made = {arguments[0] for arguments in calls("Remark") if isinstance(arguments[0], str)}
     conditional = {"zero too high", "zero too low", "x late", "x early"}
+    conditional |= {key for key in TEXTS["remark"] if key.startswith("delay ")}
     assert made | conditional == set(TEXTS["remark"])

@@ -18,7 +18,20 @@ from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
-from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest, shut_at_rest, with_rests
+from sealscope.diagnosis.inference.delays import (
+    DelayChange,
+    DelayTest,
+    SampleClock,
+    align_samples,
+    drop_delay_columns,
+)
+from sealscope.diagnosis.inference.equations.balances import (
+    equations,
+    is_separate_at_rest,
+    shut_at_rest,
+    with_delays,
+    with_rests,
+)
 from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import (
     AVERAGING_TIME,
@@ -711,7 +724,8 @@ class RegimeBlocks(NamedTuple):
 
     - `blocks`, `plain`: the blocks after removal of the sensor offset of p_A - p_B, and with p_A - p_B as recorded;
     - `equations`: the volume balances; `columns`: the roles of their columns;
-    - `shut`: true if valves cut the pump off from the cylinder while it rests, false if it stays connected.
+    - `shut`: true if valves cut the pump off from the cylinder while it rests, false if it stays connected;
+    - `delay_changes`: changes of channels' delays that were removed before; `delay_tests`: tests for them.
     """
 
     blocks: Blocks
@@ -719,6 +733,8 @@ class RegimeBlocks(NamedTuple):
     equations: tuple[Equation, ...]
     columns: tuple[ColumnRoles, ...]
     shut: bool = False
+    delay_changes: tuple[DelayChange, ...] = ()
+    delay_tests: tuple[DelayTest, ...] = ()
 
     def reverse_flow(self, is_reversed: NDArray[np.bool_]) -> RegimeBlocks:
         """Reverse the sign of the left side, a recorded flow, in each balance that is flagged in `is_reversed` (E,)."""
@@ -789,22 +805,32 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
-    make_stream = partial(BlockStream, stream_balances, recording.rate, block_s, n_first=None, start=start)
-    stream = make_stream()
-    recorded = stream.push(samples, last=True)
-    if recorded is None:
+    make_stream = partial(BlockStream, rate=recording.rate, block_s=block_s, n_first=None, start=start)
+    delay_balances = tuple(map(with_delays, stream_balances))
+    stream = make_stream(delay_balances)
+    with_delay_columns = stream.push(samples, last=True)
+    if with_delay_columns is None:
         return None
+
+    def compute_with_delay_columns(shifted: Mapping[str, Array]) -> Blocks | None:
+        """Compute the blocks of samples of which a channel was shifted, with the columns of delays."""
+        return make_stream(delay_balances, left_signs=stream.left_signs).push(shifted, last=True)
+
+    clock = SampleClock(recording.rate, start, flow_channel="omega" if balances[0].by_command else source or "")
+    aligned = align_samples(samples, with_delay_columns, compute_with_delay_columns, stream.columns, clock)
+    samples = dict(aligned.samples)
+    recorded = drop_delay_columns(aligned.blocks, stream.columns[0])
 
     @cache
     def compute_blocks(offset: float) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B."""
         if not offset:
             return recorded
-        blocks = make_stream(offset=offset, left_signs=stream.left_signs).push(samples, last=True)
+        blocks = make_stream(stream_balances, offset=offset, left_signs=stream.left_signs).push(samples, last=True)
         assert blocks is not None  # as many samples as for `recorded`
         return blocks
 
-    columns = stream.columns[0]
+    columns = ColumnRoles(stream_balances[0])
     odds = shut_odds(recorded, columns) if may_shut else 0.0
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.lasting
 
@@ -815,11 +841,12 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
             return blocks
         return apply_regime(blocks, columns, shut, has_holds=has_holds, is_certain=odds > INFERENCE.rest.locked)
 
-    open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))
+    delays: dict[str, Any] = {"delay_changes": aligned.changes, "delay_tests": aligned.tests}
+    open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))._replace(**delays)
     if not may_shut or not has_rests(recorded, columns):
-        return RecordedBlocks(open_regime, shut=None, odds=0.0, sign_log_odds=stream.sign_log_odds)
+        return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True)
+    shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True, **delays)
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
 
 

@@ -270,6 +270,18 @@ class ColumnRoles:
             deviations[self.names.index(LAG)] = INFERENCE.level.lag * np.sqrt(energies[self.left] / motion_energy)
         return deviations
 
+    def clock_drifts(self, total: Array) -> Array:
+        """Compute the standard deviations (m - 1,) of drifts in a minute by the clocks of two recorders.
+
+        Only the delay of the position (`LAG`) drifts by them: by `delay.clock` (`priors.toml`) [s] in a minute times
+        the area, the rms flow over the rms speed. `total` (m, m): Gram matrix of the recording.
+        """
+        deviations, energies = np.zeros(len(self.names)), np.diag(total)
+        motion_energy = float(energies[list(self.piston)].sum())
+        if LAG in self.names and motion_energy > 0.0:
+            deviations[self.names.index(LAG)] = INFERENCE.delay.clock * np.sqrt(energies[self.left] / motion_energy)
+        return deviations
+
     def difference_precisions(self, indices: Sequence[int], coefficients: Array, leak_coefficient: float) -> Array:
         """Compute the prior precisions (c,) of the differences of c coefficients from those of other recordings.
 
@@ -583,7 +595,8 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     # has no prior if the offset has no effect
     deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
     deviations[:-1, 0] = level
-    deviations[:-1, 1:] = (magnitudes * roles.drift_rate[nuisance] * (seconds / 60.0))[:, None]
+    drifts = np.hypot(magnitudes * roles.drift_rate[nuisance], roles.clock_drifts(total)[nuisance])  # in a minute
+    deviations[:-1, 1:] = (drifts * (seconds / 60.0))[:, None]
     deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
     nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
     offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block

@@ -99,7 +99,7 @@ class Remark(NamedTuple):
     """Remark on a recording: `key` of a text in `decision/texts.toml`, and the `values` to fill in by name."""
 
     key: str
-    values: Mapping[str, float]
+    values: Mapping[str, float | str]
 
 
 class LeakRise(NamedTuple):

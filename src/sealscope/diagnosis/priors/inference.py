@@ -134,6 +134,19 @@ class StepSize(PriorTable):
     spread: float
 
 
+class DelayPriors(StepSize):
+    """Changes of a channel's delay within a recording: `size` and `spread` [s] of a change, and three others.
+
+    - `odds`: odds that the delay of a channel changes;
+    - `clock`: standard deviation of the drift of a delay by the clocks of two recorders [s/min];
+    - `other`: probability below which an alternative channel is excluded.
+    """
+
+    odds: float
+    clock: float
+    other: float
+
+
 class SensePriors(PriorTable):
     """Probabilities of causes by which the sign of a recorded flow looks wrong, or has become wrong."""
 
@@ -258,6 +271,7 @@ class InferencePriors(PriorTable):
 
     drift: DriftPriors
     level: LevelPriors
+    delay: DelayPriors
     blocks: BlockPriors
     between: DifferencePriors
     scatter: ScatterPriors

@@ -19,6 +19,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     BIAS_TERM,
     CYLINDER,
     HOLDING,
+    LAG,
     LAG_TERM,
     LEAK,
     LEAKS,
@@ -41,6 +42,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     compensated_leak_term,
     compliance_term,
     conductance_term,
+    delay_term,
     external_leak_term,
     fitted_term,
     free_air_term,
@@ -334,6 +336,28 @@ def shut_at_rest(equation: Equation) -> Equation:
             term.with_increments(lambda s: s.moving(left) * s.dt) if term.name == BIAS else term for term in shut.terms
         )
     )
+
+
+def with_delays(equation: Equation) -> Equation:
+    """Add terms of the delays of the position, unless the balance has `LAG`, and of the chamber pressures (`delays`).
+
+    A pressure counts in the balances that contain the compliance of its chamber.
+    """
+    terms = []
+    if LAG not in (term.name for term in equation.terms):
+        # behind a servo valve, the displaced volume is the left side
+        terms.append(delay_term("x", lambda s: -equation.left(s), "s", needs=("x",)))
+    names = [term.name for term in equation.terms]
+    for side in "AB":
+        channel = f"p_{side}"
+        weight = float(f"compliance {side}" in names)
+        terms.append(delay_term(channel, partial(_weighted_step, channel, weight), "m^3 s/Pa", needs=(channel,)))
+    return _insert_before_leaks(equation, *terms)
+
+
+def _weighted_step(channel: str, weight: float, s: Signals) -> Array:
+    """Compute the differences of neighbouring samples of a channel, times a weight."""
+    return weight * s.step(channel)
 
 
 def _pump_leakage_terms(equation: Equation, drift: Coefficient | Literal[""] = "") -> tuple[Term, Term]:

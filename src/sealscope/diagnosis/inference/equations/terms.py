@@ -292,6 +292,16 @@ LINES_TERM = conductance_term(
 LAG_TERM = expressed_term(LAG, "m^2 s", "gradient(change(x) * rate)", "sensor fault", drift="motion", needs=("x",))
 
 
+def delay_name(channel: str) -> str:
+    """Return the name of the term of a channel's delay, but for `LAG`, the delay of a position after the flow."""
+    return f"delay of {channel}"
+
+
+def delay_term(channel: str, volume: Callable[[Signals], Array], unit: str, needs: tuple[str, ...]) -> Term:
+    """Make the term of a channel's delay: the change of `volume`, its increments, between sampling intervals."""
+    return fitted_term(delay_name(channel), unit, lambda s: np.gradient(volume(s) * s.rate), needs=needs)
+
+
 def metering_edge_terms(
     edge: str, upstream: str, downstream: str, sign: float, channels: Container[str], return_pressure: float
 ) -> tuple[Term, ...]:

@@ -455,7 +455,7 @@ class BalanceLeak(LeakMeasure):
 
     @property
     def remarks(self) -> Sequence[Remark]:
-        """Remarks on contradicting sizes, the sensor offset of p_A - p_B, a delay of x, and unusual conditions."""
+        """Remarks on contradicting sizes, the offset of p_A - p_B, delays and their changes, and unusual conditions."""
         balance = self.balance
         size, offset, delay = balance.size, balance.pressure_offset, balance.position_delay
         remarks = list[Remark]()
@@ -466,6 +466,14 @@ class BalanceLeak(LeakMeasure):
         # a delay of one sample is usual
         if delay is not None and abs(delay.value) > 1.0 / balance.recording.rate + WITHIN_95 * delay.deviation:
             remarks.append(Remark("x late" if delay.value > 0.0 else "x early", {"ms": 1e3 * abs(delay.value)}))
+        for change in balance.delay_changes:
+            keys = ("delay grows", "delay shrinks")
+            if change.rival_channel:
+                keys = ("delay grows, or flow's shrinks", "delay shrinks, or flow's grows")
+            values = {"ms": 1e3 * abs(change.seconds), "seconds": change.onset.value}
+            remarks.append(
+                Remark(keys[change.seconds < 0.0], {**values, "channel": change.channel, "flow": change.rival_channel})
+            )
         for condition in find_unusual_conditions(balance.recording_sums, self.healthy):
             value, low, high = condition.value, condition.low, condition.high
             if condition.name == "load":

@@ -161,6 +161,7 @@ class VolumeBalance:
         return RecordedBalance(
             regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
             plain=regime.plain, shut=regime.shut, locked=regime.shut,  # shut valves hold the load
+            delay_changes=regime.delay_changes, delay_tests=regime.delay_tests,
         )  # fmt: skip
 
     def learn(self, recording: Recording) -> Summary | None:

@@ -33,6 +33,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.delays import DelayChange, DelayTest, delay_observables
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, Equation
@@ -103,6 +104,7 @@ class RecordedBalance:
     - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
     - `locked`: true if shut valves hold the load at rest, so that these times measure the leaks (`chambers`).
     - `known_stroke`: ends of the motion in other recordings of the machine [m], None if unknown.
+    - `delay_changes`: changes of channels' delays, which the blocks no longer contain; `delay_tests`: tests for them.
     """
 
     blocks: Blocks
@@ -115,6 +117,8 @@ class RecordedBalance:
     shut: bool = False
     locked: bool = False
     known_stroke: tuple[float, float] | None = None
+    delay_changes: tuple[DelayChange, ...] = ()
+    delay_tests: tuple[DelayTest, ...] = ()
 
     @property
     def is_creep(self) -> bool:
@@ -182,14 +186,15 @@ class RecordedBalance:
 
     @cached_property
     def observables(self) -> tuple[Observable, ...]:
-        """Tests of the balance's coefficients for a step within the recording, the highest score first."""
+        """Tests of the balance's coefficients for a step, the highest score first, and then of the channels' delays."""
         plain = self.running_blocks if self.plain is None else self.plain[self._first_motion :]
         # the fall of the charge pressure is compared with losses of oil as true flows
         charge = estimate_charge_trend(self.recording) if self.size.stated else None
-        return volume_observables(
+        volume_tests = volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss,
             volume_ratio=self.volume_ratio, charge=charge, flow_scale=self.size.scale,
         )  # fmt: skip
+        return volume_tests + delay_observables(self.delay_tests, self.delay_changes)
 
     @property
     def volume_ratio(self) -> float:

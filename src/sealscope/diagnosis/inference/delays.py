@@ -1,0 +1,361 @@
+"""Changes of a channel's delay within a recording: found as steps of terms of the volume balance, and removed.
+
+A channel c that arrives later by tau from some time on reads c(t - tau). To the first order in tau, the volume balance
+then misses the term tau dV/dt, where V is what the channel contributes: A dx for the position, C dp for a pressure. The
+columns of these terms are the second differences of the channels (`equations.balances.with_delays`, `terms.LAG`).
+
+The coefficient of such a column is tested for a step while the leakage, the constant flow and the chambers' compliances
+are free in each block. A leak, air or another zero of a sensor thus never counts as a delay, however they change. The
+posterior odds that the delay has changed are
+
+    odds = r mean(L(onset)) / L_0 * sqrt(2 pi) s f(tau),
+
+with the likelihoods L and L_0 with a step and without (`onset`), their mean being over all onsets, the fitted change
+tau with its standard error s, the prior density f of its size, and the prior odds r (`delay` in `priors.toml`). If they
+exceed 1, the channel is shifted back by tau, and its samples about the onset count as missing. The search is repeated
+until no further change is found.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information, solve
+from sealscope.diagnosis.inference.differences import size_penalty
+from sealscope.diagnosis.inference.equations.terms import LAG, delay_name
+from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
+from sealscope.diagnosis.inference.rows.weak_form import half_width
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+
+#: Name of the data that the tests of delays describe.
+DELAYS = "delays"
+#: Channels whose delay is tested.
+DELAYED = ("x", "p_A", "p_B")
+#: Largest number of changes that are removed from one recording, and of corrections of the size of each.
+MAX_CHANGES, MAX_CORRECTIONS = 4, 4
+#: Fraction of the information on a delay below which a block has none, once other coefficients are free in it.
+MIN_INFORMATION = 1e-6
+
+
+class DelayTest(NamedTuple):
+    """Test for a change of the delay of a `channel`, at the onset [s] of `test`, the step test of its term.
+
+    `change`: fitted change [s], positive if the channel arrives later than before; `log_odds`: posterior log odds that
+    the delay has changed; `onset`: time of the change, estimated with the same compliances in all blocks.
+    """
+
+    channel: str
+    test: StepTest
+    change: Estimate
+    log_odds: float
+    onset: Interval
+
+
+class DelayChange(NamedTuple):
+    """Change of the delay of a `channel` by `seconds`, positive if it arrives later than before, at an `onset` [s].
+
+    `rival_channel`: that of the flow, if the position may instead be unchanged and the flow be earlier by as much; else
+    "".
+    """
+
+    channel: str
+    seconds: float
+    onset: Interval
+    rival_channel: str = ""
+
+
+def drop_delay_columns(blocks: Blocks, roles: ColumnRoles) -> Blocks:
+    """Drop the columns that `equations.balances.with_delays` adds from Gram matrices with the given `roles`."""
+    added = {delay_name(channel) for channel in DELAYED}
+    names = (*roles.names, "left")  # the last column is the left side of the balance
+    kept = [k for k, name in enumerate(names) if name not in added]
+    return replace(blocks, gram=np.asarray(blocks.gram[..., kept, :][..., kept]))
+
+
+class SampleClock(NamedTuple):
+    """Sampling of a recording: its `rate` [Hz], time of the first sample `begin` [s], and channel of the pump's flow.
+
+    `flow_channel` is "" if no channel shows the flow.
+    """
+
+    rate: float
+    begin: float
+    flow_channel: str
+
+
+class AlignedSamples(NamedTuple):
+    """Samples of a recording without changes of delays: arrays by channel name, and their blocks with delay columns.
+
+    `changes`: changes that were removed; `tests`: one test for each channel, of its first change if there is one.
+    """
+
+    samples: Mapping[str, Array]
+    blocks: Blocks
+    changes: tuple[DelayChange, ...]
+    tests: tuple[DelayTest, ...]
+
+
+def align_samples(
+    samples: Mapping[str, Array],
+    blocks: Blocks,
+    compute_blocks: Callable[[Mapping[str, Array]], Blocks | None],
+    columns: Sequence[ColumnRoles],
+    clock: SampleClock,
+) -> AlignedSamples:
+    """Find changes of the delays of channels within a recording, and shift the channels back.
+
+    `samples`: arrays by channel name; `blocks`: their blocks, with the roles `columns`, which include the columns of
+    delays; `compute_blocks` computes those of shifted samples, None if there are too few.
+    """
+    changes, found = list[DelayChange](), dict[str, DelayTest]()
+    while True:
+        tests = {test.channel: test for test in score_delays(blocks, columns, clock)}
+        best = max(tests.values(), key=lambda test: test.log_odds, default=None)
+        if best is None or best.log_odds <= 0.0 or len(changes) == MAX_CHANGES:
+            break
+        shift = _find_shift(samples, best, compute_blocks, columns, clock)
+        if shift is None:
+            break
+        samples, blocks = shift.samples, shift.blocks
+        found.setdefault(best.channel, best)
+        changes.append(DelayChange(shift.channel, shift.seconds, best.onset, shift.rival_channel))
+    return AlignedSamples(samples, blocks, tuple(changes), tuple({**tests, **found}.values()))
+
+
+def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]) -> tuple[Observable, ...]:
+    """Convert tests of delays to observables, whose sizes are in seconds.
+
+    A test of the position bears the name of the flow's channel if the first of the `changes` is one of that channel.
+    """
+    removed = {change.channel for change in changes}
+    flow = next((change.channel for change in changes if change.channel not in DELAYED), "x")
+    observables = []
+    for channel, test, change, _, onset in tests:
+        name = flow if channel == "x" and "x" not in removed else channel
+        advantage = -size_penalty(INFERENCE.delay, change.value)
+        # two tests: later, or earlier
+        observable = Observable.from_test(delay_name(name), DELAYS, test, n_tests=2.0, advantage=advantage)
+        observables.append(replace(observable, size=change.value, onset=onset))
+    return tuple(observables)
+
+
+def score_delays(blocks: Blocks, columns: Sequence[ColumnRoles], clock: SampleClock) -> list[DelayTest]:
+    """Test the delay of each channel for a step, while leakage, constant flow and compliances are free in each block.
+
+    A channel is left out if the balance has no column for its delay, or if too few blocks show it. The interval of the
+    onset is widened by half a test function, since a row shows a part of a change within it.
+    """
+    coarse = blocks.merge(INFERENCE.blocks.coarse)  # a delay need be dated to a fraction of the recording only
+    leak_free = _free_in_blocks(coarse, columns, [[roles.leak, roles.bias] for roles in columns])
+    all_free = _free_in_blocks(coarse, columns, [[roles.leak, roles.bias, *roles.compliance] for roles in columns])
+    total = coarse.gram.sum(axis=0)
+    tests = []
+    for channel in DELAYED:
+        index, unit = _delay_column(columns[0], channel), _coefficient_per_second(total[0], columns[0], channel)
+        if index is None or not unit:
+            continue
+        test, dating_test = (
+            step_test(
+                information(_drop_uninformed(coarse, reduced, index), columns, index),
+                signs=(1.0, -1.0),
+            )
+            for reduced in (all_free, leak_free)
+        )
+        if test is None or dating_test is None:
+            continue
+        change = Estimate(test.sign * test.fitted.value / unit, test.fitted.deviation / abs(unit))
+        (value, low, high), margin = dating_test.onset(), half_width(clock.rate)
+        onset = Interval(value, low - margin, high + margin)
+        tests.append(DelayTest(channel, test, change, _change_log_odds(test, change), onset))
+    return tests
+
+
+def _delay_column(roles: ColumnRoles, channel: str) -> int | None:
+    """Return the index of the column of a channel's delay, None if the balance has none."""
+    names = (LAG, delay_name(channel)) if channel == "x" else (delay_name(channel),)
+    return next((roles.names.index(name) for name in names if name in roles.names), None)
+
+
+def _free_in_blocks(blocks: Blocks, columns: Sequence[ColumnRoles], free: Sequence[Sequence[int | None]]) -> Blocks:
+    """Eliminate coefficients that are free in each block from its Gram matrices.
+
+    `free`: indices of their columns for each equation, None for a column that an equation lacks.
+    """
+    gram = blocks.gram.copy()
+    for e in range(len(columns)):
+        indices = sorted({index for index in free[e] if index is not None})
+        for k, block in enumerate(gram[:, e]):
+            gram[k, e] -= block[:, indices] @ solve(block[np.ix_(indices, indices)], block[indices])
+        gram[:, e, indices] = 0.0
+        gram[:, e, :, indices] = 0.0
+    return replace(blocks, gram=gram)
+
+
+def _drop_uninformed(blocks: Blocks, reduced: Blocks, index: int) -> Blocks:
+    """Drop from `reduced` the blocks that tell nothing of a column once other coefficients are free in each block."""
+    is_informed = reduced.gram[..., index, index] > MIN_INFORMATION * blocks.gram[..., index, index]
+    return replace(reduced, gram=np.where(is_informed[..., None, None], reduced.gram, 0.0))
+
+
+def _coefficient_per_second(total: Array, roles: ColumnRoles, channel: str) -> float:
+    """Compute the coefficient of a channel's delay column for a delay of 1 s, from its fitted contribution; 0 if none.
+
+    It is the regression coefficient of the fitted volume that the channel contributes on the channel itself, such as
+    the piston's area [m^2] of a position. `total` (m, m): Gram matrix of the recording.
+    """
+    if channel == "x":
+        parts = [k for k in roles.motion if roles.names[k].startswith("motion")]
+        reference = parts
+        if not parts:  # behind a servo valve, the column is the displaced volume itself
+            return 1.0
+    else:
+        side = channel[-1]
+        parts = [k for k in roles.compliance if f" {side}" in roles.names[k]]
+        reference = parts[:1]  # the constant compliance, whose increments are those of the pressure
+    if not parts:
+        return 0.0
+    nuisance = list(roles.nuisance)
+    fitted = dict(zip(nuisance, solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left]), strict=True))
+    products = total[np.ix_(parts, reference)].sum(axis=1) @ [fitted[k] for k in parts]
+    return float(products) / max(float(total[np.ix_(reference, reference)].sum()), np.finfo(float).tiny)
+
+
+def _change_log_odds(test: StepTest, change: Estimate) -> float:
+    """Compute the posterior log odds that a delay has changed, by the formula of the module.
+
+    The density of the change is log-normal in its magnitude, for either sign.
+    """
+    prior = INFERENCE.delay
+    size = max(abs(change.value), np.finfo(float).tiny)
+    log_density = -0.5 * size_penalty(prior, size) - np.log(2.0 * np.sqrt(2.0 * np.pi) * prior.spread * size)
+    log_mean = float(np.log(np.mean(np.exp(test.likelihood - test.likelihood.max()))))
+    log_occam = float(np.log(np.sqrt(2.0 * np.pi) * max(change.deviation, np.finfo(float).tiny)) + log_density)
+    return float(np.log(prior.odds)) + 0.5 * test.score + log_mean + min(log_occam, 0.0)
+
+
+class _Shift(NamedTuple):
+    """A `channel` whose delay changed by `seconds`: the `samples` without the change, and their `blocks`.
+
+    `residual`: mean square of the rows' residuals; `rival_channel`: as in `DelayChange`.
+    """
+
+    channel: str
+    seconds: float
+    samples: Mapping[str, Array]
+    blocks: Blocks
+    residual: float
+    rival_channel: str = ""
+
+
+def _find_shift(
+    samples: Mapping[str, Array],
+    found: DelayTest,
+    compute_blocks: Callable[[Mapping[str, Array]], Blocks | None],
+    columns: Sequence[ColumnRoles],
+    clock: SampleClock,
+) -> _Shift | None:
+    """Find the shift of a channel that removes a change of a delay; None if the samples then allow no blocks.
+
+    A change of the position's delay may as well be one of the flow, by as much in the other direction. The one that
+    leaves the smaller residual counts, and if the difference is not clear, the position with the flow as `rival_channel`.
+    """
+    by_channel = _fit_shift(samples, found, found.channel, 1.0, compute_blocks, columns, clock)
+    if by_channel is None or found.channel != "x" or not clock.flow_channel:
+        return by_channel
+    by_flow = _fit_shift(samples, found, clock.flow_channel, -1.0, compute_blocks, columns, clock)
+    if by_flow is None:
+        return by_channel
+    tiny = np.finfo(float).tiny
+    ratio = float(np.log(max(by_flow.residual, tiny) / max(by_channel.residual, tiny)))
+    log_odds = 0.5 * INFERENCE.size.readings * ratio  # of the position
+    if abs(log_odds) < np.log(1.0 / INFERENCE.delay.other):
+        return by_channel._replace(rival_channel=clock.flow_channel)
+    return by_channel if log_odds > 0.0 else by_flow
+
+
+def _fit_shift(
+    samples: Mapping[str, Array],
+    found: DelayTest,
+    channel: str,
+    sign: float,
+    compute_blocks: Callable[[Mapping[str, Array]], Blocks | None],
+    columns: Sequence[ColumnRoles],
+    clock: SampleClock,
+) -> _Shift | None:
+    """Fit the shift of a `channel` that removes the change of delay `found`, by Gauss-Newton steps.
+
+    `sign`: that of the channel's change over the change of `found`. Return None if the shifted samples allow no blocks.
+    """
+    onset, seconds, shift = found.onset, sign * found.change.value, None
+    for _ in range(MAX_CORRECTIONS):
+        shifted = {**samples, channel: shift_back(samples[channel], seconds, onset, clock)}
+        blocks = compute_blocks(shifted)
+        if blocks is None or len(blocks) < MIN_BLOCKS:
+            break
+        shift = _Shift(channel, seconds, shifted, blocks, _residual_square(blocks, columns))
+        remaining = _remaining_change(blocks, columns, found)
+        if remaining is None or abs(remaining.value) <= remaining.deviation:
+            break
+        seconds += sign * remaining.value
+    return shift
+
+
+def _remaining_change(blocks: Blocks, columns: Sequence[ColumnRoles], found: DelayTest) -> Estimate | None:
+    """Estimate the change of a delay [s] that remains at the onset of a change that was found; None if unknown."""
+    coarse = blocks.merge(INFERENCE.blocks.coarse)
+    index = _delay_column(columns[0], found.channel)
+    unit = _coefficient_per_second(coarse.gram.sum(axis=0)[0], columns[0], found.channel)
+    if index is None or not unit:
+        return None
+    delay = information(coarse, columns, index)
+    test = step_test(delay)
+    if test is None:
+        return None
+    nearest = np.array([int(np.abs(test.onsets - found.onset.value).argmin())])
+    _, sizes, deviations = step_sizes(delay, nearest, np.ones(len(coarse)), 0.0)
+    return Estimate(float(sizes[0]) / unit, float(deviations[0]) / abs(unit))
+
+
+def _residual_square(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
+    """Compute the mean square of the rows' residuals, after a fit of all coefficients that any machine has."""
+    total, square = blocks.gram.sum(axis=0), 0.0
+    for equation, roles in zip(total, columns, strict=True):
+        nuisance = list(roles.nuisance)
+        fitted = solve(equation[np.ix_(nuisance, nuisance)], equation[nuisance, roles.left])
+        square += float(equation[roles.left, roles.left] - fitted @ equation[nuisance, roles.left])
+    return max(square, 0.0) / max(float(blocks.rows.sum()), 1.0)
+
+
+def shift_back(values: Array, seconds: float, onset: Interval, clock: SampleClock) -> Array:
+    """Undo a delay of a channel by `seconds` (negative: an advance) that began within the interval `onset` [s].
+
+    `values` (n,): samples of the `clock`. Values after the onset's interval are interpolated by cubics through four
+    samples. Those within the interval, and those without samples, become NaN.
+    """
+    shift = seconds * clock.rate
+    whole = int(np.floor(shift))
+    fraction = shift - whole
+    count = len(values)
+    weights = (  # Lagrange's cubic through the samples -1, 0, 1, 2
+        -fraction * (fraction - 1.0) * (fraction - 2.0) / 6.0,
+        (fraction + 1.0) * (fraction - 1.0) * (fraction - 2.0) / 2.0,
+        -(fraction + 1.0) * fraction * (fraction - 2.0) / 2.0,
+        (fraction + 1.0) * fraction * (fraction - 1.0) / 6.0,
+    )
+    indices = np.arange(count) + whole
+    shifted = np.zeros(count)
+    for step, weight in zip((-1, 0, 1, 2), weights, strict=True):
+        if weight:
+            source = indices + step
+            is_recorded = (source >= 0) & (source < count)
+            shifted += weight * np.where(is_recorded, values[np.clip(source, 0, count - 1)], np.nan)
+    time = clock.begin + np.arange(count) / clock.rate
+    aligned = np.where(time > onset.high, shifted, values)
+    aligned[(time >= onset.low) & (time <= onset.high)] = np.nan
+    return aligned
