@@ -23,8 +23,8 @@ from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTIO
 from sealscope.diagnosis.inference.changes.levels import PATTERNS
 from sealscope.diagnosis.inference.changes.signals import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
-from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
 from sealscope.diagnosis.inference.delays import DELAYED
+from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
 from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, delay_name
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA

@@ -160,13 +160,7 @@ def score_delays(blocks: Blocks, columns: Sequence[ColumnRoles], clock: SampleCl
         index, unit = _delay_column(columns[0], channel), _coefficient_per_second(total[0], columns[0], channel)
         if index is None or not unit:
             continue
-        test, dating_test = (
-            step_test(
-                information(_drop_uninformed(coarse, reduced, index), columns, index),
-                signs=(1.0, -1.0),
-            )
-            for reduced in (all_free, leak_free)
-        )
+        test, dating_test = (_score_delay(coarse, reduced, columns, index) for reduced in (all_free, leak_free))
         if test is None or dating_test is None:
             continue
         change = Estimate(test.sign * test.fitted.value / unit, test.fitted.deviation / abs(unit))
@@ -197,10 +191,17 @@ def _free_in_blocks(blocks: Blocks, columns: Sequence[ColumnRoles], free: Sequen
     return replace(blocks, gram=gram)
 
 
-def _drop_uninformed(blocks: Blocks, reduced: Blocks, index: int) -> Blocks:
-    """Drop from `reduced` the blocks that tell nothing of a column once other coefficients are free in each block."""
+def _score_delay(blocks: Blocks, reduced: Blocks, columns: Sequence[ColumnRoles], index: int) -> StepTest | None:
+    """Test the coefficient of a delay's column, `index`, for a step in blocks with coefficients that are free in each.
+
+    `reduced`: the blocks after `_free_in_blocks`. Those that then tell nothing of the column are dropped. Return None
+    if too few remain.
+    """
     is_informed = reduced.gram[..., index, index] > MIN_INFORMATION * blocks.gram[..., index, index]
-    return replace(reduced, gram=np.where(is_informed[..., None, None], reduced.gram, 0.0))
+    if np.count_nonzero(is_informed.any(axis=1)) < MIN_BLOCKS:
+        return None
+    informed = replace(reduced, gram=np.where(is_informed[..., None, None], reduced.gram, 0.0))
+    return step_test(information(informed, columns, index), signs=(1.0, -1.0))
 
 
 def _coefficient_per_second(total: Array, roles: ColumnRoles, channel: str) -> float:
@@ -263,7 +264,8 @@ def _find_shift(
     """Find the shift of a channel that removes a change of a delay; None if the samples then allow no blocks.
 
     A change of the position's delay may as well be one of the flow, by as much in the other direction. The one that
-    leaves the smaller residual counts, and if the difference is not clear, the position with the flow as `rival_channel`.
+    leaves the smaller residual counts, and if the difference is not clear the position, with the flow as
+    `rival_channel`.
     """
     by_channel = _fit_shift(samples, found, found.channel, 1.0, compute_blocks, columns, clock)
     if by_channel is None or found.channel != "x" or not clock.flow_channel:
