@@ -25,16 +25,12 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information, solve
-from sealscope.diagnosis.inference.differences import size_penalty
 from sealscope.diagnosis.inference.equations.terms import LAG, delay_name
-from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
-#: Name of the data that the tests of delays describe.
-DELAYS = "delays"
 #: Channels whose delay is tested.
 DELAYED = ("x", "p_A", "p_B")
 #: Largest number of changes that are removed from one recording, and of corrections of the size of each.
@@ -128,23 +124,6 @@ def align_samples(
     return AlignedSamples(samples, blocks, tuple(changes), tuple({**tests, **found}.values()))
 
 
-def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]) -> tuple[Observable, ...]:
-    """Convert tests of delays to observables, whose sizes are in seconds.
-
-    A test of the position bears the name of the flow's channel if the first of the `changes` is one of that channel.
-    """
-    removed = {change.channel for change in changes}
-    flow = next((change.channel for change in changes if change.channel not in DELAYED), "x")
-    observables = []
-    for channel, test, change, _, onset in tests:
-        name = flow if channel == "x" and "x" not in removed else channel
-        advantage = -size_penalty(INFERENCE.delay, change.value)
-        # two tests: later, or earlier
-        observable = Observable.from_test(delay_name(name), DELAYS, test, n_tests=2.0, advantage=advantage)
-        observables.append(replace(observable, size=change.value, onset=onset))
-    return tuple(observables)
-
-
 def score_delays(blocks: Blocks, columns: Sequence[ColumnRoles], clock: SampleClock) -> list[DelayTest]:
     """Test the delay of each channel for a step, while leakage, constant flow and compliances are free in each block.
 
@@ -197,10 +176,12 @@ def _score_delay(blocks: Blocks, reduced: Blocks, columns: Sequence[ColumnRoles]
     `reduced`: the blocks after `_free_in_blocks`. Those that then tell nothing of the column are dropped. Return None
     if too few remain.
     """
-    is_informed = reduced.gram[..., index, index] > MIN_INFORMATION * blocks.gram[..., index, index]
+    energy, reduced_energy = (series.gram[..., index, index] for series in (blocks, reduced))
+    is_informed = reduced_energy > MIN_INFORMATION * energy
     if np.count_nonzero(is_informed.any(axis=1)) < MIN_BLOCKS:
         return None
-    informed = replace(reduced, gram=np.where(is_informed[..., None, None], reduced.gram, 0.0))
+    is_kept = is_informed | (energy == 0.0)  # an equation without the column tells the other coefficients
+    informed = replace(reduced, gram=np.where(is_kept[..., None, None], reduced.gram, 0.0))
     return step_test(information(informed, columns, index), signs=(1.0, -1.0))
 
 
@@ -234,7 +215,7 @@ def _change_log_odds(test: StepTest, change: Estimate) -> float:
     """
     prior = INFERENCE.delay
     size = max(abs(change.value), np.finfo(float).tiny)
-    log_density = -0.5 * size_penalty(prior, size) - np.log(2.0 * np.sqrt(2.0 * np.pi) * prior.spread * size)
+    log_density = -0.5 * prior.penalty(size) - np.log(2.0 * np.sqrt(2.0 * np.pi) * prior.spread * size)
     log_mean = float(np.log(np.mean(np.exp(test.likelihood - test.likelihood.max()))))
     log_occam = float(np.log(np.sqrt(2.0 * np.pi) * max(change.deviation, np.finfo(float).tiny)) + log_density)
     return float(np.log(prior.odds)) + 0.5 * test.score + log_mean + min(log_occam, 0.0)

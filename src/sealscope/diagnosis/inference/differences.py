@@ -30,7 +30,6 @@ import numpy as np
 
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
-from sealscope.diagnosis.priors.inference import StepSize
 from sealscope.signals.smoothing import TINY
 
 #: Minimum number of healthy recordings for a scatter.
@@ -163,13 +162,3 @@ def excess_error(error: float, healthy_errors: Sequence[float]) -> float:
     if not healthy_errors:
         return error
     return float(np.sqrt(max(error**2 - float(np.median(healthy_errors)) ** 2, 0.0)))
-
-
-def size_penalty(prior: StepSize, step: float, above: bool = False) -> float:
-    """Compute the penalty -2 log(prior density / largest prior density) for an improbable size of a step.
-
-    The prior is normal in log(abs(`step`)) about log(`prior.size`), with the standard deviation `prior.spread`. With
-    `above`, only steps larger than `prior.size` are penalised.
-    """
-    deviation = float(np.log(max(abs(step), TINY) / prior.size)) / prior.spread
-    return float(max(deviation, 0.0) ** 2 if above else deviation**2)

@@ -32,7 +32,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     solve_weighted,
     stack_equations,
 )
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.equations.signals import find_rests
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
@@ -244,7 +244,7 @@ def compare_low_drifts(
     for side, drift in drifts.items():
         change = compare_estimates(LOW.format(side), DRIFT, drift, known[side], scatter)
         if change is not None:
-            yield replace(change, advantage=-size_penalty(CHANGES.zero_drift, change.size))
+            yield replace(change, advantage=-CHANGES.zero_drift.penalty(change.size))
     # of each side's drift: prior variance between days, squared standard error, variance between healthy recordings
     healthy_var = {side: float(np.var([drift.value for drift in known[side]])) for side in drifts}
     variances = {side: prior.scatter**2 + drift.deviation**2 + healthy_var[side] for side, drift in drifts.items()}
@@ -259,7 +259,7 @@ def compare_low_drifts(
         difference = compare_estimates(FALL, DRIFT, subtract_drifts(judged), differences, scatter)
         chance = 1.0 if difference is None else min(1.0, fall.chance / max(difference.chance, TINY))
         fall = replace(fall, chance=chance)
-    yield replace(fall, advantage=-size_penalty(CHANGES.charge_fall, fall.size))
+    yield replace(fall, advantage=-CHANGES.charge_fall.penalty(fall.size))
 
 
 def _mean_fall(drifts: Mapping[str, Estimate], variances: Mapping[str, float]) -> Estimate | None:

@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
-from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates, size_penalty
+from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -175,7 +175,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
     if drift_A is None or drift_B is None or difference is None:
         return
     for drift in (drift_A, drift_B):  # a drift that is fast for the zero of a sensor is rather one of the load
-        yield replace(drift, advantage=-size_penalty(CHANGES.zero_drift, drift.size / duration, above=True))
+        yield replace(drift, advantage=-CHANGES.zero_drift.penalty(drift.size / duration, above=True))
     chance = drift_A.chance * drift_B.chance / max(difference.chance, TINY)
     score = max(drift_A.score + drift_B.score - difference.score, 0.0)
     yield replace(difference, chance=min(chance, 1.0), score=score)

@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.blocks import (
     sum_blocks,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend
-from sealscope.diagnosis.inference.differences import size_penalty
+from sealscope.diagnosis.inference.delays import DELAYED, DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.terms import (
     AIR,
     BIAS,
@@ -34,6 +34,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     SPEED_LOSS,
     Equation,
     Term,
+    delay_name,
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
 from sealscope.diagnosis.inference.observable import Observable
@@ -43,6 +44,8 @@ from sealscope.recordings.recording import Array
 
 #: Name of the data that these observables describe.
 VOLUMES = "volumes"
+#: Name of the data that the tests of channels' delays describe.
+DELAYS = "delays"
 #: Observable of a change of the scale of the motion: displacement, angle or speed, or the position behind a valve.
 SCALE = "scale"
 #: Observable of a constant loss of flow, if the sensor of the flow has no offset.
@@ -118,6 +121,23 @@ def volume_observables(
     return tuple(sorted(observables, key=lambda observable: -observable.score))
 
 
+def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]) -> tuple[Observable, ...]:
+    """Convert tests of delays to observables, whose sizes are in seconds.
+
+    A test of the position bears the name of the flow's channel if the first of the `changes` is one of that channel.
+    """
+    removed = {change.channel for change in changes}
+    flow = next((change.channel for change in changes if change.channel not in DELAYED), "x")
+    observables = []
+    for channel, test, change, _, onset in tests:
+        name = flow if channel == "x" and "x" not in removed else channel
+        advantage = -INFERENCE.delay.penalty(change.value)
+        # two tests: later, or earlier
+        observable = Observable.from_test(delay_name(name), DELAYS, test, n_tests=2.0, advantage=advantage)
+        observables.append(replace(observable, size=change.value, onset=onset))
+    return tuple(observables)
+
+
 def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None:
     """Compute the logarithm of a factor on both pressures that would make a leak's conductance appear to step up.
 
@@ -146,15 +166,15 @@ def _size_penalty(
     `flow_scale` convert `size` to the quantity of the prior (`volume_observables`).
     """
     if name == SCALE:
-        return size_penalty(INFERENCE.scale, size)
+        return INFERENCE.scale.penalty(size)
     if name == AIR:
-        return size_penalty(INFERENCE.free_air, size / volume_ratio, above=True)
+        return INFERENCE.free_air.penalty(size / volume_ratio, above=True)
     if name == FLOW_ZERO:
-        return size_penalty(INFERENCE.flow_zero, size / max(blocks.moving_flow, np.finfo(float).tiny), above=True)
+        return INFERENCE.flow_zero.penalty(size / max(blocks.moving_flow, np.finfo(float).tiny), above=True)
     if name == OUTSIDE:
-        return size_penalty(INFERENCE.outside, size * flow_scale, above=True)
+        return INFERENCE.outside.penalty(size * flow_scale, above=True)
     if name.startswith("external leak"):
-        return size_penalty(INFERENCE.outside, size * flow_scale * blocks.driving_pressure(names, name), above=True)
+        return INFERENCE.outside.penalty(size * flow_scale * blocks.driving_pressure(names, name), above=True)
     return 0.0
 
 

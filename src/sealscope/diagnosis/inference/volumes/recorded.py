@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.blocks import (
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
-from sealscope.diagnosis.inference.changes.volumes import volume_observables
+from sealscope.diagnosis.inference.changes.volumes import delay_observables, volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold import (
     LockedHold,
@@ -33,7 +33,7 @@ from sealscope.diagnosis.inference.circuit.holds.hold import (
 from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
 from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.delays import DelayChange, DelayTest, delay_observables
+from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
 from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, Equation

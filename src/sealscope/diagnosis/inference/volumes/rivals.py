@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import RISE
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, compare_with_healthy, excess_error, size_penalty
+from sealscope.diagnosis.inference.differences import MIN_HEALTHY, compare_with_healthy, excess_error
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, SPEED_LOSS, TURNING
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -177,7 +177,7 @@ def _penalise_size(observable: Observable, judged: RecordingSums, unit_flows: Ma
     `priors.toml`). `unit_flows`: as in `rival_rises`.
     """
     flow = observable.size * (unit_flows or {}).get(observable.name, judged.pressure)
-    return replace(observable, advantage=-size_penalty(INFERENCE.outside, flow, above=True))
+    return replace(observable, advantage=-INFERENCE.outside.penalty(flow, above=True))
 
 
 def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRoles], tested: int) -> tuple[float, float]:
