@@ -574,6 +574,17 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     of the pump's volume [m^3] between samples; `rate`: sampling rate [Hz]. Speeds above the quantile `SPEED_QUANTILE`,
     as of a glitch, count as that quantile.
     """
+    return _limit_of_rest(*_speed_and_noise(increments, rate), rate, fraction)
+
+
+def _limit_of_rest(mean_speed: float, noise: float, rate: float, fraction: float) -> float:
+    """Compute the limit of `max_rest_rate` from the results of `_speed_and_noise`."""
+    # 2: neighbouring increments may be means that share a sample, which doubles the variance of their sum
+    return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
+
+
+def _speed_and_noise(increments: Array, rate: float) -> tuple[float, float]:
+    """Compute the mean speed in motion, and the standard deviation of the noise of a speed (`max_rest_rate`)."""
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
     speed = np.minimum(speed, np.quantile(speed, SPEED_QUANTILE)) if speed.size else speed
@@ -582,8 +593,7 @@ def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.re
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
     noise = SD_PER_MEDIAN * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
-    # 2: neighbouring increments may be means that share a sample, which doubles the variance of their sum
-    return max(fraction * mean_speed, 3.0 * noise * math.sqrt(2.0 / max(1.0, AVERAGING_TIME * rate)))
+    return mean_speed, noise
 
 
 def find_lowering_limits(pump_volume: Array, signals: Signals) -> LoweringLimits:
@@ -591,13 +601,14 @@ def find_lowering_limits(pump_volume: Array, signals: Signals) -> LoweringLimits
 
     `pump_volume`: as in `flag_lowering`.
     """
-    x_step, max_flow = signals.step("x"), max_rest_rate(pump_volume, signals.rate)
+    max_flow = max_rest_rate(pump_volume, signals.rate)
+    speed_and_noise = _speed_and_noise(signals.step("x"), signals.rate)
     load = np.abs(signals.pressure_difference)[~find_rests(pump_volume, signals.rate, max_flow)]  # while it turns
     return LoweringLimits(
         pump=max_flow,
-        creep=max_rest_rate(x_step, signals.rate, INFERENCE.rest.lowers),
+        creep=_limit_of_rest(*speed_and_noise, signals.rate, INFERENCE.rest.lowers),
         load=float(np.median(np.nan_to_num(load))) if load.size else 0.0,
-        noise=max_rest_rate(x_step, signals.rate, fraction=0.0),
+        noise=_limit_of_rest(*speed_and_noise, signals.rate, fraction=0.0),
         time=len(load) / signals.rate,
     )
 

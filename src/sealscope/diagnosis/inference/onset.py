@@ -312,7 +312,7 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     if whitened is None:
         return []
     whitening, z, onsets = whitened
-    steps = whitening.transform_steps(whitening.positions, shape)
+    steps = whitening.unit_steps if shape is None else whitening.transform_steps(whitening.positions, shape)
     fits = whitening.fit_steps(z, steps)
     return [_test_step(whitening, onsets, steps, fits, sign) for sign in signs]
 
@@ -384,7 +384,33 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     return np.asarray(steps * growing)
 
 
-class _Whitening(NamedTuple):
+class _WhitenedSteps:
+    """Unit steps at each of o onsets, transformed to n whitened values, with what does not depend on these values.
+
+    `steps` (n, o): changes of the values; `weight` (w, n): as in `_StepFits`.
+    """
+
+    def __init__(self, steps: Array, weight: Array) -> None:
+        self.steps, self.weight = steps, weight
+
+    @cached_property
+    def energies(self) -> Array:
+        """Weighted sums of squares of each step, for each walk, (w, o)."""
+        return np.maximum(self.weight @ self.steps**2, np.finfo(float).tiny)
+
+    @cached_property
+    def lengths(self) -> Array:
+        """Length of the curve of all steps on the unit sphere, for each walk, (w,).
+
+        It is the sum of the angles between the steps at neighbouring onsets.
+        """
+        norm = np.sqrt(self.energies)
+        cosines = (self.weight @ (self.steps[:, 1:] * self.steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
+        return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Whitening:
     """Matrices that whiten the estimates of a coefficient in K blocks, from their precision and priors only.
 
     The whitened values z (n,) have independent noise of variance 1. Level, slope and a further change of known shape
@@ -404,8 +430,23 @@ class _Whitening(NamedTuple):
     positions: Array
     walk_log_priors: Array
 
-    def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> Array:
-        """Compute the change of the n whitened values by a unit step at each of o onsets, shape (n, o).
+    @cached_property
+    def weight(self) -> Array:
+        """Variance of the noise over that of each whitened value, for each walk, (w, n)."""
+        return np.asarray(1.0 / (1.0 + WALKS[:, None] * self.eigen))
+
+    @cached_property
+    def log_factor(self) -> Array:
+        """Half the log determinant of the weights, plus the log prior of the walk, (w,)."""
+        return np.asarray(0.5 * np.log(self.weight).sum(axis=1) + self.walk_log_priors)
+
+    @cached_property
+    def unit_steps(self) -> _WhitenedSteps:
+        """Unit steps of the coefficient itself at all possible onsets."""
+        return self.transform_steps(self.positions)
+
+    def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> _WhitenedSteps:
+        """Compute the change of the n whitened values by a unit step at each of o onsets.
 
         `positions`, `growth`: as in `step_shapes`; `shape`: factor on the step in each block of the recording, by
         default 1. The block that a prior on the level adds needs no factor: it precedes every onset.
@@ -414,15 +455,12 @@ class _Whitening(NamedTuple):
         steps = step_shapes(count, positions, growth)
         if shape is not None:
             steps[count - len(shape) :] *= shape[:, None]  # the blocks of the recording
-        return np.asarray(self.transform @ steps)
+        return _WhitenedSteps(np.asarray(self.transform @ steps), self.weight)
 
-    def fit_steps(self, z: Array, steps: Array) -> _StepFits:
-        """Fit a step to whitened values `z` (n,) by weighted least squares; `steps` (n, o): whitened unit steps."""
-        weight = 1.0 / (1.0 + WALKS[:, None] * self.eigen)
-        total = np.maximum((weight * z**2).sum(axis=1), np.finfo(float).tiny)
-        energies = np.maximum(weight @ steps**2, np.finfo(float).tiny)
-        log_factor = 0.5 * np.log(weight).sum(axis=1) + self.walk_log_priors
-        return _StepFits(weight, log_factor, total, (weight * z) @ steps, energies)
+    def fit_steps(self, z: Array, steps: _WhitenedSteps) -> _StepFits:
+        """Fit a step to whitened values `z` (n,) by weighted least squares, at each onset of the unit `steps`."""
+        total = np.maximum((self.weight * z**2).sum(axis=1), np.finfo(float).tiny)
+        return _StepFits(self.weight, self.log_factor, total, (self.weight * z) @ steps.steps, steps.energies)
 
 
 def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] | None:
@@ -441,10 +479,9 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
         return None
     if shape is not None:
         shape = np.pad(shape, (len(time) - len(shape), 0))
-    if shape is None and np.array_equal(precision, np.eye(len(time))):
-        whitening = _unit_whitening(len(time), slope, walk)
-    else:
-        whitening = _build_whitening(precision, slope, walk, shape, disturbance)
+    whitening = _find_whitening(
+        precision.tobytes(), len(time), slope, walk, None if shape is None else shape.tobytes(), disturbance
+    )
     if whitening is None:
         return None
     # edges of the blocks: half way between their middles, extrapolated at both ends
@@ -455,9 +492,15 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
 
 
 @lru_cache(maxsize=16)
-def _unit_whitening(count: int, slope: float, walk: float) -> _Whitening | None:
-    """Build the matrices of `_build_whitening` for `count` independent estimates of variance 1, a frequent case."""
-    return _build_whitening(np.eye(count), slope, walk)
+def _find_whitening(
+    precision: bytes, count: int, slope: float, walk: float, shape: bytes | None, disturbance: float
+) -> _Whitening | None:
+    """Build the matrices of `_build_whitening`, once for the tests of all laws, growths and shapes of a coefficient.
+
+    `precision`, `shape`: bytes of the arrays of doubles, `precision` with `count` rows.
+    """
+    shape_values = None if shape is None else np.frombuffer(shape)
+    return _build_whitening(np.frombuffer(precision).reshape(count, count), slope, walk, shape_values, disturbance)
 
 
 def _build_whitening(
@@ -509,10 +552,10 @@ def _build_whitening(
     )
 
 
-def _test_step(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFits, sign: float) -> StepTest:
+def _test_step(whitening: _Whitening, onsets: Array, steps: _WhitenedSteps, fits: _StepFits, sign: float) -> StepTest:
     """Test whitened values of a coefficient for a step at any of o `onsets` [s], by the likelihood ratio to no step.
 
-    `steps` (n, o): whitened unit steps; `fits`: their fits to the values; `sign`: 1 for a step up, -1 for a step down,
+    `steps`: whitened unit steps; `fits`: their fits to the values; `sign`: 1 for a step up, -1 for a step down,
     which is a step up of the values with the opposite sign. Both likelihoods are maximised over the variances of walk
     and noise, with the prior on the walk.
     """
@@ -527,10 +570,7 @@ def _test_step(whitening: _Whitening, onsets: Array, steps: Array, fits: _StepFi
     # variances of the walk that the data alone, without the prior, allow: with or without a step
     data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - whitening.walk_log_priors
     allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
-    # length of the curve of whitened steps on the unit sphere, from the angles between neighbouring onsets
-    norm = np.sqrt(energies[allowed])
-    cosines = (weight[allowed] @ (steps[:, 1:] * steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
-    length = np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1).max()
+    length = steps.lengths[allowed].max()
     noise = float(residual_squares[walk, best]) / n
     size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
     size = moments[walk_without_step] / energies[walk_without_step]

@@ -55,6 +55,8 @@ MIN_POWER = {"p_A": 1e-6, "p_B": 1e-6, "x": 1e-24, "omega": 1e-18}
 MIN_COHERENCE = 1e-3
 #: Number of cut-off frequencies, between the limits of the prior.
 CUTOFFS = 15
+#: Number of samples in the windows that are transformed together.
+MAX_TOGETHER = 100_000
 #: Largest variance of a phase [rad^2], at which a phase is nearly uniform.
 MAX_VARIANCE = 4.0
 
@@ -127,17 +129,18 @@ def _octave_powers(
     values = np.stack([median_filter(recording[name], 3, mode="nearest") for name in pair])
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
     hann, powers = np.hanning(length), []
-    for start in range(0, len(recording) - length + 1, max(length // 2, 1)):
-        window = values[:, start : start + length]
-        if not np.isfinite(window).all():
-            continue
-        spectrum_A, spectrum_B = np.fft.rfft((window - window.mean(axis=1, keepdims=True)) * hann)
-        products = np.stack([np.abs(spectrum_A) ** 2, np.abs(spectrum_B) ** 2, spectrum_A * spectrum_B.conj()])
+    windows = np.lib.stride_tricks.sliding_window_view(values, length, axis=1)[:, :: max(length // 2, 1)]
+    n_together = max(1, MAX_TOGETHER // length)
+    for start in range(0, windows.shape[1], n_together):
+        parts = windows[:, start : start + n_together]
+        parts = parts[:, np.isfinite(parts).all(axis=(0, 2))]
+        spectra_A, spectra_B = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * hann)
+        products = np.stack([np.abs(spectra_A) ** 2, np.abs(spectra_B) ** 2, spectra_A * spectra_B.conj()])
         # lines are 1 / `octaves.seconds` apart, the width of the lowest octave: every octave has a line
-        powers.append(np.add.reduceat(products[:, : first_lines[-1]], first_lines[:-1], axis=1))
-    if not powers:
+        powers.append(np.add.reduceat(products[..., : first_lines[-1]], first_lines[:-1], axis=2))
+    powers_A, powers_B, cross_powers = np.concatenate(powers, axis=1)
+    if not len(powers_A):
         return None
-    powers_A, powers_B, cross_powers = np.moveaxis(np.array(powers), 1, 0)
     return powers_A.real, powers_B.real, cross_powers
 
 

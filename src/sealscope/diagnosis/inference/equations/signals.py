@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
@@ -181,15 +182,48 @@ def find_rests(increments: Array, rate: float, limit: float, shortest: float = M
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(shortest * rate))  # [samples]
     if len(increments) < window + min_length:
         return np.zeros(len(increments), dtype=bool)
-    is_known = np.isfinite(increments)
-    sums = np.concatenate([[0], np.cumsum(np.where(is_known, increments, 0.0))])
-    n_missing = np.concatenate([[0], np.cumsum(~is_known)])
-    # a window of samples is flagged by its first sample if it is slow on average and no sample is missing
-    is_slow = np.abs(sums[window:] - sums[:-window]) <= limit * window / rate
-    is_slow &= n_missing[window:] == n_missing[:-window]
-    n_moving = np.concatenate([[0], np.cumsum(~extend_flags(is_slow, window))])
-    is_rest_start = n_moving[min_length:] == n_moving[:-min_length]  # no moving sample among the next `min_length`
+    sums = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(increments), increments, 0.0))])
+    is_slow = np.empty(len(increments) - window + 1, dtype=bool)
+    _flag_slow_windows(np.asarray(increments, dtype=float), sums, window, limit * window / rate, is_slow)
+    is_rest_start = np.empty(len(increments) - min_length + 1, dtype=bool)
+    _flag_runs(extend_flags(is_slow, window), min_length, is_rest_start)
     return extend_flags(is_rest_start, min_length)
+
+
+@kernel
+def _flag_slow_windows(increments: Any, sums: Any, window: int, limit: float, is_slow: Any) -> None:
+    """Flag windows of samples, by their first sample, whose sum is at most `limit` and that miss no sample.
+
+    `sums` (n + 1,): sums of the known `increments` (n,) before each sample.
+    """
+    n_missing = 0
+    for i in range(len(increments)):
+        n_missing += 0 if np.isfinite(increments[i]) else 1
+        first = i - window + 1
+        if first >= 0:
+            is_slow[first] = n_missing == 0 and abs(sums[i + 1] - sums[first]) <= limit
+            n_missing -= 0 if np.isfinite(increments[first]) else 1
+
+
+@kernel
+def _flag_runs(flags: Any, length: int, is_start: Any) -> None:
+    """Flag the samples from which on `length` successive samples are flagged."""
+    run = 0
+    for i in range(len(flags)):
+        run = run + 1 if flags[i] else 0
+        if i >= length - 1:
+            is_start[i - length + 1] = run >= length
+
+
+@kernel
+def _extend_flags(starts: Any, length: int, flags: Any) -> None:
+    """Write the flags of `extend_flags`."""
+    left = 0  # number of further samples to flag
+    for i in range(len(flags)):
+        if i < len(starts) and starts[i]:
+            left = length
+        flags[i] = left > 0
+        left -= 1
 
 
 def central_difference(values: Array, half_width: int) -> Array:
@@ -203,10 +237,9 @@ def central_difference(values: Array, half_width: int) -> Array:
 
 def extend_flags(starts: NDArray[np.bool_], length: int) -> NDArray[np.bool_]:
     """Flag each flagged sample of `starts` (n,) and the next `length` - 1 samples, shape (n + length - 1,)."""
-    changes = np.zeros(len(starts) + length, dtype=int)  # +1 where a run begins, -1 past its end
-    changes[: len(starts)] += starts
-    changes[length:] -= starts
-    return np.cumsum(changes)[:-1] > 0
+    flags = np.empty(len(starts) + length - 1, dtype=bool)
+    _extend_flags(np.ascontiguousarray(starts), length, flags)
+    return flags
 
 
 def interval_means(values: Array) -> Array:

@@ -59,7 +59,7 @@ from sealscope.diagnosis.verdict.machine import measures_flow
 from sealscope.recordings.channels import COUNTS, METERS, flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import average_over
 from sealscope.units import P_ATM
 
@@ -254,9 +254,17 @@ class RecordedBalance:
     def _pumped(self) -> Array:
         """Volume that the pump delivers between the samples of the recording [m^3], shape (n - 1,).
 
-        It is NaN while the piston moves past the resting pump (`flag_lowering`).
+        It is NaN while the piston moves past the resting pump (`flag_lowering`). It is computed once for the balances
+        with open and with shut valves.
         """
-        channels, rate = dict(self.recording.channels), self.recording.rate
+        equation = self.equations[0]
+        return compute_once(
+            self.recording, ("pumped", self.rig, equation.by_command, equation.left), self._compute_pumped
+        )
+
+    def _compute_pumped(self, recording: Recording) -> Array:
+        """Compute the volume that the pump delivers between the samples (`_pumped`)."""
+        channels, rate = dict(recording.channels), recording.rate
         if self.equations[0].by_command:
             channels = derive_drive_signals(channels, self.rig, rate)
         signals = Signals(channels, rate)
