@@ -19,11 +19,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from sealscope.campaigns.held import PlannedHold, has_shut_off, leak_flow_lpm, plan_hold
+from sealscope.diagnosis.hold.plan import PlannedHold, plan_hold
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.decision import DECISION
+from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.diagnosis.verdict.machine import healthy_leakage
 from sealscope.errors import InputError, SealscopeError
 from sealscope.paragraphs import paragraph
@@ -33,7 +34,7 @@ from sealscope.simulation.bench.machines import centred_start
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 from sealscope.simulation.targets_and_loads import Position, command_or_target, parse_force
-from sealscope.units import parse_quantity
+from sealscope.units import LITRE_PER_MINUTE, parse_quantity
 
 _FALSE_ALARM: float = DECISION.false_alarm.probability
 #: Commands and constant loads that are tried in addition to the machine's usual duty.
@@ -44,6 +45,12 @@ DURATIONS, COMPARISON_SECONDS = (20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 270
 N_RECORDS = 3
 #: Length [s] of the command's beginning from which the sweep of the piston is centred.
 _MAX_CENTRING_SECONDS = 1000.0
+
+
+def has_shut_off(rig: Rig) -> bool:
+    """Return True if a rig has shut-off valves between cylinder and pump, whose openings are stated, not assumed."""
+    sources = [rig.entry(name).source for name in ("line.open_A", "line.open_B")]
+    return rig.line.orifices == "present" and not any(source.startswith(("absent", "assumed")) for source in sources)
 
 
 class PlannedDuty(NamedTuple):
@@ -84,7 +91,7 @@ class RecordingPlan(NamedTuple):
     - `compared`: results of all duties, the usual duty first
     - `usual_pressure` [Pa]: mean pressure difference under the usual duty, at which flows are stated
     - `false_alarm`, `detection`: wanted probabilities of an alarm without the leak and with it
-    - `hold`: a planned locked hold, in which valves shut the cylinder off from its pump, None if none was planned
+    - `hold`: a planned hold test, with valves shut, None if none was planned
     """
 
     rig: str
@@ -104,7 +111,7 @@ class RecordingPlan(NamedTuple):
 
     def lpm(self, conductance: float) -> float | None:
         """Compute the flow [L/min] of a leak with a conductance [m^3/(s Pa)] at the usual pressure; None for inf."""
-        return leak_flow_lpm(conductance, self.usual_pressure)
+        return conductance * self.usual_pressure / LITRE_PER_MINUTE if np.isfinite(conductance) else None
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the planned recording to plain JSON values, with leaks as flows [L/min] at the usual pressure."""
@@ -129,7 +136,7 @@ class RecordingPlan(NamedTuple):
             "detection_probability": self.detection,
             "recording": leak_dict(self.for_detection),
             "separating_from_pump": leak_dict(self.for_separation),
-            "locked_hold": None if self.hold is None else self.hold.as_dict(),
+            "hold": None if self.hold is None else self.hold.as_dict(),
             "compared": [leak_dict(leak) for leak in self.compared],
         }
 
@@ -147,7 +154,7 @@ class RecordingPlan(NamedTuple):
             f"finds {self._format_flow(best.conductance)} {at_pressure}",
             f"  in {100 * self.detection:g} % of recordings, {100 * self.false_alarm:g} % false alarms; rig {self.rig}",
             f"  separated from a leak of the pump: {separation}",
-            *([] if self.hold is None else [self.hold.text(self.usual_pressure)]),
+            *([] if self.hold is None else [f"  or {self.hold.text()}"]),
             f"  {'other duties, ' + f'{self.compared[0].duration:g} s':<34}{'found':>14}{'separable':>18}",
         ]
         lines += [
@@ -264,7 +271,7 @@ def plan_recording(
 
     - `find`: flow at the mean |p_A - p_B| of the `usual` duty; None to find the smallest leak in `COMPARISON_SECONDS`
     - `false_alarm`, `detection`: probabilities of an alarm without the leak and with it
-    - `held` [N]: force that the cylinder holds in a locked hold, with its valves shut; None for the last of `LOADS` if
+    - `held` [N]: force that the cylinder holds in a hold test, with its valves shut; None for the last of `LOADS` if
       the rig has such valves, and otherwise for no hold
     - `progress`: called with a label and the completed fraction
 
@@ -297,7 +304,11 @@ def plan_recording(
         held = parse_quantity(LOADS[-1], "N", name="load")
     hold = None
     if held is not None:
-        hold = plan_hold(rig, held, compared[0].flow, target, false_alarm=false_alarm, detection=detection)
+        cylinder, encoder = rig.cylinder, rig.sensors.x
+        length = 0.5 * cylinder.L + HOLD.column.dead
+        hold = plan_hold(
+            held, cylinder.A_A, length, encoder.resolution, noise=encoder.noise, find=find, detection=detection
+        )
     return RecordingPlan(
         rig.name, target, detecting, separating, tuple(compared), usual_pressure, false_alarm, detection, hold
     )

@@ -20,7 +20,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.hold.readings import Readings, average_parts, read_channel
+from sealscope.diagnosis.hold.readings import Readings, average_parts, read_channel, smooth_course
 from sealscope.diagnosis.hold.regression import (
     Alternative,
     Column,
@@ -49,6 +49,8 @@ STEADY_PRESSURE = 1.1
 SMOOTH_DEGREE = 3
 #: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
 AT_STOP = 3.0
+#: Error of the change of a rounded temperature over a hold, in steps.
+ROUNDED = 0.15
 #: Standard deviation of the logarithm of a time constant within a step of its grid.
 GRID_DEVIATION = 0.3
 #: Millimetres of a metre.
@@ -89,6 +91,7 @@ class HeldLoad:
         self.recording, self.set_up, self.file, self.findings, self.start = recording, set_up, file, findings, start
         self.t = np.zeros(0) if recording is None else recording.t - recording.t[0]
         self.duration = float(self.t[-1]) if self.t.size else 0.0
+        self.rounding = 0.0  # error of the rate [mm/min] due to the steps of a logged temperature
 
     def _channel(self, name: str) -> Array | None:
         """Return the samples of a channel; None if it is absent."""
@@ -142,27 +145,39 @@ class HeldLoad:
     def _settling(self, t: Array, sizes: Sequence[float]) -> list[Alternative]:
         """List what may settle after the valve has shut, at times `t` [s]; `sizes`: deviations of its amplitude."""
         prior = HOLD.settling
-        weight = prior.present / (len(prior.times) * len(sizes))
-        terms = [_exponential(t, time * self.duration, size) for time in prior.times for size in sizes]
+        times = [time for time in prior.times if time <= prior.longest * self.duration]
+        weight = prior.present / max(len(times) * len(sizes), 1)
+        terms = [_exponential(t, time, size) for time in times for size in sizes]
         return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
 
-    def _thermal_column(self, t: Array) -> Column | None:
-        """Build the travel [mm] by which a logged temperature explains a hold, at times `t`; None without a log."""
+    def _thermal_columns(self, t: Array) -> list[Column]:
+        """Build the columns [mm] of a logged temperature at times `t`; none without a log."""
         T = self._channel("T_oil")
         if T is None or np.isfinite(T).mean() < 0.5:
-            return None
-        has_T = np.isfinite(T)
-        mean_t, means = average_parts(self.t[has_T], T[has_T], HOLD.noise.nodes)
-        degree = min(SMOOTH_DEGREE, len(means) - 1)
-        scaled = np.polynomial.Polynomial.fit(mean_t, means, degree)
+            return []
+        logged = read_channel(self.t[np.isfinite(T)], T[np.isfinite(T)], HOLD.cooling.step)
+        weights = 1.0 / np.hypot(logged.loose, max(logged.quantum, 1e-3))
+        degree = max(min(SMOOTH_DEGREE, int(np.count_nonzero(logged.loose == 0.0)) - 1), 1)
+        course = np.polynomial.Polynomial.fit(logged.t, logged.values, degree, w=weights)
         length, deviation = self.column
-        travel = -HOLD.cooling.expansion * length * (scaled(t) - scaled(0.0))
-        return Column(travel, 1.0, math.hypot(deviation, HOLD.cooling.expansion_deviation))
+        scale = -HOLD.cooling.expansion * length
+        self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
+        travel = scale * (course(t) - course(0.0))
+        uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
+        return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel)]
+
+    def _misfit(self, t: Array, travel: Array) -> list[Column]:
+        """Build the bends that a correction by `travel` [mm] leaves, as its law is simplified, at times `t` [s]."""
+        size = INFERENCE.held_oil.misfit * float(np.ptp(travel))
+        if size == 0.0:
+            return []
+        z = 2.0 * t / self.duration - 1.0
+        return [Column(1.5 * z**2 - 0.5, 0.0, size), Column(2.5 * z**3 - 1.5 * z, 0.0, size)]
 
     def _cooling(self, t: Array) -> list[Alternative]:
         """List the alternatives for the travel [mm] due to oil that nobody logs, at times `t`."""
         prior, set_up = HOLD.cooling, self.set_up
-        if self._thermal_column(t) is not None:
+        if self._thermal_columns(t):
             return [Alternative(1.0)]
         sizes = [(0.0, size) for size in prior.sizes]
         if set_up.oil_course == "steady":
@@ -181,7 +196,7 @@ class HeldLoad:
     @property
     def warming(self) -> float:
         """Standard deviation [K] of a change of the oil's temperature that is neither logged nor stated to be small."""
-        if self._thermal_column(self.t[:1]) is not None:
+        if self._thermal_columns(self.t[:1]):
             return 0.0
         return HOLD.cooling.steady if self.set_up.oil_course == "steady" else max(HOLD.cooling.sizes)
 
@@ -189,7 +204,7 @@ class HeldLoad:
         """List the time [min] weighted by the laws of a leak, at times `t` [s]: (prior probability, clock)."""
         p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
         if p is not None:
-            part_t, difference = average_parts(self.t, p - (P_ATM if other is None else other), HOLD.noise.nodes)
+            part_t, difference = smooth_course(self.t, p - (P_ATM if other is None else other))
             difference = np.maximum(difference, 1e-3 * float(np.abs(difference).max()))
             if difference.max() > STEADY_PRESSURE * difference.min():
                 clocks = []
@@ -205,14 +220,12 @@ class HeldLoad:
         """Speed at which the piston sinks [mm/min], with what settles fitted; None without a position."""
         if self.travel is None:
             return None
-        t, thermal = self._travel_readings.t, self._thermal_column(self._travel_readings.t)
-        base = [Column(t / 60.0), Column(np.ones_like(t))]
-        alternatives = [self._settling(t, HOLD.settling.travel)]
-        if thermal is not None:
-            base.append(thermal)
-        elif self.set_up.oil_course:
-            alternatives.append(self._cooling(t))
-        return fit_rate(self._travel_readings, base, alternatives, self.duration)
+        t = self._travel_readings.t
+        cooling = self._cooling(t) if self.set_up.oil_course else [Alternative(1.0)]
+        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._thermal_columns(t)]
+        alternatives = [self._settling(t, HOLD.settling.travel), cooling]
+        fit = fit_rate(self._travel_readings, base, alternatives, self.duration)
+        return fit._replace(rate=fit.rate.add_error(self.rounding))
 
     @cached_property
     def _travel_readings(self) -> Readings:
@@ -223,8 +236,8 @@ class HeldLoad:
         """Read an absolute pressure `p` (n,) [Pa], and the travel [mm] that a column of a `length` [mm] gives way."""
         readings = read_channel(self.t, p, HOLD.noise.pressure * BAR)
         middle = float(np.mean(p)) + np.array([-0.5, 0.5]) * BAR
-        slope = length * float(np.diff(relative_compression(middle))[0]) / BAR
-        compression = length * relative_compression(readings.values)
+        slope = length * float(np.diff(relative_compression(middle).sum(axis=0))[0]) / BAR
+        compression = length * relative_compression(readings.values).sum(axis=0)
         return readings, Readings(readings.t, compression, slope * readings.loose, slope * readings.quantum)
 
     @cached_property
@@ -237,9 +250,8 @@ class HeldLoad:
         _, compression = self._compression_readings(p, _MM * length)
         t = compression.t
         base = [Column(t / 60.0), Column(np.ones_like(t))]
-        thermal = self._thermal_column(t)
-        if thermal is not None:  # oil that cools in a closed chamber loses pressure
-            base.append(Column(-thermal.values, 1.0, thermal.deviation))
+        # oil that cools in a closed chamber loses pressure
+        base += [column._replace(values=-column.values) for column in self._thermal_columns(t)]
         sizes = [_MM * length * strain for strain in HOLD.settling.strain]
         fit = fit_rate(compression, base, [self._settling(t, sizes), self._cooling(t)], self.duration)
         return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
@@ -279,10 +291,13 @@ class HeldLoad:
         readings = self._travel_readings
         base, p = [Column(np.ones_like(readings.t))], self._pressure(self.loaded)
         if p is not None:
-            part_t, compression = average_parts(self.t, relative_compression(p), HOLD.noise.nodes)
             length, deviation = self.column
-            column = length * (np.interp(readings.t, part_t, compression) - compression[0])
-            base.append(Column(column, 1.0, math.hypot(deviation, INFERENCE.held_oil.deviation)))
+            oil = INFERENCE.held_oil
+            widths = (oil.deviation, oil.air_deviation)
+            part_t, course = smooth_course(self.t, p)
+            for compression, width in zip(relative_compression(np.maximum(course, LOWEST)), widths, strict=True):
+                column = length * (np.interp(readings.t, part_t, compression) - compression[0])
+                base += [Column(column, 1.0, math.hypot(deviation, width)), *self._misfit(readings.t, column)]
         fit = self._fit_laws(readings, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
@@ -310,16 +325,15 @@ class HeldLoad:
         p = self._pressure(self.loaded)
         if p is None or self.creep is None:
             return False
-        _, compression = average_parts(self.t, relative_compression(p), 10)
+        _, compression = average_parts(self.t, relative_compression(p).sum(axis=0), 10)
         low, high = self.creep.rate.interval
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
         return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
 
     def _fit_laws(self, readings: Readings, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
-        """Fit the rate of the leak [mm/min] under each law, with temperature and settling, and pool the laws."""
+        """Fit the rate [mm/min] under each law of a leak, with temperature and settling, and pool the laws."""
         t = readings.t
-        thermal = self._thermal_column(t)
-        base = [*base, *([] if thermal is None else [thermal])]
+        base = [*base, *self._thermal_columns(t)]
         alternatives = [self._settling(t, sizes), self._cooling(t)]
         fits, logs = [], []
         for weight, clock in self._clocks(t):
@@ -328,7 +342,8 @@ class HeldLoad:
         weights = np.exp(np.array(logs) - max(logs))
         weights /= weights.sum()
         best = fits[int(weights.argmax())]
-        return best._replace(rate=pool_mixtures([fit.rate for fit in fits], weights))
+        rate = pool_mixtures([fit.rate for fit in fits], weights)
+        return best._replace(rate=rate.add_error(self.rounding))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
         """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""

@@ -9,7 +9,8 @@ import numpy as np
 
 from sealscope.diagnosis.hold.estimates import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
-from sealscope.diagnosis.hold.regression import Column, Mixture, Noise, pool_mixtures, predict_deviation
+from sealscope.diagnosis.hold.plan import predict_rate_error
+from sealscope.diagnosis.hold.regression import Mixture, pool_mixtures
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
 from sealscope.diagnosis.inference.onset import WITHIN_95
@@ -18,8 +19,8 @@ from sealscope.paragraphs import join_names
 from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
 
 PISTON, VALVE, ROD_SEAL, LINE, COOLING = "piston", "load-holding valve", "rod seal", "line", "cooling"
-#: Longest hold that is advised [min], the ratio of a tried duration to the one before, and most readings of it.
-LONGEST_ADVISED, TRIED_RATIO, MAX_READINGS = 24 * 60.0, 1.2, 240
+#: Longest hold that is advised [min], and the ratio of a tried duration to the one before.
+LONGEST_ADVISED, TRIED_RATIO = 24 * 60.0, 1.2
 _CAP = "cap the port of side {side} at the cylinder and hold again: if it sinks as before, the piston leaks"
 _SWAP = "hold the load on the other side: a leak of the piston stays, one of the rod seal does not"
 _CAP_LINE = "cap the port of side {side} at the cylinder and hold again: if it still sinks, the rod seal leaks"
@@ -172,25 +173,6 @@ def find_minutes(hold: HeldLoad, margin: float) -> float | None:
         if half < margin:
             return float(math.ceil(total - minutes))
     return None
-
-
-def predict_rate_error(
-    minutes: float, n_readings: float, noise: Noise, s: float, duration: float, length: float, warming: float
-) -> float:
-    """Predict the standard deviation of the leak's rate [mm/min] of a hold of so many `minutes`.
-
-    `n_readings`: number of readings with the `noise`, whose white part has the standard deviation `s` [mm] and whose
-    random walk reaches its ratio after `duration` [s]; `length` [mm]: of the oil column; `warming` [K]: standard
-    deviation of a temperature change that is not logged, 0 for none. It is the formula of the fit itself.
-    """
-    m = int(min(max(n_readings, 4.0), MAX_READINGS))
-    t = 60.0 * minutes * (np.arange(m) + 0.5) / m
-    columns = [Column(t / 60.0), Column(np.ones(m))]
-    cooling = HOLD.cooling
-    if warming > 0.0:
-        worst = [Column(-np.expm1(-t / time) * cooling.expansion * length, 0.0, warming) for time in cooling.times]
-        return max(predict_deviation(t, [*columns, column], noise, s, duration, m / n_readings) for column in worst)
-    return predict_deviation(t, columns, noise, s, duration, m / n_readings)
 
 
 def describe_oil(hold: HeldLoad) -> str:

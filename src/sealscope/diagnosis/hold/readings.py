@@ -24,6 +24,9 @@ AT_STEP = 0.02
 SHARE_AT_STEP = 0.3
 #: Number of times between passages at which a position that stands is read.
 N_BETWEEN = 10
+#: Degree of the polynomial, time constants of the exponentials [durations of the hold] of a smooth course, and largest
+#: correlation of neighbouring residuals about it.
+SMOOTH_DEGREE, SMOOTH_TIMES, MAX_CORRELATION = 4, (0.02, 0.06, 0.2), 0.3
 #: Largest number of bins in which holds are sought.
 MAX_BINS = 20_000
 
@@ -104,6 +107,25 @@ def _read_passages(t: Array, fine_t: Array, position: Array, origin: float, quan
     loose = np.concatenate([np.zeros(len(groups)), np.full(len(ends), 12.0**-0.5), np.ones(len(between))]) * quantum
     order_t = np.argsort(all_t, kind="stable")
     return Readings(all_t[order_t], values[order_t], loose[order_t], quantum)
+
+
+def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
+    """Average samples (n,) over parts of a hold, and smooth the means unless they wander; return times and values.
+
+    The noise of a pressure that serves as a regressor would hide its effect. The smooth course is a polynomial with
+    exponentials; means whose residuals are correlated are left as they are.
+    """
+    part_t, means = average_parts(t, values, HOLD.noise.nodes)
+    if len(means) <= 2 * (SMOOTH_DEGREE + 1 + len(SMOOTH_TIMES)):
+        return part_t, means
+    z = (part_t - part_t[0]) / (part_t[-1] - part_t[0])
+    powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, SMOOTH_DEGREE)
+    basis = np.column_stack([powers, *(np.exp(-z / time) for time in SMOOTH_TIMES)])
+    smooth = basis @ np.linalg.lstsq(basis, means, rcond=None)[0]
+    residual = means - smooth
+    power = float(residual @ residual)
+    is_white = float(residual[1:] @ residual[:-1]) < MAX_CORRELATION * power
+    return part_t, smooth if is_white else means
 
 
 def find_held_parts(t: Array, x: Array | None, p: Array | None) -> list[tuple[int, int]]:

@@ -46,13 +46,13 @@ class SetUp(NamedTuple):
         if self.volumes and area is not None:
             return self.volumes[-1 if side == "B" else 0] / area, prior.stated
         if x is None or side == "B" or not x > 0.0:
-            return prior.unknown, prior.deviation
+            return prior.unknown, prior.unknown_deviation
         return x + prior.dead, prior.deviation
 
 
 def parse_set_up(
-    area: Any, volume: Any, limit: str | None, oil: str | None, reference: Any, collected: str | None,
-    valve: str | None, capped: str | None,
+    area: Any = None, volume: Any = None, limit: str | None = None, oil: str | None = None, reference: Any = None,
+    collected: str | None = None, valve: str | None = None, capped: str | None = None,
 ) -> SetUp:  # fmt: skip
     """Parse the arguments of `hold_test`; raise InputError for one that is out of its range."""
     areas = _parse_sides(area, "m^2", "area")

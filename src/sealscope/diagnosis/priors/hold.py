@@ -19,7 +19,8 @@ class SettlingPriors(PriorTable):
     """An exponential after a valve has shut."""
 
     present: float  # probability that something settles within the hold
-    times: tuple[float, ...]  # [durations of the hold] time constants
+    times: tuple[float, ...]  # [s] time constants
+    longest: float  # [durations of the hold] longest of them
     travel: tuple[float, ...]  # [mm] standard deviations of the amplitude of a position
     strain: tuple[float, ...]  # standard deviations of the amplitude of the oil's relative compression
 
@@ -31,6 +32,7 @@ class CoolingPriors(PriorTable):
     sizes: tuple[float, ...]  # [K] standard deviations of the whole change
     stated: tuple[float, float]  # mean and standard deviation of the change of stated oil, over its excess
     ambient: float  # [degC] temperature that stated oil approaches
+    step: float  # [K] step of a constant temperature
     steady: float  # [K] standard deviation of the change of oil that is stated to be steady
     expansion: float  # [1/K] thermal expansion of oil in a cylinder
     expansion_deviation: float  # relative standard deviation
@@ -42,6 +44,7 @@ class ColumnPriors(PriorTable):
     dead: float  # [m] added to the position
     unknown: float  # [m] without a position
     deviation: float  # standard deviation of the logarithm
+    unknown_deviation: float  # ... without a position
     stated: float  # that of a stated volume
 
 

@@ -119,13 +119,13 @@ def _lowest_changes() -> Array:
 
 
 def relative_compression(p: Array) -> Array:
-    """Compute the relative volume that usual oil with free air has lost at absolute pressures `p` [Pa].
+    """Compute the relative volumes that usual oil and its free air lose at absolute pressures `p` (n,) [Pa].
 
-    It is c p - a p_0/p with the compressibility c, free air a (Boyle's law) and the atmospheric pressure p_0. Only
-    differences have a meaning.
+    They are the rows (2, n) c p and -a p_0/p, with the compressibility c, the free air a (Boyle's law) and the
+    atmospheric pressure p_0. Only differences have a meaning.
     """
     prior = INFERENCE.held_oil
-    return np.asarray(prior.compressibility * p - prior.air * P_ATM / p)
+    return np.array([prior.compressibility * p, -prior.air * P_ATM / p])
 
 
 class LeakRegression(NamedTuple):

@@ -1,0 +1,263 @@
+"""Hold tests of cylinders drawn at random: do the intervals hold, are results right, and is cooling never a leak?
+
+    python benchmarks/hold_tests.py [--tests 2000] [--seed 1] [--jobs 2]
+
+Bores of 25 to 250 mm, loads on either side, laminar and turbulent leaks past piston or valve, oil with air that is
+warm, steady, cooling or warming, with and without a thermometer, valves that settle, seals that stick and slip, and
+loggers of 0.1 to 1000 Hz with encoder steps, correlated noise and drift. The plant is integrated here, second by
+second, and shares no code with the estimator. Truth of the creep is the leak's flow over the area; where oil cools
+unlogged it is the mean speed of the piston.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter, defaultdict
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+import numpy as np
+
+import sealscope as ss
+
+BAR, ML_MIN, MM_MIN = 1e5, 1e-6 / 60.0, 1e-3 / 60.0
+MAX_SAMPLES = 120_000
+
+
+def log_uniform(random, low, high):
+    """Draw a number, uniform in its logarithm."""
+    return float(np.exp(random.uniform(np.log(low), np.log(high))))
+
+
+def draw_plant(random):
+    """Draw cylinder, load, oil, leak and temperature of a hold."""
+    bore = log_uniform(random, 0.025, 0.25)
+    A = np.pi / 4.0 * bore**2
+    B = A * (1.0 - random.uniform(0.4, 0.75) ** 2)
+    stroke = log_uniform(random, 0.15, 1.5)
+    x = random.uniform(0.15, 0.85) * stroke
+    loaded = "B" if random.random() < 0.2 else "A"
+    thermal = random.choice(["steady", "logged", "unlogged"], p=[0.4, 0.3, 0.3])
+    swing = 0.0 if thermal == "steady" else random.choice([-1.0, 1.0], p=[0.8, 0.2]) * log_uniform(random, 1.0, 20.0)
+    return {
+        "A": A, "B": B, "stroke": stroke, "x": x, "loaded": loaded, "thermal": thermal, "swing": swing,
+        "tau": log_uniform(random, 600.0, 12000.0), "dead": random.uniform(0.05, 0.6),
+        "p": log_uniform(random, 20, 250) * BAR, "K": random.uniform(1.0e9, 1.7e9), "air": random.uniform(0.0, 0.01),
+        "exponent": random.choice([0.5, 0.75, 1.0]),
+        "path": random.choice(["piston", "valve"]), "far": random.choice(["tank", "locked"], p=[0.6, 0.4]),
+        "creep": 0.0 if random.random() < 0.25 else log_uniform(random, 0.02, 10.0) * MM_MIN,
+        "settle": 0.0 if random.random() < 0.5 else log_uniform(random, 0.01, 0.5) * 1e-3,
+        "settle_time": log_uniform(random, 1.0, 30.0), "stop": random.random() < 0.2,
+    }  # fmt: skip
+
+
+def compressibility(plant, p):
+    """Compute the compressibility of oil with free air at the absolute pressure `p`: 1/K and Boyle's law."""
+    return 1.0 / plant["K"] + plant["air"] * 101325.0 / p**2
+
+
+def simulate(plant, seconds):
+    """Integrate a hold second by second: times, position, pressures of loaded and other side, temperature, flow."""
+    steps = max(int(min(seconds, 3600.0)), 60)
+    dt = seconds / steps
+    t = np.arange(steps + 1) * dt
+    T = plant["swing"] * -np.expm1(-t / plant["tau"])
+    area, far_area = (plant["A"], plant["B"]) if plant["loaded"] == "A" else (plant["B"], plant["A"])
+    reach = plant["x"] if plant["loaded"] == "A" else plant["stroke"] - plant["x"]
+    V, far_V = area * (reach + plant["dead"]), far_area * (plant["stroke"] - reach + plant["dead"])
+    p, far_p = plant["p"] + 101325.0, 101325.0 + (5e5 if plant["far"] == "tank" else 20e5) * 0.2
+    c = plant["creep"] * area / (p - far_p) ** plant["exponent"]
+    alpha = 6.7e-4
+    s, rows = 0.0, []
+    for k in range(steps + 1):
+        flow = c * max(p - far_p if plant["path"] == "piston" else p - 101325.0, 0.0) ** plant["exponent"]
+        rows.append((s, p, far_p, flow))
+        if k == steps:
+            break
+        dT = T[k + 1] - T[k]
+        gained = flow * dt if plant["path"] == "piston" else 0.0
+        if plant["stop"]:  # the piston rests on its stop, both chambers are closed
+            p += (-flow * dt / V + alpha * dT) / compressibility(plant, p)
+            if plant["far"] == "locked":
+                far_p += (gained / far_V + alpha * dT) / compressibility(plant, far_p)
+        elif plant["far"] == "tank":  # the load keeps the pressure
+            s += flow * dt / area - alpha * dT * V / area
+        else:  # both closed: the load's balance area dp = far_area dfar_p with the travel s
+            a = area / (V * compressibility(plant, p))
+            b = far_area / (far_V * compressibility(plant, far_p))
+            push = (-flow * dt / V + alpha * dT) / compressibility(plant, p)
+            far_push = (gained / far_V + alpha * dT) / compressibility(plant, far_p)
+            ds = (far_area * far_push - area * push) / (area * a + far_area * b)
+            p, far_p, s = p + push + a * ds, max(far_p + far_push - b * ds, 2e4), s + ds
+        p, far_p = max(p, 1.1e5), max(far_p, 2e4)
+    s, p, far_p, flow = np.array(rows).T
+    if not plant["stop"]:
+        s = s + plant["settle"] * -np.expm1(-t / plant["settle_time"])
+    return t, s, p, far_p, T, flow
+
+
+def draw_logger(random):
+    """Draw a logger: rate, minutes, encoder step, noise."""
+    seconds = log_uniform(random, 60.0, 3600.0)
+    rate = log_uniform(random, max(0.1, 12.0 / seconds), 1000.0)
+    return {
+        "seconds": seconds, "rate": min(rate, MAX_SAMPLES / seconds),
+        "step": random.choice([0.0, 1e-6, 1e-5, 1e-4]), "noise": log_uniform(random, 2e-6, 1e-4),
+        "memory": 0.0 if random.random() < 0.5 else log_uniform(random, 0.05, 5.0),
+        "drift": 0.0 if random.random() < 0.7 else log_uniform(random, 3e-6, 5e-5),
+        "slip": 0.0 if random.random() < 0.75 else log_uniform(random, 1e-5, 2e-4),
+        "p_noise": log_uniform(random, 0.02, 0.5) * BAR, "p_step": random.choice([0.0, 0.01, 0.1]) * BAR,
+        "pressures": random.random() < 0.75,
+    }  # fmt: skip
+
+
+def colour(random, n, step, memory):
+    """Draw noise of variance 1 with a correlation time `memory` [s], sampled every `step` [s]."""
+    white = random.standard_normal(n)
+    if memory <= 0.0:
+        return white
+    from scipy.signal import lfilter
+
+    a = np.exp(-step / memory)
+    return lfilter([np.sqrt(1.0 - a * a)], [1.0, -a], white, zi=[a * random.standard_normal()])[0]
+
+
+def record(random, plant, logger):
+    """Record a simulated hold as the logger does."""
+    t_plant, s, p, far_p, T, flow = simulate(plant, logger["seconds"])
+    t = np.arange(int(logger["seconds"] * logger["rate"])) / logger["rate"]
+    travel = np.interp(t, t_plant, s)
+    if logger["slip"]:  # the seal sticks until the travel is a slip ahead, each of its own size
+        sizes = logger["slip"] * random.uniform(0.5, 1.5, int(np.ptp(travel) / logger["slip"] * 3) + 2)
+        edges = np.concatenate([[0.0], np.cumsum(sizes)]) - random.uniform() * sizes[0]
+        sign = 1.0 if travel[-1] >= travel[0] else -1.0
+        progress = np.maximum.accumulate(sign * (travel - travel[0]))
+        travel = travel[0] + sign * edges[np.searchsorted(edges, progress, side="right") - 1]
+    noise = logger["noise"] * colour(random, t.size, 1.0 / logger["rate"], logger["memory"])
+    drift = logger["drift"] * np.cumsum(random.standard_normal(t.size)) / np.sqrt(t.size)
+    x = plant["x"] + (-1.0 if plant["loaded"] == "A" else 1.0) * travel + noise + drift
+    far = "B" if plant["loaded"] == "A" else "A"
+    values = {"x": np.round(x / logger["step"]) * logger["step"] if logger["step"] else x}
+    if logger["pressures"] or plant["stop"] or plant["far"] == "locked":
+        for name, course in ((f"p_{plant['loaded']}", p), (f"p_{far}", far_p)):
+            gauge = np.interp(t, t_plant, course) - 101325.0 + logger["p_noise"] * random.standard_normal(t.size)
+            values[name] = np.round(gauge / logger["p_step"]) * logger["p_step"] if logger["p_step"] else gauge
+        if plant["stop"] and random.random() < 0.5:
+            del values["x"]
+    if plant["thermal"] != "unlogged" and random.random() < (1.0 if plant["thermal"] == "logged" else 0.7):
+        values["T_oil"] = np.round(10.0 * (320.0 + np.interp(t, t_plant, T))) / 10.0
+    units = {name: "m" if name == "x" else "K" if name == "T_oil" else "Pa" for name in values}
+    speed = (
+        float(s[-1] - s[min(len(s) - 1, int(5 * plant["settle_time"] / (t_plant[1])))]) if not plant["stop"] else 0.0
+    )
+    speed /= max(float(t_plant[-1] - t_plant[min(len(s) - 1, int(5 * plant["settle_time"] / t_plant[1]))]), 1e-9)
+    return ss.Recording(t, values, units, rate=logger["rate"]), float(np.mean(flow)), speed
+
+
+def run_test(seed, first):
+    """Simulate, record and judge one hold; return what is tallied."""
+    random = np.random.default_rng([first, seed])
+    plant, logger = draw_plant(random), draw_logger(random)
+    while plant["stop"] and simulate(plant, logger["seconds"])[2][-1] < 0.3 * plant["p"]:
+        plant["creep"] *= 0.3  # else the chamber is empty before the hold ends
+    recording, flow, speed = record(random, plant, logger)
+    area = plant[plant["loaded"]]
+    limit = (flow if flow > 0.0 else log_uniform(random, 0.05, 2.0) * MM_MIN * area) * log_uniform(random, 0.25, 4.0)
+    areas = (f"{plant['A']} m^2", f"{plant['B']} m^2")
+    volumes = None
+    if plant["stop"] and random.random() < 0.5:
+        lengths = plant["x"] + plant["dead"], plant["stroke"] - plant["x"] + plant["dead"]
+        volumes = tuple(f"{plant[side] * length} m^3" for side, length in zip("AB", lengths, strict=True))
+    begin = time.process_time()
+    try:
+        (result,) = ss.hold_test(recording, area=areas, volume=volumes, limit=f"{limit / ML_MIN} mL/min")
+    except Exception as error:
+        return {"seed": seed, "error": f"{type(error).__name__}: {error}", "plant": plant, "logger": logger}
+    seconds = time.process_time() - begin
+    unlogged = plant["thermal"] == "unlogged"
+    true_creep = (speed if unlogged else flow / area if not plant["stop"] else 0.0) / MM_MIN
+    if plant["far"] == "locked" and not plant["stop"]:
+        true_creep = None if unlogged else speed / MM_MIN if plant["thermal"] == "steady" else None
+    return {
+        "seed": seed, "plant": plant, "logger": logger, "seconds": seconds, "result": result.result,
+        "causes": result.causes, "flow": 6e4 * flow, "limit": 6e4 * limit, "creep": true_creep,
+        "creep_interval": result.creep_interval_mm_per_min, "leak_interval": result.leak_interval_lpm,
+        "log": sorted(recording.channels), "n": len(recording),
+    }  # fmt: skip
+
+
+def tally(tests):
+    """Print what is asked of the tests, in total and by kind."""
+    errors = [test for test in tests if "error" in test]
+    print(f"{len(tests)} tests, {len(errors)} without a result: {Counter(test['error'][:70] for test in errors)}")
+    tests = [test for test in tests if "error" not in test]
+    kinds = {
+        "all": lambda test: True,
+        "steady": lambda test: test["plant"]["thermal"] == "steady",
+        "logged": lambda test: test["plant"]["thermal"] == "logged",
+        "unlogged": lambda test: test["plant"]["thermal"] == "unlogged",
+        "thermometer": lambda test: "T_oil" in test["log"],
+        "at a stop": lambda test: test["plant"]["stop"],
+        "step 0.1 mm": lambda test: test["logger"]["step"] == 1e-4,
+        "stick-slip": lambda test: test["logger"]["slip"] > 0.0,
+        "drift": lambda test: test["logger"]["drift"] > 0.0,
+        "correlated": lambda test: test["logger"]["memory"] > 0.0,
+        "white": lambda test: not any(test["logger"][name] for name in ("slip", "drift", "memory", "step")),
+        "still": lambda test: test["plant"]["creep"] == 0.0,
+        "sinking": lambda test: test["plant"]["creep"] > 0.0,
+        "far locked": lambda test: test["plant"]["far"] == "locked",
+        "far tank": lambda test: test["plant"]["far"] == "tank",
+    }
+    print(f"{'kind':12} {'n':>5} {'creep':>7} {'leak':>7} {'wrong':>7} {'undecided':>10} {'beyond 20 %':>12}")
+    for name, belongs in kinds.items():
+        group = [test for test in tests if belongs(test)]
+        if not group:
+            continue
+        hits = defaultdict(list)
+        for test in group:
+            for key, truth in (("creep", test["creep"]), ("leak", test["flow"])):
+                ends = test[f"{key}_interval"]
+                if ends is not None and truth is not None:
+                    hits[key].append(ends[0] <= truth <= ends[1])
+            passes = test["flow"] <= test["limit"]
+            hits["wrong"].append(test["result"] == ("fail" if passes else "pass"))
+            hits["undecided"].append(test["result"] == "undecided")
+            if abs(test["flow"] / test["limit"] - 1.0) > 0.2:
+                hits["beyond"].append(test["result"] == "undecided")
+        keys = ("creep", "leak", "wrong", "undecided", "beyond")
+        shares = [100.0 * np.mean(hits[key]) if hits[key] else np.nan for key in keys]
+        print(f"{name:12} {len(group):5} " + " ".join(f"{share:8.1f}" for share in shares))
+    cooled = [test for test in tests if test["plant"]["creep"] == 0.0 and test["plant"]["thermal"] == "unlogged"]
+    named = [test for test in cooled if set(test["causes"]) - {"cooling"}]
+    failed = [test for test in cooled if test["result"] == "fail"]
+    print(f"cooling alone, no thermometer: {len(cooled)}, named a leak {len(named)}, fail {len(failed)}")
+    print("path, told as:")
+    told = Counter()
+    for test in tests:
+        if test["causes"] and test["causes"] != ("cooling",):
+            words = (
+                "piston" if test["causes"] == ("piston",) else "both" if "piston" in test["causes"] else "not piston"
+            )
+            truth = test["plant"]["path"] if test["plant"]["creep"] else "nothing"
+            told[test["plant"]["far"], truth, words] += 1
+    for key, count in sorted(told.items()):
+        print("  ", *key, count)
+    print(f"processor time a test: median {np.median([test['seconds'] for test in tests]):.3f} s")
+
+
+def main():
+    """Run the tests and print the tally."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--tests", type=int, default=2000)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--jobs", type=int, default=2)
+    arguments = parser.parse_args()
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        tests = list(pool.map(partial(run_test, first=arguments.seed), range(arguments.tests), chunksize=10))
+    tally(tests)
+    return tests
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Predict a hold test by the formula of its own fit: minutes to hold, and the smallest creep and leak it will show."""
+
+from __future__ import annotations
+
+import math
+from statistics import NormalDist
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.hold.regression import Column, Noise, predict_deviation
+from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.errors import InputError
+from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
+
+#: Durations that are tried [min], and the duration that is planned if no leak to detect is stated.
+HOLD_MINUTES, DEFAULT_MINUTES = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 240.0), 10.0
+#: Most readings in the formula; more count by their smaller noise.
+MAX_READINGS = 240
+#: Readings a second that are assumed of a logger.
+READINGS_PER_SECOND = 1.0
+
+
+def predict_rate_error(
+    minutes: float, n_readings: float, noise: Noise, s: float, duration: float, length: float, warming: float
+) -> float:
+    """Predict the standard deviation of the leak's rate [mm/min] in a hold of so many `minutes`.
+
+    `n_readings`: number of readings with the `noise`, whose white part has the standard deviation `s` [mm] and whose
+    random walk reaches its ratio after `duration` [s]; `length` [mm]: of the oil column; `warming` [K]: standard
+    deviation of a temperature change that is not logged, 0 for none.
+    """
+    m = int(min(max(n_readings, 4.0), MAX_READINGS))
+    t = 60.0 * minutes * (np.arange(m) + 0.5) / m
+    columns = [Column(t / 60.0), Column(np.ones(m))]
+    if warming == 0.0:
+        return predict_deviation(t, columns, noise, s, duration, m / n_readings)
+    size = HOLD.cooling.expansion * length * warming
+    courses = [Column(np.expm1(-t / time), 0.0, size) for time in HOLD.cooling.times]
+    return max(predict_deviation(t, [*columns, course], noise, s, duration, m / n_readings) for course in courses)
+
+
+class PlannedHold(NamedTuple):
+    """A planned hold: its `minutes`, and what it shows.
+
+    `pressure` [Pa]: that of the loaded side; `creep` [m/s], `leak` [m^3/s]: smallest ones whose interval excludes zero
+    with the wanted probability; `warming` [K]: standard deviation of an unlogged change of the oil's temperature.
+    """
+
+    minutes: float
+    pressure: float
+    creep: float
+    leak: float
+    warming: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """Convert the hold to plain JSON values."""
+        return {
+            "minutes": self.minutes,
+            "pressure_Pa": self.pressure,
+            "smallest_creep_mm_per_min": self.creep / MM_PER_MINUTE,
+            "smallest_leak_lpm": self.leak / LITRE_PER_MINUTE,
+            "unlogged_K": self.warming,
+        }
+
+    def text(self) -> str:
+        """Format the planned hold as two lines of text."""
+        oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else "the oil's temperature logged"
+        creep, leak = self.creep / MM_PER_MINUTE, self.leak / ML_PER_MINUTE
+        return (
+            f"hold the load for {self.minutes:g} min at {self.pressure / BAR:.3g} bar, valves shut: `sealscope hold`\n"
+            f"  shows creep of {creep:.2g} mm/min, a leak of {leak:.2g} mL/min, {oil}"
+        )
+
+
+def plan_hold(
+    force: float,
+    area: float,
+    length: float,
+    step: float,
+    *,
+    noise: float = 0.0,
+    warming: float = 0.0,
+    find: float | None = None,
+    detection: float = 0.9,
+) -> PlannedHold:
+    """Find the shortest hold that shows a leak of the flow `find` [m^3/s], or what ten minutes show without it.
+
+    `force` [N]: load; `area` [m^2]: of the loaded side; `length` [m]: of its oil column; `step`, `noise` [m]: encoder
+    step and noise of the position; `warming` [K]: as of `PlannedHold`; `detection`: probability that the leak's
+    interval excludes zero. If no duration in `HOLD_MINUTES` suffices, the longest is planned. Raises InputError for a
+    load or an area that is not above 0.
+    """
+    for name, value in (("load", force), ("area", area), ("length of the oil column", length)):
+        if not value > 0.0:
+            raise InputError(f"{name} of a hold must be above 0, got {value:g}")
+    quantile = WITHIN_95 + NormalDist().inv_cdf(detection)
+    s = max(1e3 * math.hypot(noise, step / math.sqrt(12.0)), 1e-6)
+    plans = []
+    for minutes in HOLD_MINUTES:
+        n_readings = 60.0 * minutes * READINGS_PER_SECOND
+        error = predict_rate_error(
+            minutes, n_readings, Noise(0.0, math.inf, 1.0), s, 60.0 * minutes, 1e3 * length, warming
+        )
+        if noise < step / 3.0:  # a position that stays within one step tells the creep by that step alone
+            error = math.hypot(error, 1e3 * step / math.sqrt(6.0) / minutes)
+        creep = quantile * error * MM_PER_MINUTE
+        plans.append(PlannedHold(minutes, force / area, creep, creep * area, warming))
+    if find is None:
+        return plans[HOLD_MINUTES.index(DEFAULT_MINUTES)]
+    return next((plan for plan in plans if plan.leak <= find), plans[-1])

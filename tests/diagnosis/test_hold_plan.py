@@ -1,0 +1,52 @@
+"""The formula of a planned hold against what hold tests then show."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.campaigns.smallest import DetectableLeak, PlannedDuty, RecordingPlan, has_shut_off
+from sealscope.diagnosis.hold.plan import plan_hold
+from sealscope.errors import InputError
+from sealscope.parameters import load_rig
+
+AREA, NOISE = 3e-3, 1e-4
+
+
+def test_a_leak_as_planned_is_shown_as_often_as_planned():
+    planned = plan_hold(2e4, AREA, 0.65, 1e-6, noise=NOISE, detection=0.8)
+    shown = 0
+    for seed in range(30):
+        random = np.random.default_rng(seed)
+        t = np.arange(0.0, 60.0 * planned.minutes, 1.0)
+        values = {"x": 0.4 - planned.creep * t + NOISE * random.standard_normal(t.size), "T_oil": 320.0 + 0.0 * t}
+        recording = ss.Recording(t, values, {"x": "m", "T_oil": "K"}, rate=1.0)
+        (result,) = ss.hold_test(recording, area=AREA)
+        shown += result.leak_interval_lpm[0] > 0.0
+    assert 15 <= shown <= 30
+
+
+def test_a_longer_hold_shows_less_and_drift_more():
+    planned = plan_hold(2e4, AREA, 0.65, 1e-4)
+    longer = plan_hold(2e4, AREA, 0.65, 1e-4, find=0.3 * planned.leak)
+    assert longer.minutes > planned.minutes and longer.leak <= 0.3 * planned.leak
+    drifting = [plan_hold(2e4, AREA, 0.65, 1e-4, warming=warming).leak for warming in (0.0, 1.0, 3.0)]
+    assert drifting == sorted(drifting) and drifting[-1] > 2.0 * drifting[0]
+    assert plan_hold(4e4, AREA, 0.65, 1e-4).pressure == pytest.approx(2.0 * planned.pressure)
+
+
+@pytest.mark.parametrize("sizes", [(0.0, AREA, 0.6), (2e4, 0.0, 0.6), (2e4, AREA, 0.0)])
+def test_a_hold_needs_load_area_and_oil(sizes):
+    with pytest.raises(InputError, match="above 0"):
+        plan_hold(*sizes, 1e-4)
+
+
+def test_a_plan_names_the_hold():
+    found = DetectableLeak(PlannedDuty("3 sin(4t)"), 60.0, 1e-14, 1e-13, 1e5)
+    hold = plan_hold(2e4, AREA, 0.65, 1e-4)
+    plan = RecordingPlan("bench", None, found, found, (found,), 1e5, 0.01, 0.9, hold)
+    assert "hold the load for 10 min" in plan.text()
+    assert plan.as_dict()["hold"]["minutes"] == 10.0
+    assert "hold" not in plan._replace(hold=None).text()
+    assert not has_shut_off(load_rig("thesis"))
