@@ -15,19 +15,20 @@ import threading
 import time
 import zlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from sqlalchemy.exc import IntegrityError
 
-from sealscope.diagnosis.commissioned.watched import is_remeasured, load_watched
+from sealscope.diagnosis.commissioned.watched import WatchedMachine, is_remeasured, load_watched
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.watch import STATE_VERSION, Watch, watch
 from sealscope.diagnosis.verdict.states import LEAKING, MachineState, state_of
-from sealscope.errors import InputError
+from sealscope.errors import InputError, SealscopeError
 from sealscope.monitor.alarms import Alarm, AlarmJudge
 from sealscope.monitor.database import tables
 from sealscope.monitor.database.machine_files import record_mark
@@ -43,6 +44,7 @@ from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
 
 _log = logging.getLogger(__name__)
+_Made = TypeVar("_Made")
 _MAX_COMMENT_LENGTH = 2000
 #: How long an alarm is shelved, on the clock of the samples [s].
 _SHELVED_S = 8 * 3600.0
@@ -50,6 +52,10 @@ _SHELVED_S = 8 * 3600.0
 PENDING_BLOCKS, PENDING_BYTES = 16, 400_000
 #: Counter of the blocks that raised an error.
 DROPPED = "blocks that raised an error"
+#: Counter of transactions that the database lacks at the start (`MonitorStore.n_lost`).
+LOST_TRANSACTIONS = "transactions that the database has lost"
+#: How often a machine's file that cannot be read is tried again [s].
+_RETRY_S = 5.0
 #: Counter of blocks whose times seem to be in another unit than seconds, and the relative deviation up to which they
 #: seem so.
 WRONG_PACE, _SAME_PACE = "blocks whose clock runs too fast for their rate", 0.01
@@ -258,30 +264,90 @@ class WatchedActuators:
         self._changes, self.change_number, self.closed = itertools.count(1), 0, False
         self.supervisor = Supervisor(outage_reason, self._notify_change)
         self._lock = threading.RLock()
+        self._machines: dict[str, WatchedMachine] = {}  # by the name or file of a rig, as last read
+        self._unread_files: dict[str, float] = {}  # files that could not be read, with the time of the next attempt [s]
+        self.count(LOST_TRANSACTIONS, store.n_lost)
         self._actuators = {name: self._restore(self.settings[name]) for name in self.settings}
 
     def _restore(self, settings: ActuatorSettings) -> _Actuator:
-        """Restore an actuator from its last checkpoint and the samples since then, or create and store it."""
+        """Restore an actuator from its last checkpoint and the samples since then, or create and store it.
+
+        If the stored state is damaged, the actuator begins anew, and this is logged; its open alarm stays.
+        """
         name = settings.name
-        watched = load_watched(settings.rig)
-        is_cut_into_recordings = watched.machine is not None and settings.folder is None and settings.recording_s > 0.0
-        # share of the allowed false alarms for the blocks; the recordings take the rest
-        block_share = 1.0 - STREAM_SHARE if is_cut_into_recordings else 1.0
-        fresh = watch(
-            watched.rig,
-            false_alarms_per_1000_h=settings.false_alarms_per_1000_h * block_share,
-            learn_hours=settings.learn_hours,
-            healthy=watched.healthy,
-        )
         n_stored = self.store.last_number(tables.blocks, name)
-        recorder = StreamRecorder(name, settings.recording_s) if is_cut_into_recordings else None
-        actuator = _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
-        checkpoint = self.store.checkpoint(name)
-        if checkpoint is None or self._load_checkpoint(actuator, *checkpoint):  # a new checkpoint is needed
+        actuator = self._make_actuator(settings, n_stored)
+        try:
+            checkpoint = self.store.checkpoint(name)
+            is_incomplete = checkpoint is None or self._load_checkpoint(actuator, *checkpoint)
+        except Exception as error:
+            if outage_reason(error) is not None:
+                raise
+            _log.error("%s: begins anew, as its stored state is damaged: %s", name, describe_error(error))
+            actuator, is_incomplete = self._make_actuator(settings, n_stored), True
+            self._restore_numbers(actuator)
+        if is_incomplete:  # a new checkpoint is needed
             rows = StoredRows()
             self._checkpoint(actuator, rows)
             self.store.commit_rows(rows)
         return actuator
+
+    def _make_actuator(self, settings: ActuatorSettings, n_stored: int) -> _Actuator:
+        """Make an actuator that has not judged any samples, of which `n_stored` blocks are stored."""
+        name = settings.name
+
+        def make(watched: WatchedMachine) -> _Actuator:
+            is_recorded = watched.machine is not None and settings.folder is None and settings.recording_s > 0.0
+            fresh = watch(
+                watched.rig,
+                # the blocks have a share of the allowed false alarms; the recordings take the rest
+                false_alarms_per_1000_h=settings.false_alarms_per_1000_h * (1.0 - STREAM_SHARE if is_recorded else 1.0),
+                learn_hours=settings.learn_hours,
+                healthy=watched.healthy,
+            )
+            recorder = StreamRecorder(name, settings.recording_s) if is_recorded else None
+            return _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
+
+        return self._with_machine(settings.rig, make)
+
+    def _with_machine(self, rig: str, make: Callable[[WatchedMachine], _Made]) -> _Made:
+        """Call `make` with the machine or rig of a name or file `rig`, read anew, and return its result.
+
+        If the file cannot be read or used, as while somebody edits it, the machine read before stays, and an outage
+        begins, which ends when the file can be read again. Without an earlier machine the error is raised.
+        """
+        part = f"machine's file {Path(rig).name}"
+        try:
+            watched = load_watched(rig)
+            result = make(watched)
+        except Exception as error:
+            if rig not in self._machines:
+                raise
+            self._unread_files[rig] = time.monotonic() + _RETRY_S
+            reason = str(error) if isinstance(error, SealscopeError) else describe_error(error)
+            self.supervisor.part(part).begin_outage(f"{reason}: the machine read before stays")
+            return make(self._machines[rig])
+        self._machines[rig] = watched
+        if self._unread_files.pop(rig, None) is not None:
+            self.supervisor.part(part).end_outage()
+        return result
+
+    def _restore_numbers(self, actuator: _Actuator) -> None:
+        """Continue the numbers of blocks, baselines and alarms of an actuator without its state; keep its open alarm.
+
+        The numbers and the alarm are those of the other tables.
+        """
+        name = actuator.settings.name
+        alarms = self.store.alarms(actuator=name)
+        baseline_version = max((int(alarm["baseline"]) for alarm in alarms), default=0)
+        with suppress(KeyError, TypeError, ValueError):  # of a summary without a baseline
+            baseline_version = max(baseline_version, int(self.store.summaries()[name]["baseline"]["version"]))
+        actuator.watch.continue_from(self.store.last_number(tables.estimates, name), baseline_version)
+        actuator.judge.raised = self.store.last_alarm_number(name)
+        latest_alarm = next(iter(alarms), None)
+        if latest_alarm is not None and latest_alarm["id"] == f"{name}-{actuator.judge.raised}":
+            alarm = restore(Alarm, {field.name: latest_alarm[field.name] for field in fields(Alarm)}, "alarm")
+            actuator.judge.alarm = None if alarm.is_over else alarm
 
     def _load_checkpoint(self, actuator: _Actuator, settings_json: str, state: Mapping[str, Any]) -> bool:
         """Restore an actuator from the settings and `state` of its checkpoint, and judge the samples since then again.
@@ -315,6 +381,8 @@ class WatchedActuators:
                 actuator.recorder.take(number, samples)
             # with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
+        # samples that are damaged have no effect on the restored detector, but their estimates are stored
+        actuator.watch.blocks = max(actuator.watch.blocks, self.store.last_number(tables.estimates, name))
         actuator.watch.false_alarms_per_1000_h = fresh.false_alarms_per_1000_h  # may change without a new baseline
         if actuator.watch.healthy is not None:  # None once a leak was withdrawn (`Watch.dismiss`)
             actuator.watch.healthy = fresh.healthy
@@ -346,6 +414,9 @@ class WatchedActuators:
         Blocks of actuators not in the settings are only counted. After an error nothing is stored: repeat the call.
         """
         with self._lock:
+            for rig, retry in [*self._unread_files.items()]:
+                if time.monotonic() >= retry:
+                    self._with_machine(rig, lambda watched: watched)
             known_blocks = [block for block in blocks if block.actuator in self.settings]
             self._last_block_clock |= dict.fromkeys((block.actuator for block in known_blocks), time.monotonic())
             self._store_once(known_blocks)
@@ -413,7 +484,8 @@ class WatchedActuators:
         name, number = settings.name, actuator.n_stored
         if recorder is not None and (recording := recorder.take(number, samples)) is not None:
             try:
-                verdict = judge_stream(settings.rig, recording, limit_lpm=settings.error_lpm)
+                watched = self._with_machine(settings.rig, lambda watched: watched)  # the file may have changed
+                verdict = judge_stream(watched, recording, limit_lpm=settings.error_lpm)
             except Exception as error:
                 _log.warning("%s: its last recording is not judged: %s", name, describe_error(error))
         estimates, events = actuator.judge_samples(samples, follows=follows, settings=settings, verdict=verdict)
@@ -464,8 +536,9 @@ class WatchedActuators:
         """Add the summary of an actuator to the rows that will be stored, if it has changed; log counters that grew."""
         summary = actuator.summary()
         if summary != actuator.stored_summary:
-            counters_before = (actuator.stored_summary or summary)["counters"]
-            log_growth(actuator.settings.name, counters_before, summary["counters"])
+            if actuator.settings.folder is None:  # between files there are always pauses
+                counters_before = (actuator.stored_summary or summary)["counters"]
+                log_growth(actuator.settings.name, counters_before, summary["counters"])
             actuator.stored_summary = summary
             rows.add_summary(actuator.settings.name, summary)
 

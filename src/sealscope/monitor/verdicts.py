@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.commissioned.watched import WatchedMachine, load_watched
+from sealscope.diagnosis.commissioned.watched import WatchedMachine
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
@@ -195,9 +195,10 @@ def judge_recording(
     return RecordingVerdict.from_diagnosis(diagnosis, start_s + shift, end_s + shift, shift)
 
 
-def judge_stream(rig: str, recording: Recording, *, limit_lpm: float | None = None) -> RecordingVerdict | None:
-    """Judge a recording of an actuator's stream by `judge_recording`; raise InputError if `rig` cannot be read."""
-    watched = load_watched(rig)  # read anew, as the file may have changed
+def judge_stream(
+    watched: WatchedMachine, recording: Recording, *, limit_lpm: float | None = None
+) -> RecordingVerdict | None:
+    """Judge a recording of an actuator's stream by `judge_recording`."""
     start, end = (float(recording.t[k]) for k in (0, -1))
     name = f"stream from {clock_text(start)} to {clock_text(end)}"
     return judge_recording(watched, replace(recording, t=recording.t - start), name, start, limit_lpm=limit_lpm)

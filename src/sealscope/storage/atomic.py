@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import platform
 import re
@@ -15,6 +16,7 @@ from pathlib import Path
 from sealscope.errors import InputError
 from sealscope.storage.opening import find_wrong_kind
 
+_log = logging.getLogger(__name__)
 #: Bytes to which the file's name is cut in the name of its temporary file, as file systems limit names to 255 bytes.
 _MAX_NAME = 60
 #: Name of a temporary file: .TARGET.COMPUTER-PROCESS.RANDOM.part.
@@ -42,12 +44,13 @@ def check_folder(file: Path) -> None:
 
 
 @contextmanager
-def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
+def atomic_write(path: str | os.PathLike[str], like: Path | None = None) -> Iterator[Path]:
     """Write a file atomically: the `with` block fills a temporary file, which then replaces the file `path`.
 
     The block gets the path of the temporary file, which is in the same folder and is removed after an error. File and
-    folder are synced to the disk: a power loss leaves either the old or the new file. A replaced file keeps its
-    permissions. Raises InputError if `path` cannot be written, and for any OSError in the block.
+    folder are synced to the disk: a power loss leaves either the old or the new file. Owner, group and permissions are
+    those of the file `like`, if it exists, else of the replaced file. Raises InputError if `path` cannot be written,
+    and for any OSError in the block.
     """
     target = Path(path)
     try:
@@ -64,7 +67,11 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     try:
         yield temporary
         _sync(temporary, os.O_RDWR)  # Windows syncs only what is open for writing
-        temporary.chmod(_file_mode(target))
+        present = next((file for file in (like, target) if file is not None and file.exists()), None)
+        if present is None:
+            temporary.chmod(_new_file_mode())
+        else:
+            copy_access(present, temporary, name=target)
         temporary.replace(target)
         with suppress(OSError):  # Windows cannot open folders, and some file systems cannot sync them
             _sync(target.parent, os.O_RDONLY)
@@ -74,10 +81,29 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def _file_mode(target: Path) -> int:
-    """Return the permission bits of the file `target`, or those of a new file (by the umask) if it does not exist."""
-    with suppress(FileNotFoundError):
-        return target.stat().st_mode & 0o777
+def copy_access(source: Path, file: Path, name: Path | None = None) -> None:
+    """Give a file the owner, the group and the permissions of the file `source`.
+
+    Only the administrator may give a file to another user: a process of somebody else changes the group, if it may, and
+    logs that the file has another owner than before, under the `name` that the file will have. Raises OSError if the
+    permissions cannot be changed.
+    """
+    status, present = source.stat(), file.stat()
+    if hasattr(os, "chown"):
+        for user, group in ((status.st_uid, status.st_gid), (-1, status.st_gid)):
+            if (present.st_uid, present.st_gid) == (status.st_uid, status.st_gid):
+                break
+            with suppress(PermissionError):
+                os.chown(file, user, group)
+                present = file.stat()
+        if present.st_uid != status.st_uid:
+            _log.warning("%s now belongs to user %d, no more to %d", name or file, present.st_uid, status.st_uid)
+    if present.st_mode & 0o777 != status.st_mode & 0o777:
+        file.chmod(status.st_mode & 0o777)
+
+
+def _new_file_mode() -> int:
+    """Return the permission bits of a new file, by the umask of this process."""
     mask = os.umask(0)  # the mask can be read only by setting it
     os.umask(mask)
     return 0o666 & ~mask

@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from sealscope.errors import InputError, printable
+from sealscope.storage.atomic import copy_access
 from sealscope.storage.opening import open_inner
 
 _log = logging.getLogger(__name__)
@@ -53,17 +54,21 @@ def numeric_sort_key(name: str) -> list[str | int]:
 
 
 @contextmanager
-def lock_file(file: Path, busy: str | None, wait: float = 0.0) -> Iterator[None]:
+def lock_file(file: Path, busy: str | None, wait: float = 0.0, like: Path | None = None) -> Iterator[None]:
     """Hold the lock `file` against other processes while the block runs; the lock also ends with the process.
 
     If another process still holds it after `wait` [s], InputError with the message `busy` is raised; if `busy` is None,
-    the wait has no limit. The file is created if necessary, and never emptied. Raises InputError for a link.
+    the wait has no limit. The file is created if necessary, and never emptied. It gets the owner and the permissions of
+    the file `like`, if that exists, so that whoever may write that file can lock it. Raises InputError for a link.
     """
     from filelock import FileLock, Timeout
 
     lock = FileLock(file, timeout=-1 if busy is None else wait)  # -1: no limit
     try:
         open_inner(file, "a lock", mode="ab+").close()  # creates the file, or raises an error if it is a link
+        if like is not None and like.exists():
+            with suppress(PermissionError):  # a lock of somebody else, which can be used nevertheless
+                copy_access(like, file)
         lock.acquire(poll_interval=0.01)
     except Timeout:
         raise InputError(str(busy)) from None

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from dataclasses import replace
 from multiprocessing.connection import Connection
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+import numpy as np
 import pytest
 
 import sealscope as ss
@@ -148,3 +151,43 @@ def test_a_change_that_fails_leaves_the_file(pair, tmp_path):
     with refusal("new"):
         update_machine(path, lambda machine: machine.with_healthy(run(1), file="run1.nc"))
     assert path.read_bytes() == pair["press.toml"]
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root may give files away")
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.slow) for seed in (2, 3, 4, 5))])
+def test_files_of_a_machine_keep_owner_and_mode_whoever_changes_them(seed: int, pair):
+    """Root adds a recording or a mark to a machine of another user, who can go on reading, writing and locking it."""
+    random = np.random.default_rng(seed)
+    user, group = (int(number) for number in random.integers(10_000, 60_000, 2))
+    mode = int(random.choice([0o600, 0o640, 0o660, 0o644]))
+    with TemporaryDirectory() as name:  # not `tmp_path`, which is root's alone
+        folder = Path(name)
+        path = place(pair, folder)
+        for file in (folder, *folder.iterdir()):
+            os.chown(file, user, group)
+            file.chmod(0o755 if file == folder else mode)
+        if random.random() < 0.5:  # files that an earlier version left to root, open to all
+            for file in (path.with_suffix(".toml.bak"), folder / ".press.toml.lock"):
+                file.write_bytes(b"")
+        before = os.umask(int(random.choice([0o022, 0o077])))
+        try:
+            add(path, 3) if random.random() < 0.5 else mark(path, 1)
+        finally:
+            os.umask(before)
+        files = sorted(folder.iterdir())
+        assert {file.suffix for file in files} == {".toml", ".healthy", ".bak", ".lock"}
+        for file in files:
+            status = file.stat()
+            assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (user, group, mode), file.name
+        child = os.fork()
+        if child == 0:
+            exit_status = 1
+            try:
+                os.setgid(group)
+                os.setuid(user)
+                mark(path, 2)
+                exit_status = 0
+            finally:
+                os._exit(exit_status)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+        assert "press-2" in path.read_text()

@@ -392,8 +392,11 @@ def read_lines(path: Path) -> list[Line]:
         return []
 
 
-def write_lines(lines: Collection[Line], path: Path) -> None:
-    """Write a file of summaries as a whole; raise InputError if it would be too large or cannot be written."""
+def write_lines(lines: Collection[Line], path: Path, like: Path | None = None) -> None:
+    """Write a file of summaries as a whole; raise InputError if it would be too large or cannot be written.
+
+    `like`: file whose owner and permissions it gets (`atomic_write`).
+    """
     size = len(_HEAD) + sum(len(line.data) + _DIGITS + 2 for line in lines)  # 2: a blank and a line feed
     max_line = max((len(line.data) + 2 * _DIGITS for line in lines), default=0)  # longest line, with a margin
     if size > MAX_SIZE or len(lines) > _MAX_SUMMARIES or max_line > _MAX_LINE:
@@ -401,7 +404,7 @@ def write_lines(lines: Collection[Line], path: Path) -> None:
         raise InputError(
             f"a file of healthy summaries must have at most {limits}, got {len(lines)} and {size} bytes ({path})"
         )
-    with atomic_write(path) as temporary, temporary.open("wb") as file:
+    with atomic_write(path, like) as temporary, temporary.open("wb") as file:
         file.write(_HEAD)
         for line in lines:
             file.write(b"%b %b\n" % (line.checksum.encode(), line.data))

@@ -189,7 +189,7 @@ def _follow_links(path: str | os.PathLike[str]) -> Path:
 
 def _lock(target: Path) -> AbstractContextManager[object]:
     """Lock the file `target` against other writers; entering raises InputError if one holds the lock for over 60 s."""
-    return lock_file(target.with_name(f".{target.name}.lock"), _BUSY.format(target), _LONGEST_WAIT)
+    return lock_file(target.with_name(f".{target.name}.lock"), _BUSY.format(target), _LONGEST_WAIT, like=target)
 
 
 def _write_files(machine: CommissionedMachine, target: Path) -> None:
@@ -224,9 +224,10 @@ def _write_files(machine: CommissionedMachine, target: Path) -> None:
             size += len(line.data)
             if size < _SPARE:
                 lines[checksum] = line
-    write_lines([*lines.values()], target.with_suffix(SUFFIX))
+    # all belong to the owner of the TOML file, with its permissions, whoever adds a recording
+    write_lines([*lines.values()], target.with_suffix(SUFFIX), like=target)
     if target.is_file():
-        with atomic_write(backup) as temporary:
+        with atomic_write(backup, like=target) as temporary:
             temporary.write_bytes(target.read_bytes())
     with atomic_write(target) as temporary:
         temporary.write_bytes(data)

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import itertools
 import json
+import logging
 import threading
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,16 +29,28 @@ from sealscope.errors import InputError
 from sealscope.monitor.alarms import Alarm
 from sealscope.monitor.database import tables
 from sealscope.monitor.database.postgresql import engine_options, limit_answers
+from sealscope.monitor.database.sqlite_files import FilesReplaced, SqliteFiles
+from sealscope.monitor.supervisor import describe_error
 from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.recordings.recording import Recording
 from sealscope.storage.plain_state import restore
 
+_log = logging.getLogger(__name__)
 #: Number of block identities that are stored for each actuator: more than a day of messages of 1 s each.
 MAX_IDENTITIES = 100_000
 #: Number of refused messages that are stored, the newest ones.
 MAX_REFUSED = 1000
 #: Attempts to create the tables, as several monitors may start at once.
 _ATTEMPTS = 10
+#: Queries of the page at a time, at most; connections for them and for outputs; longest wait for one [s].
+MAX_QUERIES, _N_READERS, QUERY_WAIT_S = 4, 8, 5.0
+#: Most estimates that are averaged to one row of a history: of more, every second one, every third one and so on.
+_MAX_AVERAGED = 32
+#: What each alarm and each summary of an actuator has; a row without it is damaged.
+_ALARM_KEYS = ("id", "actuator", "level", "state", "raised_s", "onset_s", "baseline")
+_SUMMARY_KEYS = ("t", "status", "by", "blocks", "counters", "total_lpm", "leak_lpm", "leak_interval_lpm", "status_word")
+#: Name of the number of transactions in the table `facts`.
+_TRANSACTIONS = "transactions"
 
 
 class StoredSamples(NamedTuple):
@@ -115,12 +129,19 @@ class MonitorStore:
         # one thread writes at a time: SQLite would make the others wait, and then fail
         self._writing_lock: AbstractContextManager[object] = threading.RLock() if is_file else nullcontext()
         url = f"sqlite:///{Path(database)}" if is_file else database
+        #: Transactions that the database has lost since its last monitor, because of a removed or replaced file.
+        self.n_lost = self._n_transactions = 0
+        is_new = is_file and not Path(database).exists()
+        self._files: SqliteFiles | None = None
+        self._reported_rows = set[tuple[str, Any]]()  # damaged rows that are logged already
         try:
-            self.engine = sa.create_engine(url, **engine_options(sa.make_url(url)))
-            limit_answers(self.engine)
-            if self.engine.dialect.name == "sqlite":
-                sa.event.listen(self.engine, "connect", _prepare_sqlite)
+            # the page has connections of its own, so that storage never waits for one
+            limits = {"pool_size": _N_READERS, "max_overflow": 0, "pool_timeout": QUERY_WAIT_S}
+            self.engine, self._page_engine = _create_engine(url), _create_engine(url, **limits)
             version = self._prepare_tables()
+            if is_file:
+                self._files = SqliteFiles(Path(database))
+                self._find_lost_transactions(self._files, is_new=is_new)
         except (SQLAlchemyError, ImportError, ValueError) as error:
             reason = str(getattr(error, "orig", None) or error).splitlines()[0]
             raise InputError(f"the monitor's database must be a file of SQLite or a URL, got: {reason}") from None
@@ -134,6 +155,8 @@ class MonitorStore:
             try:
                 with self.engine.begin() as connection:
                     tables.metadata.create_all(connection)
+                    for index in tables.estimates.indexes:  # a database of an earlier version lacks it
+                        index.create(connection, checkfirst=True)
                     version = connection.execute(select(facts.c.value).where(facts.c.name == "schema")).scalar()
                     if version is None:
                         connection.execute(facts.insert().values(name="schema", value=str(tables.SCHEMA)))
@@ -144,11 +167,51 @@ class MonitorStore:
                 time.sleep(0.2)  # another monitor is creating the tables
         return str(version or tables.SCHEMA)
 
+    def _find_lost_transactions(self, files: SqliteFiles, *, is_new: bool) -> None:
+        """Compare the number of transactions in the database with that beside it, and log how many are missing.
+
+        `is_new`: True if there was no database: somebody has removed it to begin anew.
+        """
+        self._n_transactions, expected = self.position(_TRANSACTIONS), files.stored_count()
+        self.n_lost = 0 if is_new else max(0, expected - self._n_transactions)
+        if self.n_lost:
+            _log.error(
+                "%s lacks the last %d transactions of its monitor: its file -wal was removed, or it was replaced",
+                files.path.name,
+                self.n_lost,
+            )
+        if expected != self._n_transactions:
+            files.store_count(self._n_transactions)
+
     @contextmanager
     def writing(self) -> Iterator[sa.Connection]:
-        """Open a transaction for changes, which an error rolls back."""
-        with self._writing_lock, self.engine.begin() as connection:
-            yield connection
+        """Open a transaction for changes, which an error rolls back.
+
+        Raises FilesReplaced if the file of a SQLite database was removed or replaced.
+        """
+        files = self._files
+        with self._writing_lock:
+            if files is not None:
+                files.check_database()
+                if files.is_wal_lost():
+                    self._save_removed_wal(files)
+            with self.engine.begin() as connection:
+                yield connection
+                if files is not None:
+                    row = {"name": _TRANSACTIONS, "value": str(self._n_transactions + 1)}
+                    self.upsert(connection, tables.facts, [row])
+            if files is not None:
+                self._n_transactions += 1
+                files.store_count(self._n_transactions)
+                files.note_wal()
+
+    def _save_removed_wal(self, files: SqliteFiles) -> None:
+        """Move the transactions of a removed file `-wal`, which open connections still reach, to the database."""
+        _log.error("%s-wal was removed while the monitor runs: its transactions are saved", files.path.name)
+        with self.engine.connect() as connection:  # an open one, by the pool: it was not closed since the removal
+            connection.exec_driver_sql("PRAGMA wal_checkpoint(TRUNCATE)")
+        for engine in (self.engine, self._page_engine):  # new connections make a new file
+            engine.dispose()
 
     @contextmanager
     def _begin_relaxed_transaction(self) -> Iterator[sa.Connection]:
@@ -168,9 +231,23 @@ class MonitorStore:
                     connection.exec_driver_sql("PRAGMA synchronous=FULL")
                     connection.commit()
 
-    def _rows(self, query: Any) -> Sequence[sa.Row[Any]]:
-        with self.engine.connect() as connection:
+    def _rows(self, query: Any, *, by_page: bool = False) -> Sequence[sa.Row[Any]]:
+        """Execute a query; `by_page`: by one of the connections of the page, of which there are few."""
+        with (self._page_engine if by_page else self.engine).connect() as connection:
             return connection.execute(query).all()
+
+    def _parse_row(self, table: sa.Table, key: Any, parse: Callable[[], Any]) -> Any:
+        """Return the result of `parse` for a row; log a row that is damaged, once, and return None for it.
+
+        `key`: text by which the row is named.
+        """
+        try:
+            return parse()
+        except Exception as error:  # a damaged row may hold anything
+            if (table.name, key) not in self._reported_rows:
+                self._reported_rows.add((table.name, key))
+                _log.error("a row of the table %s is damaged: %s (%s)", table.name, key, describe_error(error))
+            return None
 
     def _value(self, query: Any) -> int:
         """Execute a query for a single number; return 0 if it gives none."""
@@ -274,26 +351,45 @@ class MonitorStore:
         return self._value(select(func.max(table.c.number)).where(table.c.actuator == actuator))
 
     def checkpoint(self, actuator: str) -> tuple[str, dict[str, Any]] | None:
-        """Read settings (JSON) and state of an actuator at its last checkpoint; return None if there is none."""
-        rows = self._rows(select(tables.actuators).where(tables.actuators.c.actuator == actuator))
-        return (rows[0].settings, json.loads(rows[0].checkpoint)) if rows else None
+        """Read settings (JSON) and state of an actuator at its last checkpoint; return None if there is none.
 
-    def pending(self, actuator: str) -> list[StoredSamples]:
+        Raises ValueError if the row is damaged.
+        """
+        rows = self._rows(select(tables.actuators).where(tables.actuators.c.actuator == actuator))
+        return (rows[0].settings, _parse_table(rows[0].checkpoint)) if rows else None
+
+    def pending(self, actuator: str, *, by_page: bool = False) -> list[StoredSamples]:
         """Read the pending samples of an actuator in the order of their blocks.
 
         They arrived after the last checkpoint, or before it and belong to a recording that has not ended.
         """
         columns = tables.pending.c
         query = select(columns.number, columns.samples).where(columns.actuator == actuator).order_by(columns.number)
-        return [_unpack_samples(row.number, row.samples) for row in self._rows(query)]
+        blocks: list[StoredSamples] = []
+        follows = True  # False after a damaged row
+        for row in self._rows(query, by_page=by_page):
+            parse = partial(_unpack_samples, row.number, row.samples)
+            block = self._parse_row(tables.pending, f"of {actuator}", parse)
+            if block is not None:
+                blocks.append(block if follows else block._replace(follows=False))
+            follows = block is not None
+        return blocks
 
     def last_samples(self, actuator: str) -> list[Recording]:
         """Read the pending samples of an actuator, one recording for each block."""
-        return [block.samples for block in self.pending(actuator)]
+        return [block.samples for block in self.pending(actuator, by_page=True)]
 
     def summaries(self) -> dict[str, dict[str, Any]]:
         """Read the last summary of each actuator, by name."""
-        return {row.actuator: json.loads(row.summary) for row in self._rows(select(tables.summaries))}
+        rows = self._rows(select(tables.summaries), by_page=True)
+        parsed = (
+            (
+                row.actuator,
+                self._parse_row(tables.summaries, row.actuator, partial(_parse_table, row.summary, _SUMMARY_KEYS)),
+            )
+            for row in rows
+        )
+        return {actuator: summary for actuator, summary in parsed if summary is not None}
 
     def alarms(self, *, open_only: bool = False, actuator: str | None = None) -> list[dict[str, Any]]:
         """Read alarms as plain values, sorted by actuator, and for each actuator with the latest alarm first.
@@ -301,43 +397,73 @@ class MonitorStore:
         `open_only`: leave out closed and invalid alarms; `actuator`: read only the alarms of this actuator.
         """
         columns = tables.alarms.c
-        query = select(columns.alarm)
+        query = select(columns.id, columns.alarm)
         if open_only:
             query = query.where(columns.state.not_in(("closed", "invalid")))
         if actuator is not None:
             query = query.where(columns.actuator == actuator)
-        values = [json.loads(text) for (text,) in self._rows(query)]
-        # an alarm's id ends in "-" and a running number
-        return sorted(values, key=lambda alarm: (alarm["actuator"], -int(alarm["id"].rpartition("-")[2])))
+        rows = self._rows(query, by_page=True)
+        parsed = (self._parse_row(tables.alarms, row.id, partial(_parse_table, row.alarm, _ALARM_KEYS)) for row in rows)
+        values = [alarm for alarm in parsed if alarm is not None]
+        return sorted(values, key=lambda alarm: (alarm["actuator"], -alarm_number(alarm["id"])))
+
+    def last_alarm_number(self, actuator: str) -> int:
+        """Read the highest running number of an actuator's alarms, 0 if there is none."""
+        columns = tables.alarms.c
+        rows = self._rows(select(columns.id).where(columns.actuator == actuator))
+        return max((alarm_number(row.id) for row in rows), default=0)
 
     def events_since(self, number: int) -> list[tuple[int, dict[str, Any]]]:
         """Read up to 1000 events with a running number above `number`, as pairs (number, event) in order."""
         columns = tables.events.c
         query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(1000)
-        return [(row.number, _event_from_row(row)) for row in self._rows(query)]
+        return self._parse_events(self._rows(query))
+
+    def _parse_events(self, rows: Iterable[sa.Row[Any]]) -> list[tuple[int, dict[str, Any]]]:
+        """Convert rows of `events` to pairs (number, event); leave out damaged ones."""
+        parsed = (
+            (row.number, self._parse_row(tables.events, row.number, partial(_event_from_row, row))) for row in rows
+        )
+        return [(number, event) for number, event in parsed if event is not None]
 
     def last_events(self, actuator: str) -> list[dict[str, Any]]:
         """Read the latest 200 events of an actuator, newest first."""
         columns = tables.events.c
         query = select(tables.events).where(columns.actuator == actuator).order_by(columns.number.desc()).limit(200)
-        return [_event_from_row(row) for row in self._rows(query)]
+        return [event for _, event in self._parse_events(self._rows(query, by_page=True))]
 
     def history(self, actuator: str, max_rows: int = 600, seconds: float | None = None) -> list[dict[str, Any]]:
         """Read the history of an actuator's estimates in order of time, averaged to at most about `max_rows` rows.
 
-        Each row has the mean time `t` [s] and `FIGURES` of a group of successive estimates. `seconds` [s]: length of
-        the history up to the last estimate, None for all.
+        Each row has the mean time `t` [s] and `FIGURES` of a group of successive estimates, of which at most
+        `_MAX_AVERAGED`, evenly spread, are read: the work does not grow with the length of the history. `seconds` [s]:
+        length of the history up to the last estimate, None for all.
         """
         columns = tables.estimates.c
+        ends = select(columns.number, columns.t).where(columns.actuator == actuator).limit(1)
+        last = self._rows(ends.order_by(columns.number.desc()), by_page=True)
+        if not last:
+            return []
+        stop, last_t = last[0].number, last[0]._mapping["t"]  # `row.t` would be a method of SQLAlchemy's rows
         is_chosen = columns.actuator == actuator
-        if seconds is not None:
-            last_t = select(columns.t).where(is_chosen).order_by(columns.number.desc()).limit(1).scalar_subquery()
+        if seconds is None:
+            first = self._rows(ends.order_by(columns.number), by_page=True)
+        else:
             is_chosen &= columns.t.between(last_t - seconds, last_t)
-        n_estimates = self._value(select(func.count()).where(is_chosen))
-        n_averaged = max(1, -(-n_estimates // max_rows))  # estimates per row, rounded up
+            first = self._rows(ends.where(is_chosen).order_by(columns.t), by_page=True)
+        start = first[0].number if first else stop
+        n_averaged = max(1, -(-(stop - start + 1) // max_rows))  # estimates per row, rounded up
         group = columns.number - columns.number % n_averaged  # first running number in the group of an estimate
         query = select(*(func.avg(columns[name]).label(name) for name in ("t", *tables.FIGURES)))
-        return [dict(row._mapping) for row in self._rows(query.where(is_chosen).group_by(group).order_by(group))]
+        step = -(-n_averaged // _MAX_AVERAGED)
+        if step == 1:
+            query = query.where(is_chosen, columns.number.between(start, stop))
+        else:  # every so many estimates: each is found by its number
+            numbers = select(sa.literal(start).label("number")).cte("numbers", recursive=True)
+            numbers = numbers.union_all(select(numbers.c.number + step).where(numbers.c.number + step <= stop))
+            query = query.select_from(numbers).join(tables.estimates, is_chosen & (columns.number == numbers.c.number))
+        rows = self._rows(query.group_by(group).order_by(group), by_page=True)
+        return [dict(row._mapping) for row in rows]
 
     def estimates(self) -> Iterator[dict[str, Any]]:
         """Yield all stored estimates, sorted by actuator and running number."""
@@ -376,9 +502,35 @@ def outage_reason(error: BaseException) -> str | None:
     """
     if isinstance(error, PoolTimeout):
         return "every connection to the database is in use"
+    if isinstance(error, FilesReplaced):
+        return str(error)
     if not isinstance(error, DBAPIError) or isinstance(error, DataError):
         return None
     return " ".join(str(error.orig).split())[:200]
+
+
+def alarm_number(alarm_id: str) -> int:
+    """Return the running number of an alarm, with which its id ends after a hyphen."""
+    return int(alarm_id.rpartition("-")[2])
+
+
+def _create_engine(url: str, **options: Any) -> sa.Engine:
+    """Create an engine for the database at `url`, with `options` of its pool of connections."""
+    engine = sa.create_engine(url, **{**engine_options(sa.make_url(url)), **options})
+    limit_answers(engine)
+    if engine.dialect.name == "sqlite":
+        sa.event.listen(engine, "connect", _prepare_sqlite)
+    return engine
+
+
+def _parse_table(text: str, keys: Iterable[str] = ()) -> dict[str, Any]:
+    """Parse JSON to a mapping that has the `keys`; raise ValueError for anything else."""
+    values = json.loads(text)
+    if not isinstance(values, dict):
+        raise ValueError(f"it must be a mapping, got {type(values).__name__}")
+    if missing_keys := sorted({*keys} - values.keys()):
+        raise ValueError(f"it must have {', '.join(missing_keys)}")
+    return values
 
 
 def _pack_samples(block: StoredSamples) -> bytes:
@@ -407,7 +559,7 @@ def _event_from_row(row: Any) -> dict[str, Any]:
     """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after this event."""
     # `row.t` would be a method of SQLAlchemy's rows
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
-    return {**values, "alarm": json.loads(row.alarm)}
+    return {**values, "alarm": _parse_table(row.alarm, _ALARM_KEYS)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:

@@ -45,7 +45,11 @@ actuators = _table("actuators", "actuator 120 key, settings text, checkpoint tex
 #: Summary of each actuator; separate from the state, because rows are written whole and a state is large.
 summaries = _table("summaries", "actuator 120 key, summary text")
 _FIGURES = ", ".join(f"{name} double null" for name in FIGURES)
-estimates = _table("estimates", f"actuator 120 key, number int key, t double, status 160, {_FIGURES}")
+#: The index finds the estimates of a span of time.
+_estimates_by_time = Index("estimates_by_time", "actuator", "t")
+estimates = _table(
+    "estimates", f"actuator 120 key, number int key, t double, status 160, {_FIGURES}", _estimates_by_time
+)
 alarms = _table("alarms", "id 160 key, actuator 120 indexed, state 20 indexed, alarm text")
 #: Changes of alarms and comments of persons, in order; each output stores the number of the last one it delivered.
 events = _table(

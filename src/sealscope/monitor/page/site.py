@@ -10,6 +10,7 @@ import json
 import math
 import re
 import socket
+import threading
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import ExitStack, suppress
 from typing import Any
@@ -29,7 +30,8 @@ from sealscope.errors import InputError
 from sealscope.monitor.actuators import WatchedActuators
 from sealscope.monitor.alarms import rank_actuators
 from sealscope.monitor.bounded_queue import QueueLoad
-from sealscope.monitor.database.store import outage_reason
+from sealscope.monitor.database.sqlite_files import FilesReplaced
+from sealscope.monitor.database.store import MAX_QUERIES, QUERY_WAIT_S, outage_reason
 from sealscope.monitor.outputs.prometheus import CONTENT_TYPE, format_metrics
 from sealscope.monitor.page.live import DETAIL_FORMS, PRESSURES, LiveSamples, describe_rig
 from sealscope.monitor.settings import PageSettings, read_secret
@@ -75,16 +77,16 @@ def site(
         *(Route(path, pages.file) for path in _FILES),
         *(Route(path, serve_shared_file) for path in SHARED_FILES),
         Route("/login", pages.login, methods=["GET", "POST"]),
-        Route("/api/fleet", pages.fleet),
-        Route("/api/actuator", pages.actuator),
+        Route("/api/fleet", pages.limit_queries(pages.fleet)),
+        Route("/api/actuator", pages.limit_queries(pages.actuator)),
         Route("/api/mark", pages.mark, methods=["POST"]),
         Route("/api/changes", pages.changes),
-        Route("/metrics", pages.metrics),
+        Route("/metrics", pages.limit_queries(pages.metrics)),
     ]
     middleware = [Middleware(BaseHTTPMiddleware, dispatch=pages.guard)]
     if settings.host in LOCAL:  # against DNS rebinding: refuse host names of other sites
         middleware.append(Middleware(TrustedHostMiddleware, allowed_hosts=[*LOCAL, "[::1]"]))
-    handlers: Any = {SQLAlchemyError: pages.answer_outage}
+    handlers: Any = {SQLAlchemyError: pages.answer_outage, FilesReplaced: pages.answer_outage}
     return Starlette(routes=routes, middleware=middleware, exception_handlers=handlers)
 
 
@@ -102,6 +104,23 @@ class _Pages:
         # half of the connections remain for other requests
         self._n_listeners, self._max_listeners = 0, min(_MAX_LISTENERS, connection_limit() // 2)
         self._admission = None if token is None else Admission(token)
+        self._queries = threading.BoundedSemaphore(MAX_QUERIES)
+
+    def limit_queries(self, handler: Callable[[Request], Response]) -> Callable[[Request], Response]:
+        """Build a request handler of which at most `MAX_QUERIES` run at a time, so that storage keeps its share.
+
+        A request that must wait for more than `QUERY_WAIT_S` is refused.
+        """
+
+        def answer(request: Request) -> Response:
+            if not self._queries.acquire(timeout=QUERY_WAIT_S):
+                return make_refusal("too many queries at a time", 503, _RETRY_HEADERS)
+            try:
+                return handler(request)
+            finally:
+                self._queries.release()
+
+        return answer
 
     def file(self, request: Request) -> Response:
         name, media_type = _FILES[request.url.path]
