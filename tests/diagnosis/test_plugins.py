@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import os
 import re
+import subprocess
 import sys
+import time
 import tomllib
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -14,6 +18,7 @@ import pytest
 from sealscope.diagnosis.detectors import detector, registry
 from sealscope.diagnosis.detectors.registry import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
+from sealscope.recordings import write
 from sealscope.recordings.recording import Recording
 
 from ..representatives import SLOW, few
@@ -190,3 +195,97 @@ def test_the_guide_shows_the_example_as_it_stands() -> None:
     guide = (EXAMPLE.parents[1] / "detectors.md").read_text(encoding="utf-8")
     project = (EXAMPLE / "pyproject.toml").read_text(encoding="utf-8")
     assert all(line in project for line in guide.split("```toml\n")[1].split("```")[0].splitlines())
+
+
+#: What a hostile or careless plug-in may do in any of its functions, and the words of the line that it costs.
+MISCHIEF = {
+    "exit": ("import sys; sys.exit(3)", "must not end the process, got sys.exit(3)"),
+    "exit by error": ("raise SystemExit('bye\\nbye')", "got sys.exit(bye bye)"),
+    "quit": ("quit()", "must not end the process"),
+    "interrupt": ("raise KeyboardInterrupt", "must raise an Exception, got KeyboardInterrupt"),
+    "generator exit": ("raise GeneratorExit", "must raise an Exception, got GeneratorExit"),
+    "sleep": ("import time; time.sleep(3600)", "must end within"),
+    "loop": ("while True: pass", "must end within"),
+    "loop that catches": ("while True:\n            try: pass\n            except Exception: pass", "must end within"),
+    "wait": ("import threading; threading.Event().wait()", "must end within"),
+    "long text": ("raise ValueError('x' * 10**6)", "ValueError: xxx"),
+    "no text": ("raise type('E', (Exception,), {'__str__': lambda self: 1 / 0})()", "has no text"),
+}
+PLACES = {
+    "import": lambda act: f"def mischief():\n            {act}\nmischief()\n{GOOD}",
+    "make": lambda act: GOOD.replace("self.rig = rig.name", f"\n            {act}"),
+    "usable": lambda act: GOOD.replace("return None", f"\n            {act}"),
+    "observe": lambda act: GOOD.replace('return Observed("good", lack=f"assumed {self.rig}")', f"\n            {act}"),
+}
+#: Each act with each place, those of all acts and all places first.
+CASES = [f"{[*PLACES][(k + shift) % 4]} {act}" for shift in range(4) for k, act in enumerate(MISCHIEF)]
+
+
+@pytest.mark.parametrize("case", few(dict.fromkeys(CASES), len(MISCHIEF), SLOW))
+def test_whatever_a_plug_in_does_the_call_goes_on(
+    case: str, install: Install, short: Recording, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It exits, hangs or raises anything, anywhere: one line names it, and the verdict is that without it."""
+    place, _, act = case.partition(" ")
+    code, words = MISCHIEF[act]
+    monkeypatch.setattr("sealscope.diagnosis.detectors.isolation.LIMIT_S", 0.5)
+    monkeypatch.setattr("sealscope.diagnosis.detectors.isolation.SAMPLE_S", 0.0)
+    monkeypatch.setattr(registry, "_TIMED_OUT", set())
+    expected = diagnose(short)
+    name = f"broken_{CASES.index(case)}"  # a thread that hangs in an import holds the lock of its module
+    install(name, PLACES[place](code), {"good": f"{name}:Good"})
+    with caplog.at_level(logging.WARNING, "sealscope"):
+        result, start = diagnose(short), time.monotonic()
+        again = diagnose(short)
+    assert time.monotonic() - start < 30.0
+    lines = reported(caplog)
+    assert f"detector 'good' of {name} is left out" in lines[0]
+    assert words in lines[0]
+    assert all("\n" not in line and len(line) < 500 for line in lines)
+    for each in (result, again):
+        assert (each.verdict, each.score, each.reason) == (expected.verdict, expected.score, expected.reason)
+
+
+REPORTS = {
+    "too many": ("(make_observable('a', 0.5),) * 200_000", "at most 1000 observables, got 200000"),
+    "without an end": ("itertools.repeat(make_observable('a', 0.5))", "must be a tuple, got repeat"),
+    "a long name": ("(make_observable('a' * 10**6, 0.5),)", "a text of at most 200 letters"),
+    "no name": ("(make_observable(None, 0.5),)", "a text of at most 200 letters"),
+}
+
+
+@pytest.mark.parametrize("case", REPORTS)
+def test_a_report_has_limits(case: str, install: Install, short: Recording, caplog: pytest.LogCaptureFixture) -> None:
+    observables, words = REPORTS[case]
+    source = GOOD.replace(
+        'return Observed("good", lack=f"assumed {self.rig}")', f"return Observed('good', {observables})"
+    )
+    imports = "import itertools\nfrom sealscope.diagnosis.detectors.detector import make_observable\n"
+    install("broken", imports + source, {"good": "broken:Good"})
+    with caplog.at_level(logging.WARNING, "sealscope"):
+        diagnose(short)
+    (line,) = reported(caplog)
+    assert "detector 'good' of broken is left out" in line
+    assert words in line
+
+
+@pytest.mark.slow
+def test_what_a_plug_in_prints_is_no_result(tmp_path: Path, short: Recording) -> None:
+    """By print, by the file, by the descriptor and by a process that it starts, wherever: standard output has JSON."""
+    prints = "import os, sys; print('A'); sys.__stdout__.write('B\\n'); os.write(1, b'C\\n'); os.system('echo D')"
+    source = f"{prints}\n" + GOOD.replace("return None", f"\n        {prints}; return None")
+    source = source.replace("self.rig = rig.name", f"self.rig = rig.name; {prints}")
+    (tmp_path / "chatty.py").write_text(source, encoding="utf-8")
+    info = tmp_path / "chatty-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: chatty\nVersion: 1.0\n", encoding="utf-8")
+    (info / "entry_points.txt").write_text(f"[{registry.GROUP}]\ngood = chatty:Good\n", encoding="utf-8")
+    write(short, tmp_path / "log.nc")
+    command = [sys.executable, "-P", "-m", "sealscope", "diagnose", "log.nc", "log.nc", "--format", "jsonl"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [row["file"] for row in rows] == ["log.nc", "log.nc"]
+    assert "assumed" in done.stdout  # it was heard
+    assert all(done.stderr.count(f"{letter}\n") >= 3 for letter in "ABCD")

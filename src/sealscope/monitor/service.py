@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import threading
 import time
@@ -88,7 +89,7 @@ class Service:
             self.supervisor, self.count, self.summaries = actuators.supervisor, actuators.count, actuators.summaries
             self.stopping, self._database = self.supervisor.stopping, self.supervisor.part(DATABASE)
             self._live = LiveSamples(self.store.last_samples)
-            self._lines = EventLines(self.store, stdout or sys.stdout)
+            self._lines = EventLines(self.store, stdout or _copy_standard_output())
             self.page: PageServer | None = None
             if settings.page is not None and not once:
                 self.page = PageServer(actuators, settings.page, self.queue_load, self._live)
@@ -242,6 +243,14 @@ class Service:
         self._lines.deliver()
         if not self._is_database_blocked:  # the events were read, and nothing waits to be written
             self._database.end_outage()
+
+
+def _copy_standard_output() -> TextIO:
+    """Open another stream on the standard output, which a plug-in's call, that must not print there, leaves alone."""
+    try:
+        return os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding=sys.stdout.encoding, errors=sys.stdout.errors)
+    except (AttributeError, OSError, ValueError):  # there is none, or it is no file
+        return sys.stdout
 
 
 def _is_logged(number: int) -> bool:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 #: Kind of data (`Observable.data`) of a user's own detector, as in `decision/events.toml`.
 PLUG_IN = "plug-in"
+#: Most observables of a report, and most letters of their names and of the reason why there are none.
+MAX_OBSERVABLES, _MAX_NAME, _MAX_LACK = 1000, 200, 2000
 
 
 class Detector(Protocol):
@@ -61,7 +63,7 @@ def unusable_reason(detector: Detector, recording: Recording) -> str | None:
         return None
     if not isinstance(reason, str):
         raise TypeError(f"usable must return None or a reason, got {reason!r}")
-    return " ".join(reason.split()) or "the recording cannot be used"
+    return " ".join(reason[:_MAX_LACK].split()) or "the recording cannot be used"
 
 
 def make_observable(
@@ -96,15 +98,21 @@ def validate_report(report: Any, name: str) -> Observed:
         report = Observed(name, (report,))
     if not isinstance(report, Observed):
         raise TypeError(f"observe must return an Observed, got {type(report).__name__}")
+    if not isinstance(report.observables, tuple | list):
+        raise TypeError(f"the observables must be a tuple, got {type(report.observables).__name__}")
+    if len(report.observables) > MAX_OBSERVABLES:
+        raise ValueError(f"a report must have at most {MAX_OBSERVABLES} observables, got {len(report.observables)}")
     for observable in report.observables:
         if not isinstance(observable, Observable):
             raise TypeError(f"each of the observables must be an Observable, got {type(observable).__name__}")
+        if not isinstance(observable.name, str) or len(observable.name) > _MAX_NAME:
+            raise ValueError(f"the name of an observable must be a text of at most {_MAX_NAME} letters")
         if not 0.0 <= observable.chance <= 1.0:
             raise ValueError(f"a chance must be 0 to 1, got {observable.chance!r} ({observable.name})")
         if not np.isfinite(observable.score):
             raise ArithmeticError(f"a score must be finite, got {observable.score!r} ({observable.name})")
-    if "\n" in report.lack:
-        raise ValueError("the `lack` of a report must be one line")
+    if "\n" in report.lack or len(report.lack) > _MAX_LACK:
+        raise ValueError(f"the `lack` of a report must be one line of at most {_MAX_LACK} letters")
     return replace(report, provider=name)
 
 

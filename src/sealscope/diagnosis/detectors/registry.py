@@ -5,23 +5,26 @@ A package registers a class, or a function that creates a detector for a Rig, in
     [project.entry-points."sealscope.detectors"]
     "pressure means" = "my_package:PressureMeans"
 
-A detector that cannot be loaded is left out, and the reason is logged.
+A detector that cannot be loaded is left out, and the reason is logged. Its code runs under limits (`isolation`).
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from hashlib import sha256
 from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.detectors.detector import Detector, Factory, log_failure
+from sealscope.diagnosis.detectors.isolation import call_plug_in
+from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
+from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -30,6 +33,47 @@ if TYPE_CHECKING:
 GROUP = "sealscope.detectors"
 #: Names that no detector may have, as they mean something else in lists of detectors.
 _RESERVED = ("diagnose", "always fire", "never fire")
+
+
+#: Names of plug-ins that did not end in time: they are not called again in this process.
+_TIMED_OUT = set[str]()
+
+
+class IsolatedDetector:
+    """The detector of a plug-in, each call of which runs under the limits of `isolation`."""
+
+    def __init__(self, plug_in: PlugIn, rig: Rig) -> None:
+        self._plug_in = plug_in
+        self._detector: Any = self._call(plug_in.make, rig)
+        self.name: str = self._call(getattr, self._detector, "name")
+        if hasattr(self._detector, "learn"):
+            self.learn = self._learn
+
+    def usable(self, recording: Recording) -> str | None:
+        """Return the reason why the detector cannot use the recording; None if it can."""
+        reason: str | None = self._call(self._detector.usable, recording, n_samples=len(recording))
+        return reason
+
+    def observe(self, recording: Recording, baseline: Sequence[Any] = ()) -> Observed:
+        """Test the detector's quantities in a recording, compared with those of a baseline."""
+        n_samples = len(recording) + sum(len(healthy) for healthy in baseline if isinstance(healthy, Recording))
+        report: Observed = self._call(self._detector.observe, recording, baseline, n_samples=n_samples)
+        return report
+
+    def _learn(self, recording: Recording) -> Any:
+        """Return the detector's summary of a healthy recording."""
+        return self._call(self._detector.learn, recording, n_samples=len(recording))
+
+    def _call(self, function: Any, *arguments: Any, n_samples: int = 0) -> Any:
+        """Call a function of the plug-in, unless one of its calls has not ended in time."""
+        name = self._plug_in.name
+        if name in _TIMED_OUT:
+            raise TimeoutError("it did not end in time before")
+        try:
+            return call_plug_in(function, *arguments, n_samples=n_samples)
+        except TimeoutError:
+            _TIMED_OUT.add(name)
+            raise
 
 
 @dataclass(frozen=True)
@@ -41,8 +85,8 @@ class PlugIn:
     make: Factory
 
     def __call__(self, rig: Rig) -> Detector:
-        """Create the plug-in's detector for a rig."""
-        return self.make(rig)
+        """Create the plug-in's detector for a rig, whose calls have limits."""
+        return IsolatedDetector(self, rig)
 
     @property
     def fingerprint(self) -> str:
@@ -87,7 +131,7 @@ def plug_ins(built_in_names: frozenset[str]) -> Mapping[str, PlugIn]:
                 raise ValueError("its name is taken by Sealscope itself")
             if any(mark in point.name for mark in (" @ ", ",", "\n")) or not point.name.strip():
                 raise ValueError("its name must be plain words without a comma, ' @ ' or a line break")
-            make = point.load()
+            make = call_plug_in(point.load)
             if not callable(make):
                 raise TypeError(f"{point.value} must be callable with a rig, got {type(make).__name__}")
         except Exception as error:
