@@ -12,6 +12,7 @@ from sealscope.diagnosis.live.watch import watch as watch
 from sealscope.diagnosis.trend.trend import Trend as Trend
 from sealscope.diagnosis.trend.trend import trend as trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis as Diagnosis
+from sealscope.emit.export import export_controller as export_controller
 from sealscope.fmu.build import write_fmu as write_fmu
 from sealscope.fmu.build import write_sensor_fmu as write_sensor_fmu
 from sealscope.fmu.recording import record_fmu as record_fmu

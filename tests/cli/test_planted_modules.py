@@ -122,7 +122,7 @@ def test_none_runs_in_worker_processes(run: Ran) -> None:
 @pytest.mark.slow
 def test_none_runs_in_the_compiler_of_units(run: Ran) -> None:
     pytest.importorskip("ziglang")
-    text = "import subprocess\nfrom sealscope.fmu.build import find_compiler\n"
+    text = "import subprocess\nfrom sealscope.emit.compiler import find_compiler\n"
     text += "command = [*find_compiler().command, '--version']\n"
     text += "print(subprocess.run(command, capture_output=True, check=True).stdout.decode())"
     assert "clang" in run(["ziglang"], text).stdout

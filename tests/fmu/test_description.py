@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 
 import pytest
 
+from sealscope.emit.compiler import Compiler, find_compiler
 from sealscope.fmu import build
 from sealscope.fmu.description import base_units, format_description
 from sealscope.fmu.variables import REFERENCES, VALUES, variables
@@ -71,17 +72,17 @@ def test_references_and_names_are_unique_and_outputs_are_listed(version, tag):
 )
 def test_wrong_options_are_one_line_and_write_nothing(tmp_path, monkeypatch, options, names):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(build, "find_compiler", lambda: build.Compiler([sys.executable], cross_compiles=True))
+    monkeypatch.setattr(build, "find_compiler", lambda: Compiler([sys.executable], cross_compiles=True))
     with refusal(*names.split(", ")):
         build.write_fmu(**{"path": "eha.fmu"} | options)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_without_a_compiler_the_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(build.shutil, "which", lambda name: None)
+    monkeypatch.setattr("shutil.which", lambda name: None)
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with refusal("sealscope[fmu]"):
-        build.find_compiler()
+        find_compiler()
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the compilers are scripts of a shell")
@@ -98,7 +99,7 @@ def test_a_compiler_that_builds_nothing_is_one_line(tmp_path, monkeypatch, scrip
     compiler = tmp_path / "cc"
     compiler.write_text(script)
     compiler.chmod(0o755)
-    monkeypatch.setattr(build, "find_compiler", lambda: build.Compiler([str(compiler)], cross_compiles=False))
+    monkeypatch.setattr(build, "find_compiler", lambda: Compiler([str(compiler)], cross_compiles=False))
     monkeypatch.setattr(build, "fmi_headers", lambda: tmp_path)
     monkeypatch.setattr(build, "_COMPILE_TIMEOUT", 0.2 if "sleep" in script else 60.0)
     unit = build.MockUp("words", {}, (), (), n_inputs=1, n_results=1, n_states=1, step=1e-3, failures={})

@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.fmu.build import PLATFORMS, find_compiler, this_platform
+from sealscope.emit.compiler import find_compiler
+from sealscope.fmu.build import PLATFORMS, this_platform
 from sealscope.simulation.commands import sampled_signal
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run

@@ -16,6 +16,7 @@ import typer
 
 from sealscope.cli import (
     campaign,
+    export,
     fmu,
     hold,
     machine,
@@ -48,7 +49,7 @@ app = typer.Typer(
 for command in (
     simulation.demo, simulation.simulate, machine.commission, recordings.diagnose, recordings.report, trend.trend,
     hold.hold, simulation.parameters, planning.plan, recordings.inspect, recordings.convert, workbench.mend,
-    workbench.app, reproduction.reproduce, fmu.fmu,
+    workbench.app, reproduction.reproduce, fmu.fmu, export.export,
 ):  # fmt: skip
     app.command()(command)
 for group in (campaign.campaign, rigs.rigs, monitoring.monitor, plugin.plugin):

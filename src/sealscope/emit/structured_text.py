@@ -47,8 +47,8 @@ abs acos action add and andn any array asin at atan bool by byte cal calc calcn 
 cos ct ctd ctu ctud cu cv date day dint div do dt dword edge else elsif end eq exit exp expt f_edge f_trig false find
 for from function function_block ge goto gt if in initial insert int interval jmp jmpc jmpcn ld ldn le left len limit
 lint ln log lreal lt lword max mid min mod move mul mux ne not of on or orn parameter persistent pointer priority
-program pt q r r1 r_edge r_trig read_only read_write real ref_to repeat replace resource ret retain retc retcn return
-right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super tan task
+program pt q r r1 r_edge r_trig read_only read_write real ref_to reference repeat replace resource ret retain retc
+retcn return right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super tan task
 then this time tod tof ton to tp transition true trunc type udint uint ulint until usint var while with word wstring
 xor xorn
 """
@@ -68,6 +68,10 @@ class StText:
     def state_type(self) -> str:
         """Name of the data type of the state."""
         return f"{self._prefix}_STATE"
+
+    def field_name(self, name: str) -> str:
+        """Return the name of a field of the state."""
+        return self._field_names[name]
 
     def block_name(self, name: str) -> str:
         """Return the name of the function block of a function."""
@@ -197,7 +201,7 @@ class _BlockText:
         """Declare a constant table."""
         values = self._program.tables[name]
         kind: Kind = "real" if any(isinstance(value, float) for value in values) else "whole"
-        numbers = ", ".join(_literal(Constant(value, kind)) for value in values)
+        numbers = ", ".join(format_constant(Constant(value, kind)) for value in values)
         return f"    {self._names[f'table_{name}']} : ARRAY [0..{len(values) - 1}] OF {_TYPES[kind]} := [{numbers}];"
 
     def _block(self, statements: Iterable[Statement], indent: str, names: dict[str, str]) -> Iterator[str]:
@@ -245,7 +249,7 @@ class _BlockText:
     def _last(self, stop: Expression, lines: list[str], indent: str) -> str:
         """Render the last value of a loop's variable."""
         if isinstance(stop, Constant):
-            return _literal(Constant(int(stop.value) - 1, "whole"))
+            return format_constant(Constant(int(stop.value) - 1, "whole"))
         return f"{self._expression(stop, lines, indent)} - 1"
 
     def _while(self, statement: While, indent: str, names: dict[str, str]) -> Iterator[str]:
@@ -292,7 +296,7 @@ class _BlockText:
     def _expression(self, value: Expression, lines: list[str], indent: str) -> str:
         """Render an expression; the lines that must precede it are appended to `lines`."""
         if isinstance(value, Constant):
-            return _literal(value)
+            return format_constant(value)
         if isinstance(value, Local):
             return self._names[value.name]
         if isinstance(value, Element):
@@ -352,7 +356,7 @@ def _conversion(value: Operation, operand: str) -> str:
     """Render a conversion of a number."""
     kind = value.operands[0].kind
     if value.operator == "truth":
-        return f"({operand} <> {_literal(Constant(0, kind))})"
+        return f"({operand} <> {format_constant(Constant(0, kind))})"
     if kind == "truth":
         return f"SEL({operand}, LREAL#0.0, LREAL#1.0)" if value.operator == "real" else f"SEL({operand}, 0, 1)"
     return f"DINT_TO_LREAL({operand})" if value.operator == "real" else f"TRUNC({operand})"
@@ -370,7 +374,7 @@ def _is_partial(value: Expression) -> bool:
     )
 
 
-def _literal(constant: Constant) -> str:
+def format_constant(constant: Constant) -> str:
     """Render a constant; a large or tiny one as a product of literals that each compiler reads."""
     if constant.kind == "truth":
         return "TRUE" if constant.value else "FALSE"
@@ -398,3 +402,8 @@ def _product(number: float) -> str:
     mantissa += "" if "." in mantissa else ".0"
     literal = f"LREAL#{mantissa}" + (f"E{exponent.replace('+', '')}" if exponent else "")
     return f"({' * '.join([literal, *factors])})" if factors else literal
+
+
+def format_real(number: float) -> str:
+    """Render a real number as a literal or product of literals."""
+    return format_constant(Constant(float(number), "real"))

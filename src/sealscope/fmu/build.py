@@ -6,7 +6,6 @@ import hashlib
 import math
 import os
 import re
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,7 +17,9 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.inference.rows.weak_form import MIN_STRIDE, STRIDE
+from sealscope.diagnosis.live.kernel.stream import StreamSettings
+from sealscope.emit.compiler import find_compiler
+from sealscope.emit.stream_program import stream_program
 from sealscope.errors import InputError
 from sealscope.fmu.description import format_description, templates
 from sealscope.fmu.machine import FAILURES, RigChoice, object_code, rig_code
@@ -40,8 +41,8 @@ STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
 #: Longest time [s] that the C compiler may take.
 _COMPILE_TIMEOUT = 300.0
 _README = """\
-The machine's laws are LLVM code (.ll), the interface around them is C11. To build the library for another
-system, with clang or `zig cc`: clang -O2 -fPIC -shared -I. -Iheaders -o NAME.so *.c *.ll -lm
+The interface is C11, a soft sensor C99; a rig's laws are LLVM code (.ll). To build the library for another system:
+cc -O2 -ffp-contract=off -fPIC -shared -I. -Iheaders -o NAME.so *.c -lm (with .ll: clang or `zig cc`, and *.ll).
 """
 
 
@@ -69,26 +70,6 @@ def this_platform() -> str:
     if name not in PLATFORMS:
         raise InputError(f"platform must be one of {', '.join(PLATFORMS)}, got {name}; state the FMU's platforms")
     return name
-
-
-class Compiler(NamedTuple):
-    """A C compiler; `command` has the first arguments; `cross_compiles`: True if it compiles for other systems, too."""
-
-    command: list[str]
-    cross_compiles: bool
-
-
-def find_compiler() -> Compiler:
-    """Find a C compiler, in the package ziglang or else in the system; raise InputError if there is none."""
-    from importlib.util import find_spec
-
-    if find_spec("ziglang") is not None:
-        # -P: a package ziglang in the working folder must not run
-        return Compiler([sys.executable, "-P", "-m", "ziglang", "cc"], cross_compiles=True)
-    for name in ("cc", "gcc", "clang"):
-        if path := shutil.which(name):
-            return Compiler([path], cross_compiles=False)
-    raise InputError("an FMU needs a C compiler, and none was found; pip install 'sealscope[fmu]' installs one")
 
 
 def fmi_headers() -> Path:
@@ -119,7 +100,7 @@ class MockUp(NamedTuple):
     """The code and data of a functional mock-up unit (FMU), to be compiled and archived."""
 
     summary: str  # one line that describes the FMU
-    modules: Mapping[str, str]  # LLVM code by name of the function
+    modules: Mapping[str, str]  # LLVM code by name of the function, or C sources by name of the file
     variable_list: tuple[Variable, ...]
     values: tuple[float, ...]  # initial values of the parameters, in the order of the code
     n_inputs: int
@@ -159,7 +140,9 @@ class MockUp(NamedTuple):
         config = templates().get_template("config.h.j2").render(unit=self, references=REFERENCES, present=present)
         texts = {name: (interface / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
         texts |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
-        texts |= {"config.h": config} | {f"{function}.ll": module for function, module in self.modules.items()}
+        texts |= {"config.h": config} | {
+            name if Path(name).suffix in (".c", ".h") else f"{name}.ll": text for name, text in self.modules.items()
+        }
         texts["README.txt"] = _README
         (folder / "headers").mkdir()
         for name, text in texts.items():
@@ -172,12 +155,16 @@ class MockUp(NamedTuple):
         compiler = find_compiler()
         inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
         for function, module in self.modules.items():
+            if Path(function).suffix == ".c":
+                inputs.append(folder / function)
+            if Path(function).suffix in (".c", ".h"):
+                continue
             object_file = folder / f"{function}-{system}.o"
             object_file.write_bytes(object_code(module, platform.triple))
             inputs.append(object_file)
         output = folder / f"{system}{platform.suffix}"
         target = ["-target", platform.target] if compiler.cross_compiles else []
-        flags = ["-std=c11", "-O2", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
+        flags = ["-std=c11", "-O2", "-ffp-contract=off", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
         command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
         rule = f"the C compiler ({' '.join(compiler.command)}) must build the unit for {system}"
         try:
@@ -280,10 +267,11 @@ def write_sensor_fmu(
     """Write a functional mock-up unit (FMU) that estimates the leakage from measurements, a soft sensor.
 
     From measured pressures, angle and position, it estimates the leakage of pump and piston together in blocks of 3 s.
-    The FMU contains the compiled volume balance that also judges live recordings, and needs no Python. Its outputs are
+    The FMU contains the C99 that controllers run, too (`export_controller`), and needs no Python. Its outputs are
 
     - the mean leakage of the last blocks, at most 20, with a 95 % interval [m^3/s];
-    - the rise of this mean above the mean of the first 20 blocks, with a 95 % interval [m^3/s];
+    - an alarm at one false alarm in 1000 h, the leak since its onset with a 95 % interval, and without an alarm the bound
+      of a leak [m^3/s];
     - further numbers, such as the leakage conductance.
 
     Parameters
@@ -318,26 +306,25 @@ def write_sensor_fmu(
     >>> [variable.name for variable in variables if variable.causality == "input"]  # doctest: +SKIP
     ['p_A', 'p_B', 'theta', 'x']
     """
-    from sealscope.fmu import sensor as sensor_unit
+    from sealscope.fmu.sensor import FAILURES, memory_size, sensor_sources
+    from sealscope.fmu.sensor import variables as sensor_variables
 
     path = Path(path)
     chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
-    if not MIN_STRIDE / STRIDE <= rate < math.inf:
-        raise InputError(f"rate of a soft sensor must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
     machine = _load_pump_controlled_rig(rig)
-    choice = sensor_unit.SensorChoice.from_rig(machine, float(rate))
+    program = stream_program(StreamSettings.from_rig(machine, float(rate)))
     unit = MockUp(
         summary=f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
-        modules=sensor_unit.sensor_code(choice),
-        variable_list=tuple(sensor_unit.variables(machine)),
+        modules=sensor_sources(program, machine.title),
+        variable_list=tuple(sensor_variables(machine, program.settings.channels)),
         values=parameter_values(machine),
-        n_inputs=len(sensor_unit.INPUTS),
+        n_inputs=len(program.settings.channels),
         n_results=len(SENSOR_RESULTS),
-        n_states=sensor_unit.memory_layout(choice).itemsize // 8,  # a record of doubles
+        n_states=memory_size(program),
         step=1.0 / rate,
-        failures=sensor_unit.FAILURES,
+        failures=FAILURES,
     )
     unit.write(path, fmi, chosen_platforms)
     return unit.variable_list

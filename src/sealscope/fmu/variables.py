@@ -8,6 +8,7 @@ from importlib.resources import files
 from operator import attrgetter
 from typing import Any, Literal, NamedTuple
 
+from sealscope.emit.stream_program import RESULT_UNITS
 from sealscope.parameters import Rig
 from sealscope.parameters.fields import absent_of, iter_fields, unit_of
 from sealscope.physics.rig import VALUES as NAMES_OF_VALUES
@@ -23,7 +24,7 @@ RESULTS: Mapping[str, tuple[str, str]] = {
     **{name: _TABLES["outputs"].get(name) or (CHANNEL_UNITS[name], LONG_NAMES[name]) for name in OUTPUTS},
     **_TABLES["powers"],
 }
-SENSOR_RESULTS: Mapping[str, tuple[str, str]] = _TABLES["sensor"]
+SENSOR_RESULTS: Mapping[str, tuple[str, str]] = RESULT_UNITS
 #: The inputs on which an output depends without delay.
 DIRECT: Mapping[str, list[str]] = _TABLES["direct"]
 #: First value reference of each kind of variable.

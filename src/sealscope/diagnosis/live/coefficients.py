@@ -8,8 +8,8 @@ column eliminated from both. Then the nuisances c, and the leak's coefficient g_
 
 where N_k, n_k and b_k are the products of the leak's column with itself, the left side and the nuisances over the
 rows (equations) of block k, and s^2 is the long-run variance of a row. A leak does not enter c, so that a step of g_k
-is a step of the leak. No function allocates memory, as a simulation unit for other programs (`fmu.sensor`) runs the
-same functions in C.
+is a step of the leak. No function allocates memory, as controllers and units of other
+programs run the same functions in C (`emit`).
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ WINDOW = 20
 #: Blocks after a pause of so many seconds are not compared with earlier ones.
 PAUSE = float(LIVE.watch.pause)
 #: Onsets that a call of `advance` weighs, and halvings of the interval of the bound after each block.
-_ONSETS_A_CALL, _HALVINGS = 4, 20
+ONSETS_A_CALL, HALVINGS = 4, 20
 #: Blocks from which on the times of the detector of steps begin anew, and by how many.
 _MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
 #: Parts of the work at the end of a block: `phase` of the record.
@@ -180,7 +180,8 @@ class StreamSettings(NamedTuple):
             raise InputError(f"a stream on a controller must have one volume balance, got {len(balances)} ({circuit})")
         (balance,) = balances
         unknown = [term.name for term in balance.terms if not term.expression]
-        if unknown or not balance.left_expression or rig.circuit.feeds_one_chamber:
+        has_flow = rig.circuit.pump_moves_piston or flow == "q_pump"
+        if unknown or not balance.left_expression or not has_flow or rig.circuit.feeds_one_chamber:
             what = ", ".join(unknown) or f"the flow of {rig.circuit.name}"
             raise InputError(f"a stream on a controller must have terms that are expressions, got {what}")
         columns = ColumnRoles(balance)
@@ -250,7 +251,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     - ``add_sample(m, p_A, p_B, flow, x)`` adds a sample in SI units, NaN or a number beyond `MAX_READING` if missing.
     - ``advance(m)`` does a part of the work at the end of a block, if there is any (`m.phase`).
     - ``write_results(m, out)`` writes the results, in the order of `RESULTS`.
-    - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew.
+    - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew; ``resume(m)`` begins with samples anew, with what
+      was learned before.
     """
     from scipy.special import stdtrit
 
@@ -554,7 +556,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     def test_part(m: Any) -> None:
         """Do a part of the test for a step: weigh the onsets, decide, and find the bound."""
         steps, n_onsets = m.steps, int(m.steps.n_onsets)
-        first, last = int(m.place), min(int(m.place) + _ONSETS_A_CALL, n_onsets)
+        first, last = int(m.place), min(int(m.place) + ONSETS_A_CALL, n_onsets)
         if m.phase == WEIGH:
             for j in range(first, last):
                 step.weigh_onset(steps, j)
@@ -578,7 +580,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
                 step.bisect_bound(steps)
                 m.halvings += 1
                 m.place = 0
-                if m.halvings > _HALVINGS:
+                if m.halvings > HALVINGS:
                     m.phase = FINISH
 
     @law
@@ -633,6 +635,15 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             m.phase = FINISH
 
     @law
+    def resume(m: Any) -> None:
+        """Begin with samples anew, after a power cut, with what was learned before."""
+        m.sample_count = m.n_ended = m.n_open = m.n_closed = m.n_waiting = m.n_moving = m.n_estimated = 0
+        m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = m.has_converged = m.is_fitting = 0
+        m.block_end = m.leak_onset = 0.0
+        m.reason = 0 if m.usual_precision > 0.0 else _LEARNING
+        step.forget_onsets(m.steps)
+
+    @law
     def write_results(m: Any, out: Any) -> None:
         """Write the results in the order of `RESULTS`, by the formulas of the module's docstring.
 
@@ -668,5 +679,10 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             out[_OUT_BOUND] = pressure * m.steps.bound * (1.0 + WITHIN_95 * m.leak_error)
 
     return SimpleNamespace(
-        start=start, add_sample=add_sample, advance=advance, write_results=write_results, acknowledge=acknowledge
+        start=start,
+        add_sample=add_sample,
+        advance=advance,
+        write_results=write_results,
+        acknowledge=acknowledge,
+        resume=resume,
     )

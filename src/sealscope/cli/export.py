@@ -1,0 +1,58 @@
+"""The command `export`, which writes the estimator of a machine's stream for a controller."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from typer import Argument, Option
+
+from sealscope.cli.options import say
+from sealscope.errors import InputError
+
+_LANGUAGE = "c: C99; st: Structured Text (IEC 61131-3) as .st, PLCopen XML and .scl."
+_LEARN = "Healthy recording from which the program begins to know the machine; repeat."
+
+
+def export(
+    language: Annotated[str, Argument(help=_LANGUAGE)],
+    output: Annotated[Path, Option("--output", "-o", help="Folder to write into.")],
+    machine: Annotated[Path | None, Option(help="File of a commissioned machine (.toml).")] = None,
+    rig: Annotated[str | None, Option(help="Without --machine: name or file of a rig (thesis).")] = None,
+    rate: Annotated[str, Option(help="Samples a second of the controller.")] = "100 Hz",
+    flow: Annotated[str, Option(help="Channel of the pump's flow: theta, omega or q_pump.")] = "theta",
+    alarms: Annotated[float, Option("--false-alarms", help="False alarms in 1000 h of a healthy machine.")] = 1.0,
+    learn: Annotated[list[Path] | None, Option(metavar="FILE", help=_LEARN)] = None,
+    prefix: Annotated[str, Option(help="Beginning of all names.")] = "leak",
+) -> None:
+    """Write the estimator of a machine's leakage, with alarm, for a controller or PLC.
+
+    It estimates leakage and leak in m^3/s with 95 % intervals from chamber pressures, the pump's flow and the position.
+    """
+    from sealscope.diagnosis.commissioned.machine_file import read_machine
+    from sealscope.emit.export import export_controller
+    from sealscope.parameters import load_rig
+    from sealscope.recordings import read
+    from sealscope.units import parse_quantity
+
+    if machine is not None and rig is not None:
+        raise InputError("--rig cannot be combined with --machine, whose file states the sizes")
+    known = None if machine is None else read_machine(machine)
+    paths = learn or []
+    recordings = [read(path, map="auto") if known is None else known.read(path) for path in paths]
+    written = export_controller(
+        output,
+        language=language,  # type: ignore[arg-type]
+        rig=load_rig(rig or "thesis") if known is None else known.rig,
+        rate=parse_quantity(rate, "Hz", name="rate"),
+        flow=flow,
+        false_alarms_per_1000_h=alarms,
+        learn=recordings,
+        prefix=prefix,
+        origin="" if machine is None else machine.name,
+    )
+    names = ", ".join(path.name for path in written.files)
+    lines = [f"{output}: {names}", f"state {written.state_bytes} bytes, {written.parts_a_sample} parts a sample"]
+    if paths:
+        lines.append(f"learned from {written.learned_blocks} blocks of {len(paths)} recordings")
+    say("\n".join(lines))

@@ -1,0 +1,156 @@
+"""Export the estimator of a machine's stream for controllers: C99, or Structured Text."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from sealscope.calls import checked_call
+from sealscope.diagnosis.live.kernel.stream import StreamSettings
+from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
+from sealscope.emit.run_program import CompiledStream
+from sealscope.emit.st_export import render_st
+from sealscope.emit.stream_program import StreamProgram, stream_program
+from sealscope.errors import InputError
+from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.channels import flow_source
+from sealscope.recordings.recording import Array, Recording
+from sealscope.storage.atomic import atomic_write
+
+Language = Literal["c", "st"]
+#: Names that begin the functions of an export: a letter, then letters, digits and single underscores.
+_PREFIX = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
+#: Longest test vectors [s].
+_VECTOR_SECONDS = 90.0
+
+
+class Export(NamedTuple):
+    """What `export_controller` wrote: the files, and what they say of the program."""
+
+    files: tuple[Path, ...]
+    state_bytes: int
+    parts_a_sample: int
+    learned_blocks: int
+
+
+@checked_call
+def export_controller(
+    folder: str | os.PathLike[str],
+    *,
+    language: Language = "c",
+    rig: Rig | str | os.PathLike[str] = "thesis",
+    rate: float = 100.0,
+    flow: str = "theta",
+    false_alarms_per_1000_h: float = 1.0,
+    learn: Sequence[Recording] = (),
+    prefix: str = "leak",
+    origin: str = "",
+) -> Export:
+    """Export the estimator of a running actuator's leakage as source text for a controller.
+
+    Parameters
+    ----------
+    folder : path
+        Folder to write into; files of the same names are replaced.
+    language : {"c", "st"}, default "c"
+        C99, or Structured Text of IEC 61131-3.
+    rig : Rig, str or path, default "thesis"
+        Sizes of the machine: of its circuit, piston area and pump displacement are used.
+    rate : float, default 100
+        Samples a second [Hz].
+    flow : {"theta", "omega", "q_pump"}, default "theta"
+        Channel that gives the pump's flow: its angle, its speed, or a flow meter.
+    false_alarms_per_1000_h : float, default 1
+        Largest number of false alarms of a healthy machine per 1000 operating hours.
+    learn : sequence of Recording, optional
+        Healthy recordings, from which the program begins to know the machine. The first of them also gives test vectors.
+    prefix : str, default "leak"
+        Beginning of all names.
+    origin : str, optional
+        Where the sizes are from, in words.
+
+    Returns
+    -------
+    Export
+        The written files, and figures of the program.
+
+    Raises
+    ------
+    InputError
+        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate, or
+        learning needs a C compiler and there is none.
+
+    Examples
+    --------
+    >>> import sealscope as ss
+    >>> export = ss.export_controller("leak", rig="thesis", rate=100.0)  # doctest: +SKIP
+    >>> [path.name for path in export.files]  # doctest: +SKIP
+    ['leak.h', 'leak.c', 'main.c', 'Makefile', 'README.md']
+    """
+    if language not in ("c", "st"):
+        raise InputError(f"language must be c or st, got {language!r}")
+    if not _PREFIX.fullmatch(prefix) or len(prefix) > 16:
+        raise InputError(f"prefix must be a name of at most 16 letters and digits, got {prefix!r}")
+    machine = load_rig(rig)
+    unit = stream_program(StreamSettings.from_rig(machine, float(rate), flow, false_alarms_per_1000_h))
+    words: dict[str, Any] = {
+        "prefix": prefix,
+        "title": machine.title,
+        "origin": origin or machine.name,
+        "alarm_rate": false_alarms_per_1000_h,
+    }
+    samples = [_samples_of(recording, unit) for recording in learn]
+    learned, blocks = _learn(unit, samples, words) if samples else ((), 0)
+    texts: Mapping[str, str]
+    if language == "c":
+        texts = render_c(unit, **words, learned=learned)
+        if samples:
+            vectors = samples[0][: round(_VECTOR_SECONDS * unit.settings.rate)]
+            texts = {**texts, **render_vectors(CompiledStream(unit, texts, prefix), vectors)}
+    else:
+        texts = render_st(unit, **words, learned=learned)
+    place = Path(folder)
+    place.mkdir(parents=True, exist_ok=True)
+    for name, text in texts.items():
+        with atomic_write(place / name) as temporary:
+            Path(temporary).write_text(text, encoding="utf-8")
+    state_bytes = sum((8 if field.kind == "real" else 4) * (field.size or 1) for field in unit.program.fields)
+    return Export(tuple(place / name for name in texts), state_bytes, parts_a_sample(unit.settings), blocks)
+
+
+def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
+    """Return the samples (n, 4) of a recording in the order of the program; raise InputError if one is missing."""
+    settings = unit.settings
+    lacking = [name for name in settings.channels if name not in recording]
+    if lacking:
+        source = flow_source(recording.channels)
+        hint = f"; its flow is {source}: state it as the flow" if source and lacking == [settings.channels[2]] else ""
+        raise InputError(f"a recording to learn from must have {', '.join(lacking)}{hint}")
+    if abs(recording.rate / settings.rate - 1.0) > 1e-3:
+        raise InputError(f"a recording to learn from must have the rate {settings.rate:g} Hz, got {recording.rate:g}")
+    return np.stack([recording[name] for name in settings.channels], axis=1)
+
+
+def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]) -> tuple[list[float], int]:
+    """Run the program on healthy recordings; return the numbers that it saves, and how many blocks it estimated.
+
+    Raises InputError if no block could be estimated, or a recording raises an alarm.
+    """
+    stream = CompiledStream(unit, render_c(unit, **words), str(words["prefix"]))
+    blocks = 0
+    for k, samples in enumerate(recordings):
+        if k:
+            stream.resume()
+        for _ in stream.feed(samples, parts_a_sample(unit.settings)):
+            pass
+        if stream.state.alarm:
+            raise InputError(f"a recording to learn from must be healthy, got an alarm in number {k + 1}")
+        blocks += int(stream.state.n_estimated)
+    if not blocks:
+        raise InputError("recordings to learn from must have a minute of motion or more, got none that was estimated")
+    return stream.saved(), blocks

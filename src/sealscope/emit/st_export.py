@@ -1,0 +1,194 @@
+"""The files of a stream in Structured Text: function blocks as plain text, as PLCopen XML, and for TIA Portal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any, NamedTuple
+
+from sealscope.emit import function_blocks
+from sealscope.emit.c_export import most_parts, parts_a_sample, templates
+from sealscope.emit.program import Program
+from sealscope.emit.specialise import specialise
+from sealscope.emit.stream_program import StreamProgram, result_rows
+from sealscope.emit.structured_text import StText, format_real
+
+#: A reading beyond `MAX_READING` of the kernels, which counts as missing, as a product that each compiler reads.
+_MISSING = "LREAL#1.0E37 * LREAL#1.0E37 * LREAL#1.0E37"
+
+
+class Piece(NamedTuple):
+    """A part of an export: name of a data type, function or function block, and its text."""
+
+    name: str
+    text: str
+
+    @property
+    def kind(self) -> str:
+        """Kind of the part: "dataType", "function" or "functionBlock"."""
+        words = {"TYPE": "dataType", "FUNCTION": "function", "FUNCTION_BLOCK": "functionBlock"}
+        first = re.search(r"^(TYPE|FUNCTION_BLOCK|FUNCTION)\b", self.text, flags=re.MULTILINE)
+        assert first is not None
+        return words[first[1]]
+
+    @property
+    def fields(self) -> list[tuple[str, str, str]]:
+        """Name, type and initial value of the fields of a data type."""
+        return _declarations(self.text)
+
+    @property
+    def sections(self) -> list[tuple[str, list[tuple[str, str, str]]]]:
+        """Sections of variables: XML's tag with its attributes; name, type and initial value of each variable."""
+        found = re.findall(r"^(VAR\w*)( CONSTANT| RETAIN)?\n(.*?)^END_VAR$", self.text, flags=re.MULTILINE | re.DOTALL)
+        attributes = {" CONSTANT": ' constant="true"', " RETAIN": ' retain="true"', "": ""}
+        return [(_SECTIONS[word] + attributes[more], _declarations(lines)) for word, more, lines in found]
+
+    @property
+    def body(self) -> str:
+        """Statements of a function or function block."""
+        return re.split(r"^END_FUNCTION", self.text.rpartition("END_VAR\n")[2], flags=re.MULTILINE)[0]
+
+
+#: XML's tag for each section of variables.
+_SECTIONS = {"VAR_INPUT": "inputVars", "VAR_OUTPUT": "outputVars", "VAR_IN_OUT": "inOutVars", "VAR": "localVars"}
+_DECLARATION = re.compile(r"^ +(\w+) : ([^;:]+?)(?: := ([^;]*))?;", flags=re.MULTILINE)
+
+
+def _declarations(text: str) -> list[tuple[str, str, str]]:
+    """List name, type and initial value of declared variables."""
+    return [(match[1], match[2], match[3] or "") for match in _DECLARATION.finditer(text)]
+
+
+def _xml_type(kind: str) -> str:
+    """Write a type as PLCopen's XML."""
+    array = re.fullmatch(r"ARRAY \[(\d+)\.\.(\d+)\] OF (\w+)", kind)
+    if array:
+        inner = _xml_type(array[3])
+        return f'<array><dimension lower="{array[1]}" upper="{array[2]}"/><baseType>{inner}</baseType></array>'
+    return f"<{kind}/>" if kind in ("LREAL", "REAL", "DINT", "BOOL") else f'<derived name="{kind}"/>'
+
+
+def _xml_initial(text: str) -> str:
+    """Write an initial value, a number or an array of numbers, as PLCopen's XML."""
+    if not text:
+        return ""
+    if not text.startswith("["):
+        return f'<initialValue><simpleValue value="{text}"/></initialValue>'
+    values = (f'<value><simpleValue value="{value.strip()}"/></value>' for value in text[1:-1].split(","))
+    return f"<initialValue><arrayValue>{''.join(values)}</arrayValue></initialValue>"
+
+
+def auxiliary_programs() -> Mapping[str, Program]:
+    """Specialise the kernels of the function blocks beside the estimator, by the name of the block."""
+    real, truth = "real", "truth"
+    hold = {"m": "state", "x": real, "rate": real, "area": real, "most_creep": real}
+    alarm = {"m": "state", "leak": real, "valid": truth, "acknowledge": truth, "warning": real, "alarm": real}
+    recorded = {"m": "state", "p_A": real, "p_B": real, "flow": real, "x": real, "trigger": truth, "release": truth}
+    return {
+        "HOLD": specialise(
+            function_blocks.HOLD_LAYOUT,
+            {
+                "start": (function_blocks.start_hold, {"m": "state"}),
+                "add": (function_blocks.add_hold_sample, hold),
+            },
+        ),
+        "ALARM": specialise(
+            function_blocks.ALARM_LAYOUT,
+            {
+                "start": (function_blocks.start_alarm, {"m": "state"}),
+                "add": (function_blocks.add_alarm_sample, {**alarm, "hysteresis": real, "delay": "whole"}),
+            },
+        ),
+        "RECORDER": specialise(
+            function_blocks.RECORDER_LAYOUT,
+            {
+                "start": (function_blocks.start_recorder, {"m": "state"}),
+                "add": (function_blocks.add_recorded_sample, recorded),
+            },
+        ),
+    }
+
+
+def pieces(unit: StreamProgram, prefix: str, learned: Sequence[float] = ()) -> Iterator[Piece]:
+    """Yield the parts of an export, each after those that it needs."""
+    upper = prefix.upper()
+    text = StText(unit.program, upper)
+    yield Piece(text.state_type, text.render_state())
+    for name, block in text.render_blocks():
+        yield Piece(name, block)
+    values: dict[str, Any] = {
+        "unit": unit,
+        "prefix": upper,
+        "text": text,
+        "missing": _MISSING,
+        "results": result_rows(),
+        "learned": [format_real(number) for number in learned[1:-1]],
+        "parts_a_sample": parts_a_sample(unit.settings),
+        "most_parts": most_parts(),
+        "n_recorded": function_blocks.N_RECORDED,
+    }
+    for name in (*(["LEARNED"] if learned else []), "MONITOR"):
+        yield Piece(f"{upper}_{name}", templates().get_template(f"{name.lower()}.st.j2").render(values))
+    for name, program in auxiliary_programs().items():
+        part = StText(program, f"{upper}_{name}")
+        yield Piece(part.state_type, part.render_state())
+        for block, block_text in part.render_blocks():
+            yield Piece(block, block_text)
+        rendered = templates().get_template(f"{name.lower()}.st.j2").render({**values, "text": part})
+        yield Piece({"HOLD": "FB_HoldTest", "ALARM": "FB_LeakAlarm", "RECORDER": "FB_Recorder"}[name], rendered)
+
+
+def render_st(
+    unit: StreamProgram,
+    *,
+    prefix: str,
+    title: str,
+    origin: str,
+    alarm_rate: float,
+    learned: Sequence[float] = (),
+) -> dict[str, str]:
+    """Render the Structured Text of a stream as files by name; the arguments are those of `c_export.render_c`."""
+    parts = list(pieces(unit, prefix, learned))
+    head = f"(* {title}\n   Written by Sealscope {version('sealscope')} from {origin}, checksum {unit.checksum}. *)\n"
+    values = {
+        **{"unit": unit, "prefix": prefix.upper(), "title": title, "origin": origin, "version": version("sealscope")},
+        **{"results": result_rows(), "parts": parts, "alarm_rate": alarm_rate, "learned": bool(learned)},
+        **{"parts_a_sample": parts_a_sample(unit.settings), "most_parts": most_parts()},
+        **{"flow": unit.settings.channels[2], "xml_type": _xml_type, "xml_initial": _xml_initial},
+    }
+    return {
+        f"{prefix}.st": "\n".join([head, *(part.text for part in parts)]),
+        f"{prefix}.scl": "\n".join([head, *(_as_scl(part) for part in parts)]),
+        f"{prefix}.xml": templates().get_template("plcopen.xml.j2").render(values),
+        "README.md": templates().get_template("st_readme.md.j2").render(values),
+    }
+
+
+def _as_scl(part: Piece) -> str:
+    """Write a part as a source of TIA Portal: names in quotation marks, and other words for its head and body."""
+    if part.kind == "dataType":
+        body = part.text.replace(f"TYPE {part.name} :", f'TYPE "{part.name}"').replace("END_STRUCT;\n", "END_STRUCT;\n")
+        return body
+    lines = []
+    has_begun = False
+    for line in part.text.splitlines():
+        if re.match(r"FUNCTION(_BLOCK)? ", line):
+            lines.append(re.sub(r"^(FUNCTION(?:_BLOCK)?) (\w+)", r'\1 "\2"', line))
+            lines.append("{ S7_Optimized_Access := 'TRUE' }")
+        elif re.match(r"(VAR\w*|END_VAR)\b", line) or (not has_begun and line.startswith("    ")):
+            lines.append(re.sub(r": (\w+_(?:STATE|\w+));", _quote_type, line))
+        elif line.startswith("END_FUNCTION"):
+            lines.append(line)
+        else:
+            if not has_begun and line and not line.startswith("(*"):
+                lines.append("BEGIN")
+                has_begun = True
+            lines.append(line)
+    return "\n".join([*lines, ""])
+
+
+def _quote_type(match: re.Match[str]) -> str:
+    """Quote a data type or function block of the export in a declaration."""
+    name = match[1]
+    return f': "{name}";' if not re.fullmatch(r"L?REAL|D?INT|BOOL", name) else match[0]

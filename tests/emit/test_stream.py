@@ -1,0 +1,155 @@
+"""The estimator of a stream as C99 and as Structured Text: both compute what the kernels compute, block by block."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import sealscope as ss
+from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
+from sealscope.emit.c_export import parts_a_sample, render_c
+from sealscope.emit.compiler import find_compiler
+from sealscope.emit.run_program import CompiledStream
+from sealscope.emit.st_export import render_st
+from sealscope.emit.stream_program import stream_program
+from sealscope.errors import InputError
+
+from ..diagnosis.balance_machine import machine, step
+from .st_evaluator import Program
+
+RIG = ss.load_rig("thesis")
+WORDS = {"prefix": "leak", "title": "a machine", "origin": "a test", "alarm_rate": 1000.0}
+
+
+def has_compiler() -> bool:
+    try:
+        return bool(find_compiler())
+    except InputError:
+        return False
+
+
+pytestmark = pytest.mark.skipif(not has_compiler(), reason="needs a C compiler")
+
+
+def unit_at(rate, flow="theta"):
+    return stream_program(StreamSettings.from_rig(RIG, rate, flow, 1000.0))
+
+
+def samples_of(recording, flow="theta"):
+    return np.stack([recording[name] for name in ("p_A", "p_B", flow, "x")], axis=1)
+
+
+def nuisances(samples, random):
+    """Lost readings, numbers that are none, a stuck channel and spikes."""
+    samples = samples.copy()
+    n = len(samples)
+    for _ in range(4):
+        first, channel = int(random.integers(0, n - 40)), int(random.integers(4))
+        samples[first : first + int(random.integers(1, 30)), channel] = random.choice([np.nan, np.inf, -np.inf, 1e120])
+    first = int(random.integers(0, n - 60))
+    samples[first : first + 50, int(random.integers(4))] = samples[first, 0]
+    return samples
+
+
+def c_stream(unit):
+    return CompiledStream(unit, render_c(unit, **WORDS), "leak")
+
+
+def run_st(unit, samples, learned=()):
+    """Results of the monitor's function block after each block of the stream, and the block."""
+    program = Program(render_st(unit, **WORDS, learned=learned)["leak.st"])
+    monitor = program.make("LEAK_MONITOR")
+    results, ended = [], 0
+    for p_A, p_B, flow, x in samples.tolist():
+        is_valid = bool(np.isfinite([p_A, p_B, flow, x]).all())
+        monitor(enable=True, valid=is_valid, **{"p_a": p_A, "p_b": p_B, "flow": flow, "x": x})  # names have no case
+        if monitor.state.phase == 0 and monitor.state.n_ended != ended:
+            ended = monitor.state.n_ended
+            results.append([monitor.alarm if name == "alarm" else getattr(monitor, name) for name in RESULTS])
+    return np.array(results, dtype=float), monitor
+
+
+def test_structured_text_computes_what_c_computes():
+    """Through the first fit; lost readings among the samples."""
+    unit, random = unit_at(16.0), np.random.default_rng(1)
+    recording = machine(1, duration=66.0, rate=16.0)
+    samples = samples_of(recording)
+    samples[300:310] = np.nan
+    samples[600 + int(random.integers(40))] = np.nan
+    expected = np.array(list(c_stream(unit).feed(samples, parts_a_sample(unit.settings))))
+    results, _ = run_st(unit, samples)
+    assert len(results) >= 4 and np.count_nonzero(expected[:, 0]) >= 2
+    assert results == pytest.approx(expected[-len(results) :], rel=1e-9, abs=1e-25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("flow", ["theta", "omega"])
+def test_structured_text_raises_the_alarm_of_c(flow):
+    unit = unit_at(20.0, flow)
+    recording = machine(1, G=step(0.0, 4e-13, at=80.0), duration=110.0, rate=20.0)
+    if flow == "omega":
+        channels = {**recording.channels, "omega": np.gradient(recording["theta"], 1.0 / recording.rate)}
+        samples = np.stack([channels[name] for name in ("p_A", "p_B", "omega", "x")], axis=1)
+    else:
+        samples = samples_of(recording)
+    expected = np.array(list(c_stream(unit).feed(samples, parts_a_sample(unit.settings))))
+    results, monitor = run_st(unit, samples)
+    assert monitor.alarm and expected[-1, RESULTS.index("alarm")] == 1.0
+    assert results == pytest.approx(expected[-len(results) :], rel=1e-9, abs=1e-25)
+
+
+def test_a_leak_raises_an_alarm_with_its_size_and_onset():
+    unit = unit_at(25.0)
+    recording = machine(1, G=step(0.0, 4e-13, at=80.0), duration=110.0, rate=25.0)
+    results = np.array(list(c_stream(unit).feed(samples_of(recording), parts_a_sample(unit.settings))))
+    alarms = results[:, RESULTS.index("alarm")]
+    first = int(np.argmax(alarms))
+    assert alarms[-1] == 1.0 and not alarms[: first - 1].any()
+    row = dict(zip(RESULTS, results[-1], strict=True))
+    pressure = np.mean(np.abs(recording["p_A"] - recording["p_B"]))
+    assert row["q_leak_low"] < 4e-13 * pressure < row["q_leak_high"]
+    assert row["since"] == pytest.approx(30.0, abs=4.0)
+
+
+def test_hostile_samples_lead_nowhere(tmp_path):
+    """Any numbers: the state recovers, and estimates what it did before."""
+    unit, random = unit_at(16.0), np.random.default_rng(3)
+    recording = machine(2, duration=80.0, rate=16.0)
+    stream, parts = c_stream(unit), parts_a_sample(unit_at(16.0).settings)
+    before = list(stream.feed(samples_of(recording), parts))[-1]
+    hostile = random.standard_normal((2000, 4)) * 10.0 ** random.uniform(-300, 300, (2000, 4))
+    hostile[random.random((2000, 4)) < 0.2] = np.nan
+    for _ in stream.feed(hostile, parts):
+        pass
+    stream.resume()
+    after = list(stream.feed(samples_of(recording), parts))[-1]
+    assert np.isfinite(after).all()
+    q = RESULTS.index("q")
+    assert after[q] == pytest.approx(before[q], rel=0.5)
+
+
+def test_what_was_learned_outlasts_a_power_cut_and_damage_is_refused():
+    unit = unit_at(16.0)
+    recording, parts = machine(2, duration=70.0, rate=16.0), parts_a_sample(unit_at(16.0).settings)
+    stream = c_stream(unit)
+    list(stream.feed(samples_of(recording), parts))
+    saved = stream.saved()
+    again = CompiledStream(unit, render_c(unit, **WORDS, learned=saved), "leak")
+    first = next(iter(again.feed(samples_of(recording), parts)))
+    assert again.state.usual_precision == stream.state.usual_precision > 0.0
+    assert np.isfinite(first).all()
+    import ctypes
+
+    damaged = list(saved)
+    damaged[7] += 1.0
+    for numbers, restores in ((saved, True), (damaged, False), ([1.0, *saved[1:]], False)):
+        assert again._call("restore", (ctypes.c_double * len(numbers))(*numbers)) is restores
+
+
+def test_machines_without_such_a_balance_are_refused():
+    with pytest.raises(InputError, match="valve-controlled"):
+        StreamSettings.from_rig(ss.load_rig("servo-valve"), 100.0)
+    with pytest.raises(InputError, match="rate"):
+        StreamSettings.from_rig(RIG, 5.0)
+    with pytest.raises(InputError, match="balance"):
+        StreamSettings.from_rig(RIG, 100.0, "x")
