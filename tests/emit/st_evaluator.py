@@ -30,7 +30,8 @@ def _ln(a):
 
 
 FUNCTIONS = {
-    "abs": abs, "sqrt": lambda a: math.sqrt(a) if a >= 0 else math.nan, "ln": _ln, "exp": lambda a: math.exp(min(a, 709.0)),
+    "abs": abs, "sqrt": lambda a: math.sqrt(a) if a >= 0 else math.nan, "ln": _ln,
+    "exp": lambda a: math.exp(min(a, 709.0)),
     "trunc": int, "dint_to_lreal": float, "sel": lambda g, a, b: b if g else a, "expt": lambda a, b: a**b,
     "_divide": _divide, "_mod": lambda a, b: int(math.fmod(a, b)),
 }  # fmt: skip

@@ -65,10 +65,12 @@ def test_the_hold_test_in_structured_text_equals_the_kernel():
     x[40:45] = np.nan
     block = program.make("FB_HoldTest")
     for value in x.tolist():
-        block(active=True, valid=value == value, x=value, rate=RATE, area=AREA, limit_mm_per_min=2.0)
+        block(active=True, valid=bool(np.isfinite(value)), x=value, rate=RATE, area=AREA, limit_mm_per_min=2.0)
     state = run_hold(x, 2.0)
     assert block.creep_mm_per_min == pytest.approx(6e4 * state.creep, rel=1e-12)
-    assert (block.creep_low, block.creep_high) == pytest.approx((6e4 * state.creep_low, 6e4 * state.creep_high), rel=1e-9)
+    assert (block.creep_low, block.creep_high) == pytest.approx(
+        (6e4 * state.creep_low, 6e4 * state.creep_high), rel=1e-9
+    )
     assert block.leak_lpm == pytest.approx(6e4 * state.leak, rel=1e-12)
     assert block.result == state.result == blocks.PASS
 

@@ -38,12 +38,15 @@ def export(
     if machine is not None and rig is not None:
         raise InputError("--rig cannot be combined with --machine, whose file states the sizes")
     known = None if machine is None else read_machine(machine)
+    sizes = load_rig(rig or "thesis") if known is None else known.rig
+    if sizes is None:
+        raise InputError(f"a controller needs the pump's displacement, got none in {machine}: state it in [pump]")
     paths = learn or []
     recordings = [read(path, map="auto") if known is None else known.read(path) for path in paths]
     written = export_controller(
         output,
         language=language,  # type: ignore[arg-type]
-        rig=load_rig(rig or "thesis") if known is None else known.rig,
+        rig=sizes,
         rate=parse_quantity(rate, "Hz", name="rate"),
         flow=flow,
         false_alarms_per_1000_h=alarms,

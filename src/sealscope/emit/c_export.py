@@ -66,8 +66,8 @@ def render_c(
 ) -> dict[str, str]:
     """Render the C files of a stream by name.
 
-    `title`, `origin`: the machine, and its file, in words; `alarm_rate`: false alarms in 1000 h; `learned`: numbers that
-    `CompiledStream.saved` returned after healthy recordings.
+    `title`, `origin`: the machine, and its file, in words; `alarm_rate`: false alarms in 1000 h; `learned`: numbers
+    that `CompiledStream.saved` returned after healthy recordings.
     """
     text = CText(unit.program, prefix)
     flow = unit.settings.channels[2]

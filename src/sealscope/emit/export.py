@@ -30,7 +30,7 @@ _VECTOR_SECONDS = 90.0
 
 
 class Export(NamedTuple):
-    """What `export_controller` wrote: the files, and what they say of the program."""
+    """The files that `export_controller` wrote, and figures of the program."""
 
     files: tuple[Path, ...]
     state_bytes: int
@@ -68,7 +68,7 @@ def export_controller(
     false_alarms_per_1000_h : float, default 1
         Largest number of false alarms of a healthy machine per 1000 operating hours.
     learn : sequence of Recording, optional
-        Healthy recordings, from which the program begins to know the machine. The first of them also gives test vectors.
+        Healthy recordings, from which the program begins to know the machine. The first also gives test vectors.
     prefix : str, default "leak"
         Beginning of all names.
     origin : str, optional

@@ -62,9 +62,10 @@ def start_hold(m: Any) -> None:
 def add_hold_sample(m: Any, x: float, rate: float, area: float, most_creep: float) -> None:
     """Add a position x [m] of the held load to a hold test.
 
-    `rate` [Hz]: calls a second; `area` [m^2]: of the loaded side; `most_creep` [m/s]: the limit, 0 for none. The samples are summed to at most `N_MEANS` means. Creep is the slope of a line through them; its interval is
-    Student's, with the variance of the means inflated by their autocorrelation. The test passes if the whole interval
-    is within the limit, and fails if it is outside (ISO 14253-1).
+    `rate` [Hz]: calls a second; `area` [m^2]: of the loaded side; `most_creep` [m/s]: the limit, 0 for none. The
+    samples are summed to at most `N_MEANS` means. Creep is the slope of a line through them; its interval is Student's,
+    with the variance of the means inflated by their autocorrelation. The test passes if the whole interval is within
+    the limit, and fails if it is outside (ISO 14253-1).
     """
     if not abs(x) < 1e30:
         return
@@ -140,8 +141,9 @@ def add_alarm_sample(
 ) -> None:
     """Compare a leak with the limits of a warning and of an alarm.
 
-    All are in the same unit; `hysteresis` is a share of a limit, `delay` a number of calls. A level is reached after `delay` calls above its limit, and left below the limit less the hysteresis. An alarm stays
-    until it is acknowledged, and comes back while the leak is above its limit.
+    All are in the same unit; `hysteresis` is a share of a limit, `delay` a number of calls. A level is reached after
+    `delay` calls above its limit, and left below the limit less the hysteresis. An alarm stays until it is
+    acknowledged, and comes back while the leak is above its limit.
     """
     if not valid:
         m.n_above_warning = m.n_above_alarm = 0
@@ -176,7 +178,8 @@ def start_recorder(m: Any) -> None:
 def add_recorded_sample(m: Any, p_A: float, p_B: float, flow: float, x: float, trigger: bool, release: bool) -> None:
     """Store a sample in a ring, unless it is frozen.
 
-    `trigger` freezes it after `N_AFTER` more samples, until it is read and `release` is set. The oldest sample stands at `next` once the ring is full, else at 0.
+    `trigger` freezes it after `N_AFTER` more samples, until it is read and `release` is set. The oldest sample stands
+    at `next` once the ring is full, else at 0.
     """
     if release:
         start_recorder(m)

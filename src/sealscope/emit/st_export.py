@@ -168,8 +168,7 @@ def render_st(
 def _as_scl(part: Piece) -> str:
     """Write a part as a source of TIA Portal: names in quotation marks, and other words for its head and body."""
     if part.kind == "dataType":
-        body = part.text.replace(f"TYPE {part.name} :", f'TYPE "{part.name}"').replace("END_STRUCT;\n", "END_STRUCT;\n")
-        return body
+        return part.text.replace(f"TYPE {part.name} :", f'TYPE "{part.name}"')
     lines = []
     has_begun = False
     for line in part.text.splitlines():

@@ -43,14 +43,14 @@ _BINARY |= {name: name for name in ("<", "<=", ">", ">=")}
 _FUNCTIONS = {"absolute": "ABS", "log": "LN", "exp": "EXP", "sqrt": "SQRT"}
 #: Words that a name must not be: keywords, types, standard functions and blocks of IEC 61131-3, and of SFC and IL.
 _RESERVED_TEXT = """\
-abs acos action add and andn any array asin at atan bool by byte cal calc calcn case concat configuration constant
-cos ct ctd ctu ctud cu cv date day dint div do dt dword edge else elsif end eq exit exp expt f_edge f_trig false find
-for from function function_block ge goto gt if in initial insert int interval jmp jmpc jmpcn ld ldn le left len limit
-lint ln log lreal lt lword max mid min mod move mul mux ne not of on or orn parameter persistent pointer priority
-program pt q r r1 r_edge r_trig read_only read_write real ref_to reference repeat replace resource ret retain retc
-retcn return right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super tan task
-then this time tod tof ton to tp transition true trunc type udint uint ulint until usint var while with word wstring
-xor xorn
+abs acos action add and andn any array asin at atan bool by byte cal calc calcn case concat configuration constant cos
+ct ctd ctu ctud cu cv date day dint div do dt dword edge else elsif end eq exit exp expt f_edge f_trig false find for
+from function function_block ge goto gt if in initial insert int interval jmp jmpc jmpcn ld ldn le left len limit lint
+ln log lreal lt lword max mid min mod move mul mux ne not of on or orn parameter persistent pointer priority program
+pt q r r1 r_edge r_trig read_only read_write real ref_to reference repeat replace resource ret retain retc retcn
+return right rol ror rs rtc s s1 sd sel sema shl shr sin single sint sl sqrt sr st step stn string struct sub super
+tan task then this time tod tof ton to tp transition true trunc type udint uint ulint until usint var while with word
+wstring xor xorn
 """
 RESERVED = frozenset(_RESERVED_TEXT.split())
 #: Limit of a literal, and the factor by which larger ones are written.

@@ -164,7 +164,17 @@ class MockUp(NamedTuple):
             inputs.append(object_file)
         output = folder / f"{system}{platform.suffix}"
         target = ["-target", platform.target] if compiler.cross_compiles else []
-        flags = ["-std=c11", "-O2", "-ffp-contract=off", "-fPIC", "-shared", f"-I{folder}", f"-I{folder / 'headers'}", "-o", str(output)]
+        flags = [
+            "-std=c11",
+            "-O2",
+            "-ffp-contract=off",
+            "-fPIC",
+            "-shared",
+            f"-I{folder}",
+            f"-I{folder / 'headers'}",
+            "-o",
+            str(output),
+        ]
         command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
         rule = f"the C compiler ({' '.join(compiler.command)}) must build the unit for {system}"
         try:
@@ -270,8 +280,8 @@ def write_sensor_fmu(
     The FMU contains the C99 that controllers run, too (`export_controller`), and needs no Python. Its outputs are
 
     - the mean leakage of the last blocks, at most 20, with a 95 % interval [m^3/s];
-    - an alarm at one false alarm in 1000 h, the leak since its onset with a 95 % interval, and without an alarm the bound
-      of a leak [m^3/s];
+    - an alarm at one false alarm in 1000 h, the leak since its onset with a 95 % interval, and without an alarm the
+      bound of a leak [m^3/s];
     - further numbers, such as the leakage conductance.
 
     Parameters

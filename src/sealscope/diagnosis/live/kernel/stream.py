@@ -251,8 +251,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     - ``add_sample(m, p_A, p_B, flow, x)`` adds a sample in SI units, NaN or a number beyond `MAX_READING` if missing.
     - ``advance(m)`` does a part of the work at the end of a block, if there is any (`m.phase`).
     - ``write_results(m, out)`` writes the results, in the order of `RESULTS`.
-    - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew; ``resume(m)`` begins with samples anew, with what
-      was learned before.
+    - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew.
+    - ``resume(m)`` begins with samples anew, with what was learned before.
     """
     from scipy.special import stdtrit
 
