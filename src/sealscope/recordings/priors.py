@@ -19,6 +19,17 @@ class ClockPriors(PriorTable):
     meet: tuple[float, float]  # [usual intervals] mean step between late rows that are sorted to their places
 
 
+class AnglePriors(PriorTable):
+    """An angle that begins anew after a period."""
+
+    period: float  # relative rounding error of the period
+    measured: float  # largest scatter of a period that leaps measure, relative to it
+    alike: float  # largest fraction of leaps that are not from one end of the range to the other
+    slow: float  # largest step that shows that an angle wraps, whatever its period, over the period
+    fast: float  # step, over the period, from which its direction must be told by another channel
+    most: float  # quantile of the steps that stands for the largest
+
+
 class StalePriors(PriorTable):
     """Samples that repeat the previous sample instead of a new reading."""
 
@@ -141,6 +152,7 @@ class RecordingPriors(PriorTable):
     """All tables of `recordings/priors.toml`, the assumptions on loggers, sensors and machines."""
 
     clock: ClockPriors
+    angle: AnglePriors
     stale: StalePriors
     spike: SpikePriors
     unsigned: UnsignedPriors

@@ -56,10 +56,10 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     """Find the defects of a recording's times and channels.
 
     Codes of what was found when the file was read: ``clock_wrapped``, ``wrong_times``, ``rows_written_twice``,
-    ``rows_sorted``, ``clock_set``, ``clock_restarted``. Codes of the time: ``too_short``, ``missing_time``,
-    ``reversed_time``, ``duplicated_time``, ``gap``, ``rate_mismatch``, ``irregular_sampling``; of a channel:
-    ``missing``, ``mixed_rate``, ``infinite``, ``constant``, ``impossible``, ``clipped``, ``stuck``, ``mains_hum``,
-    ``raw_counts``; of both chambers: ``creeping_pressures``.
+    ``rows_sorted``, ``clock_set``, ``clock_restarted``, ``angle_unwrapped``, ``angle_ambiguous``. Codes of the time:
+    ``too_short``, ``missing_time``, ``reversed_time``, ``duplicated_time``, ``gap``, ``rate_mismatch``,
+    ``irregular_sampling``; of a channel: ``missing``, ``mixed_rate``, ``infinite``, ``constant``, ``impossible``,
+    ``clipped``, ``stuck``, ``mains_hum``, ``raw_counts``; of both chambers: ``creeping_pressures``.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def inspect(recording: Recording) -> tuple[Finding, ...]:
     warning constant - p_A: is constant at 300000 Pa
     """
     with np.errstate(all="ignore"):
-        findings = [*_clock_findings(recording), *_time_findings(recording)]
+        findings = [*_reading_findings(recording), *_time_findings(recording)]
         for name, values in recording.channels.items():
             findings += _channel_findings(recording, name, values) if name not in SLOW else []
         findings += _creep_findings(recording)
@@ -103,18 +103,19 @@ def _make_finding(
     return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
 
 
-def _clock_findings(recording: Recording) -> list[Finding]:
-    """List what was found about the order of the rows when a recording was read, from the entry `clock` of its origin.
+def _reading_findings(recording: Recording) -> list[Finding]:
+    """List the findings made when a recording was read, from the entry `reading` of its provenance.
 
     Entries that are not written by `formats.table` are ignored: the provenance of a file may hold anything.
     """
-    entries = recording.provenance.get("clock")
+    entries = recording.provenance.get("reading")
     findings = []
     for entry in entries if isinstance(entries, Sequence) and not isinstance(entries, str) else ():
-        with suppress(KeyError, TypeError, ValueError):
+        with suppress(KeyError, TypeError, ValueError, AttributeError, OverflowError):
             severity: Severity = "warning" if entry["severity"] == "warning" else "note"
             code, text = str(entry["code"])[:_MAX_TEXT], str(entry["text"])[:_MAX_TEXT]
-            findings.append(Finding(code, severity, None, int(entry["count"]), float(entry["first_t"]), text))
+            channel = "theta" if entry.get("channel") == "theta" else None
+            findings.append(Finding(code, severity, channel, int(entry["count"]), float(entry["first_t"]), text))
     return findings
 
 

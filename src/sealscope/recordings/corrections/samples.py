@@ -10,6 +10,7 @@ import numpy as np
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.corrections.angles import unwrap_angles
 from sealscope.recordings.corrections.clock import order_recording, resample_evenly
 from sealscope.recordings.corrections.gaps import (
     bridge,
@@ -48,7 +49,7 @@ class CorrectedSamples(NamedTuple):
 def correct_samples(recording: Recording) -> CorrectedSamples:
     """Correct the samples of a recording for the defects of loggers, in this order.
 
-    0. rows out of the order of time;
+    0. rows out of the order of time, and an angle that begins anew after a turn;
     1. impossible values, dropouts, i.e. rows with zeros in both chamber pressures, and sensors without a supply;
     2. rows, and then single pressures, that repeat one value for a long time;
     3. spikes, and samples that repeat the previous one;
@@ -61,7 +62,8 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     `MAX_STUCK_FRACTION` of the rows keeps these rows, and is named as unusable.
     """
     ordered = order_recording(recording)
-    part = remove_unsupplied(remove_dropouts(remove_impossible(ordered.recording)))
+    part, unwrapped_angles = unwrap_angles(remove_dropouts(remove_impossible(ordered.recording)))
+    part = remove_unsupplied(part)
     part = set_missing(part, dict.fromkeys(part.channels, flag_frozen_rows(part)))
     chambers = chambers_of(part)
     # empty channels are left out, except chamber pressures
@@ -74,7 +76,7 @@ def correct_samples(recording: Recording) -> CorrectedSamples:
     part, spikes = remove_spikes(part)
     part, stale_samples = interpolate_stale_samples(part)
     part, restored_signs = restore_signs(resample_evenly(part))
-    findings = [*ordered.findings, *spikes, *stale_samples, *restored_signs]
+    findings = [*ordered.findings, *unwrapped_angles, *spikes, *stale_samples, *restored_signs]
     part = interpolate_short_gaps(bridge(part, needed), needed)
     if part.bridged is not None:
         bridged = np.flatnonzero(part.bridged)

@@ -42,7 +42,8 @@ from sealscope.recordings.formats.times.timebase import (
     time_base,
     timedelta_seconds,
 )
-from sealscope.units import to_si
+from sealscope.recordings.wrapped_angle import unwrap_angle
+from sealscope.units import same_dimension, to_si
 
 MAX_VALUES = 2**28  # most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz
 #: Most bytes of a table: the larger of _MIN_LIMIT and _MAX_EXPANSION times its file's size, as fill values expand.
@@ -152,7 +153,7 @@ def build_fields(
         channel_series, more_notes = _pivot_long_table(series, long_columns, prepare, clock_findings)
         table = build_fields(channel_series, request, kind, remarks)  # their values are read already
         findings = {finding["code"]: finding for finding in clock_findings}  # alike for all channels
-        provenance = table.provenance | ({"clock": [*findings.values()]} if findings else {})
+        provenance = table.provenance | ({"reading": [*findings.values()]} if findings else {})
         return table._replace(history=(*more_notes, *table.history), provenance=provenance)
     # the series to read; `CLOCK_LABEL`, which may come after all series, is not one
     kinds = {column: kind_read for column, kind_read in choice.columns.items() if column < len(candidates)}
@@ -263,7 +264,7 @@ def _describe_clock(base: TimeBase, name: str) -> dict[str, Any]:
         }
         for event in base.events
     ]
-    return {"clock": findings, "clock_breaks": [float(base.t[row]) for row in base.breaks]}
+    return {"reading": findings, "clock_breaks": [float(base.t[row]) for row in base.breaks]}
 
 
 def _convert_channels(
@@ -450,6 +451,7 @@ def _align_clocks(
         raise InputError(f"a channel must have a clock or be given a rate, got none for {names}")
     t, start = base.clock.read()
     clock: dict[str, Any] = {}
+    findings: list[dict[str, Any]] = []
     if any(member.clock is not None and member.clock.key != base.clock.key for member in used.values()):
         t, clock = _unwrap_clock(t, base.path)
     known = np.isfinite(t)
@@ -462,6 +464,12 @@ def _align_clocks(
                 f"{member.path} must have a clock or as many samples as {base.path} ({base.count}), got {member.count}"
             )
         if member.clock is not None and member.clock.key != base.clock.key:
+            if channel_of[column] == "theta":
+                values, finding = _unwrap_angle(values, member, choice.channels["theta"].unit or COUNTS)
+                findings += finding
+            if np.isnan(values).all():
+                columns[column] = np.full(np.count_nonzero(known), np.nan)
+                continue
             values, note = _resample(values, member, t[known], start)
             notes += [f"{channel_of[column]} {note}"] if note else []
         # resampled values are already at the known times only
@@ -471,7 +479,31 @@ def _align_clocks(
     columns[choice.time] = (
         t if start is None else start.astype("datetime64[ns]") + np.round(t * 1e9).astype("timedelta64[ns]")
     )
-    return columns, notes, clock
+    entries = [*clock.get("reading", []), *findings]
+    return columns, notes, {"reading": entries} if entries else {}
+
+
+def _unwrap_angle(values: Array, member: Series, unit: str) -> tuple[Array, list[dict[str, Any]]]:
+    """Unwrap the angle (n,) in `unit` of the series `member` before it is resampled; also return findings on it.
+
+    An angle whose turns are ambiguous becomes missing.
+    """
+    assert member.clock is not None
+    t, _ = member.clock.read()
+    scale = 1.0 if same_dimension(unit, COUNTS) else to_si(1.0, unit, "rad")
+    angle = unwrap_angle(values * scale, COUNTS if same_dimension(unit, COUNTS) else "rad", t)
+    if angle is None:
+        return values, []
+    is_known = angle.values is not None
+    text = f"theta: begins anew after {angle.period / scale:.6g} {unit}, {format_count(angle.n_leaps, 'time')}: "
+    text += "unwrapped" if is_known else "turns of half of it or more from sample to sample are ambiguous, left out"
+    finding: dict[str, Any] = {
+        "code": "angle_unwrapped" if is_known else "angle_ambiguous",
+        "text": text,
+        "channel": "theta",
+    }
+    finding |= {"severity": "note" if is_known else "warning", "count": angle.n_leaps, "first_t": float(t[angle.first])}
+    return np.full(values.size, np.nan) if angle.values is None else angle.values / scale, [finding]
 
 
 def _unwrap_clock(t: Array, name: str) -> tuple[Array, dict[str, Any]]:
@@ -566,7 +598,7 @@ def _read_long_channel(
     columns[value_column][is_word] = np.nan
     fields = convert_columns(choice, columns, "", _count_request(value_column))
     t, start = fields.t, None
-    clock_findings += fields.provenance.get("clock", [])
+    clock_findings += fields.provenance.get("reading", [])
     if breaks := fields.provenance.get("clock_breaks"):
         raise InputError(
             f"the times of a long table must not step back, got a break of the clock at {breaks[0]:g} s of "

@@ -28,7 +28,7 @@ _OIL_WORD = re.compile(
 )
 _OIL_COMPOUND = re.compile(rf"(?:{_OIL_WORD.pattern}){{2,6}}")
 #: The unit at the end of the name of a temperature, as in `OilTempC` or `T_oil_F`, by its letter.
-_TEMPERATURE_LETTER = re.compile(r"(?:[ _.]+(?:deg[ _]?|°)?|(?<=[a-z]))(?P<unit>[CFK]|(?<=[ _.])[cfk])$")
+_TEMPERATURE_LETTER = re.compile(r"(?:[ _.]{1,3}(?:deg[ _]?|°)?|(?<=[a-z]))(?P<unit>[CFK]|(?<=[ _.])[cfk])$")
 _TEMPERATURE_UNITS = {"c": "degC", "f": "degF", "k": "K"}
 #: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool may have any unit of
 #: a command (`_is_command_unit`).
