@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from datetime import UTC
 from functools import partial
 from pathlib import Path
@@ -27,11 +28,12 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
         start = start_time if start_time > np.datetime64("1980-01-02") else None
         series = []
         groups: list[Any] = file.groups
+        names = _name_groups(groups)
         for number, group in enumerate(groups):
             count = int(group.channel_group.cycles_nr)
             master = file.masters_db.get(number)  # index of the group's time channel
             clock = None if master is None else Clock(number, partial(_read_times, file, number, start))
-            name = str(getattr(group.channel_group, "comment", "") or "").strip() or f"group {number + 1}"
+            name = names[number]
             for index, channel in enumerate(group.channels):
                 if index != master:
                     label = Label.parse(channel.name, file.get_channel_unit(group=number, index=index) or None)
@@ -39,6 +41,21 @@ def read_mdf(path: Path, request: Request) -> RecordingFields:
         header = ("author", "department", "project", "subject", "comment")
         remarks = collect_remarks((name, getattr(file.header, name, "")) for name in header)
         return build_fields(series, request, f"MDF {file.version}", remarks, size=path.stat().st_size)
+
+
+def _name_groups(groups: Sequence[Any]) -> list[str]:
+    """List the names of groups of channels: of the acquisition, its source, or the comment; else they are numbered.
+
+    If several groups have one name, their numbers are added to it.
+    """
+    names = []
+    for number, group in enumerate(groups, 1):
+        channel_group = group.channel_group
+        source = getattr(channel_group, "acq_source", None)
+        entries = (getattr(channel_group, "acq_name", ""), getattr(source, "name", ""), channel_group.comment)
+        texts = (str(entry or "").strip() for entry in entries)
+        names.append(next(filter(None, texts), f"group {number}"))
+    return [f"{name} {k}" if names.count(name) > 1 else name for k, name in enumerate(names, 1)]
 
 
 def _read_times(file: Any, group: int, start: np.datetime64 | None) -> tuple[Array, np.datetime64 | None]:

@@ -6,8 +6,11 @@ A sheet is written as tab-separated text and read as a text log, so that all rul
 from __future__ import annotations
 
 import datetime as dt
+import re
 import tempfile
 import zipfile
+from collections.abc import Iterable, Sequence
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +23,11 @@ from sealscope.recordings.formats.text import read_text
 from sealscope.storage.unpacking import check_unpacked, max_unpacked_size
 
 _CHUNK = 2**20
+_N_ROWS = 500  # rows from which texts that are numbers with a decimal comma are detected
+_MAX_HEADING = 30  # rows in which merged cells are headings
+#: A number with a decimal comma, as text, and one that may also be a whole number with separated thousands.
+_COMMA_NUMBER = re.compile(r"\s*[+-]?(?:\d{1,3}(?:\.\d{3})+|\d+),\d+(?:[eE][+-]?\d+)?\s*")
+_THOUSANDS = re.compile(r"\s*[+-]?[1-9]\d{0,2},\d{3}\s*")
 
 
 def read_spreadsheet(path: Path, request: Request) -> RecordingFields:
@@ -67,8 +75,14 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
     with tempfile.TemporaryDirectory(prefix="sealscope-") as folder:
         text = Path(folder) / "sheet.tsv"
         with text.open("w", encoding="utf-8", newline="\n") as file:
-            for row in sheet.iter_rows():
-                file.write("\t".join(map(_format_cell, row)) + "\n")
+            rows = iter(sheet.iter_rows())
+            head = _fill_merged(list(islice(rows, _N_ROWS)), getattr(sheet, "merged_cell_ranges", None) or ())
+            comma_columns = _find_comma_columns(head)
+            for row in chain(head, rows):
+                cells = [*map(_format_cell, row)]
+                for column in comma_columns:
+                    cells[column] = _use_point(cells[column])
+                file.write("\t".join(cells) + "\n")
         try:
             return read_text(text, request)
         except InputError as error:
@@ -77,6 +91,39 @@ def _read_sheet(sheet: Any, request: Request, place: str) -> RecordingFields:
             raise InputError(
                 message.replace(str(text), sheet_place) if names_file else f"{message} ({sheet_place})"
             ) from None
+
+
+def _fill_merged(rows: list[list[Any]], ranges: Iterable[Any]) -> list[list[Any]]:
+    """Write the text of merged cells, in the heading, in all of them; `ranges`: ((row, column), (row, column)) each."""
+    for (first_row, first_column), (last_row, last_column) in ranges:
+        if last_row >= min(len(rows), _MAX_HEADING):
+            continue
+        value = rows[first_row][first_column]
+        if isinstance(value, str):
+            for row in rows[first_row : last_row + 1]:
+                row[first_column : last_column + 1] = [value] * len(row[first_column : last_column + 1])
+    return rows
+
+
+def _find_comma_columns(rows: Sequence[Sequence[Any]]) -> set[int]:
+    """Find the columns in which numbers with a decimal comma are texts, as in a table that was pasted.
+
+    Raises InputError if the commas of all these texts may as well separate thousands.
+    """
+    texts: dict[int, list[str]] = {}
+    for row in rows:
+        for column, cell in enumerate(row):
+            if isinstance(cell, str) and _COMMA_NUMBER.fullmatch(cell):
+                texts.setdefault(column, []).append(cell)
+    if texts and all(_THOUSANDS.fullmatch(cell) for cells in texts.values() for cell in cells):
+        example = next(iter(texts.values()))[0].strip()
+        raise InputError(f"a number must be no text whose comma may separate decimals or thousands, got {example!r}")
+    return {*texts}
+
+
+def _use_point(cell: str) -> str:
+    """Replace the decimal comma of a number by a point; return other texts as they are."""
+    return cell.replace(".", "").replace(",", ".") if _COMMA_NUMBER.fullmatch(cell) else cell
 
 
 def _format_cell(value: Any) -> str:

@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, chain, compress, islice, product, repeat
+from itertools import accumulate, chain, compress, pairwise, product, repeat
 
 from sealscope.errors import InputError
 from sealscope.paragraphs import format_count
@@ -24,7 +24,7 @@ from sealscope.recordings.formats.cells import (
     remove_units,
 )
 from sealscope.recordings.formats.headings.descriptions import apply_descriptions, parse_scope_heading, split_pairs
-from sealscope.recordings.formats.headings.labels import Label, is_unit
+from sealscope.recordings.formats.headings.labels import Label, is_unit, strip_word_before
 from sealscope.recordings.formats.headings.preamble import parse_remarks, stated_rate
 from sealscope.recordings.formats.headings.proposal import has_known_word, is_quantity
 from sealscope.recordings.formats.headings.words import WORDS
@@ -165,7 +165,7 @@ def _split_heading(line: str, delimiter: str, width: int = 0) -> list[str]:
 
 def _parse_unit_row(cells: Sequence[str]) -> list[str | None] | None:
     """Parse a row of units, with None for an empty cell; return None if none, or under 60 %, of them are known."""
-    texts = [cell.strip().strip("[]()<>'").strip() for cell in cells]
+    texts = [strip_word_before(cell.strip().strip("[]()<>'").strip()) for cell in cells]
     units = [text if text and text != "-" else None for text in texts]
     n_known = sum(unit is not None and is_unit(unit) for unit in units)
     return units if n_known and n_known >= 0.6 * sum(unit is not None for unit in units) else None
@@ -244,7 +244,11 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
     n_rows = n_rulers + 1
     units = (_parse_graphtec_units(row) or _parse_unit_row(row)) if rows_above else None
     if units is not None:  # units below the names
-        names, rows_above, n_rows = list(rows_above[0]), rows_above[1:], n_rows + 1
+        index = _find_name_row(rows_above)
+        names, n_rows = _fill_names(rows_above[index], rows_above[index + 1 :]), n_rows + index + 1
+        rows_above = rows_above[index + 1 :]
+        if index:  # the other rows say other things of the columns
+            n_rows, rows_above = n_rows + len(rows_above), []
     elif (
         rows_above
         and (units := _parse_unit_row(rows_above[0])) is not None
@@ -254,18 +258,77 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
         rows_above, n_rows = rows_above[1:], n_rows + 1
     else:
         units = []
-    channel_names = {name.casefold() for name in CHANNEL_UNITS}
-    if (
-        rows_above
-        and not any(Label.parse(text).name.casefold() in channel_names for text in names)
-        and any(map(is_quantity, rows_above[0]))
-    ):
-        # a group is named above its first column only; names that are channels already need no group
-        groups = accumulate(chain(rows_above[0], repeat("")), lambda group, cell: cell.strip() or group, initial="")
-        names = [f"{group} {text}".strip() for text, group in zip(names, islice(groups, 1, None), strict=False)]
-        n_rows += 1
+    while rows_above and (grouped_names := _prefix_groups(names, rows_above[0])) is not None:
+        names, rows_above, n_rows = grouped_names, rows_above[1:], n_rows + 1
     labels = [Label.parse(name, unit) for name, unit in zip(names, chain(units, repeat(None)), strict=False)]
     return split_pairs(labels), n_rows
+
+
+def _find_name_row(rows: Sequence[Sequence[str]]) -> int:
+    """Find the row of names among the heading rows above the units, the lowest first; return its index.
+
+    It is the lowest row, unless that names no quantity, as registers, comments or a row with one text in all cells, and
+    another row that fills as many columns names some. Of several such rows, the one that names most is chosen, and of
+    equal ones the highest.
+    """
+    n_filled = [sum(bool(cell.strip()) for cell in row) for row in rows]
+    n_named = [0 if _is_ruler(row) or _is_type_row(row) else sum(map(_names_quantity, row)) for row in rows]
+    if n_named[0]:
+        return 0
+    candidates = [i for i in range(len(rows)) if n_named[i] and 2 * n_filled[i] > max(n_filled)]
+    return max(candidates, key=lambda i: (n_named[i], i), default=0)
+
+
+def _names_quantity(cell: str) -> bool:
+    """Test whether a cell of a heading is the name of a channel or of a quantity."""
+    name = Label.parse(cell).name
+    return name.casefold() in {channel.casefold() for channel in CHANNEL_UNITS} or (len(name) > 1 and is_quantity(cell))
+
+
+def _is_type_row(row: Sequence[str]) -> bool:
+    """Test whether all cells of a row are names of data types, as in the heading of a PLC."""
+    cells = [cell.strip().casefold() for cell in row if cell.strip()]
+    return bool(cells) and all(cell in WORDS["row"]["type"] for cell in cells)
+
+
+def _fill_names(names: Sequence[str], rows_above: Sequence[Sequence[str]]) -> list[str]:
+    """Fill empty names of columns by the lowest text above them, such as `Date` in another row of a PLC's heading."""
+    result = list(names)
+    for row in rows_above:
+        n_missing = len(result) - len(row)
+        above = [*row, *[""] * max(n_missing, 0)]
+        result = [name if name.strip() else cell for name, cell in zip(result, above, strict=False)]
+    return result
+
+
+def _prefix_groups(names: Sequence[str], row: Sequence[str]) -> list[str] | None:
+    """Put the names of groups of columns, in the row above their names, before these; None if the row has no groups.
+
+    A group is named above its first column only, or above each of its columns. The row has groups if one of its cells
+    is a quantity, and no column is called as a channel; or if it tells columns of the same name apart; or if it names
+    several groups, or one beside columns without any, each above each of its columns.
+    """
+    cells = [cell.strip() for cell in row]
+    filled = [cell for cell in cells if cell]
+    channel_names = {name.casefold() for name in CHANNEL_UNITS}
+    groups = [*accumulate(cells, lambda group, cell: cell or group, initial="")][1:]
+    groups += groups[-1:] * (len(names) - len(groups))
+    repeated = [a for a, b in pairwise(cells) if a and a == b]
+    if repeated and len(filled) > len({*filled}):  # named above each of its columns
+        groups = [*cells, *[""] * (len(names) - len(cells))]
+    pairs = [(group, name) for group, name in zip(groups, names, strict=False) if name]
+    n_pairs, n_names = len({*pairs}), len({name for _, name in pairs})
+    has_quantity = any(map(is_quantity, cells)) and not any(
+        Label.parse(text).name.casefold() in channel_names for text in names
+    )
+    tells_apart = n_pairs == len(pairs) > n_names
+    is_above_each = bool(repeated) and (len({*filled}) > 1 or len(filled) < len(pairs))
+    if not filled or not (has_quantity or tells_apart or is_above_each):
+        return None
+    return [
+        name if name == group or (tells_apart and not group) else f"{group} {name}".strip()
+        for name, group in zip(names, groups, strict=False)
+    ]
 
 
 def _parse_graphtec_units(row: Sequence[str]) -> list[str | None] | None:

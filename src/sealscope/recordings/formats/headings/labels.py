@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, same_dimension
 
 #: Full-width brackets of Chinese and Japanese text -> brackets.
@@ -16,6 +17,11 @@ _TRAILING_UNIT = re.compile(r"(?P<name>.{1,80}?)(?:\s+in\s+|\s*/|\s*,\s+)(?P<uni
 
 #: `Drehzahl_U/min`, `Flow l/min`: a unit that contains a slash itself.
 _JOINED_UNIT = re.compile(r"(?P<name>.{1,80}?)[_\s]+(?P<unit>[^\s_/]{1,10}/[^\s_/]{1,10})")
+
+#: `in bar`, `Einheit: bar`: a unit and a word before it.
+_UNIT_AFTER_WORD = re.compile(
+    rf"(?:{'|'.join(WORDS['before']['unit'])})(?:\s*[:=]\s*|\s+)(?P<unit>\S.{{0,20}})", re.IGNORECASE
+)
 
 
 @dataclass(frozen=True)
@@ -33,7 +39,7 @@ class Label:
         whole = text.strip().translate(_WIDE_BRACKETS)
         name, bracket_text = split_square_brackets(whole)
         if bracket_text is not None:
-            return cls(whole, name, bracket_text if unit is None else unit)
+            return cls(whole, name, strip_word_before(bracket_text) if unit is None else unit)
         name, remark = _split_brackets_or_slash(whole)
         if unit is None and remark is None:
             usual_units = (*CHANNEL_UNITS.values(), "s", "m/s", "1/s")
@@ -53,6 +59,12 @@ def is_unit(text: str) -> bool:
     except InputError:
         return False
     return True
+
+
+def strip_word_before(text: str) -> str:
+    """Remove the word before a unit, as in `in bar` or `Einheit: bar`; return any other text as it is."""
+    match = _UNIT_AFTER_WORD.fullmatch(text.strip())
+    return match["unit"] if match is not None and is_unit(match["unit"]) else text
 
 
 def split_square_brackets(text: str) -> tuple[str, str | None]:
@@ -83,5 +95,5 @@ def _split_brackets_or_slash(text: str) -> tuple[str, str | None]:
             if n_opened <= 2:  # `name (m/(s V))`; deeper brackets do not contain a unit
                 splits.append((text[:index].rstrip(), text[index + 1 : -1].strip()))
             break
-    splits = [(name, unit) for name, unit in splits if name]
+    splits = [(name, strip_word_before(unit)) for name, unit in splits if name]
     return min(splits, key=lambda split: (not is_unit(split[1]), len(split[0])), default=(text, None))
