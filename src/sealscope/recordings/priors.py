@@ -24,7 +24,7 @@ class AnglePriors(PriorTable):
 
     period: float  # relative rounding error of the period
     measured: float  # largest scatter of a period that leaps measure, relative to it
-    alike: float  # largest fraction of leaps that are not from one end of the range to the other
+    spoilt: float  # largest fraction of leaps that are not from one end of the range to the other
     slow: float  # largest step that shows that an angle wraps, whatever its period, over the period
     fast: float  # step, over the period, from which its direction must be told by another channel
     most: float  # quantile of the steps that stands for the largest

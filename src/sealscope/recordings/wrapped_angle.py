@@ -91,8 +91,8 @@ def _find_period(values: Array, steps: Array, leaps: NDArray[np.intp], unit: str
     quantum = quantum if math.isfinite(quantum) else 0.0
     wrapped = _wrap(steps, span + quantum)
     padded = np.concatenate([wrapped[1:2], wrapped, wrapped[-2:-1]])
-    beside = 0.5 * (padded[leaps] + padded[leaps + 2])  # means of the steps before and after each leap
-    estimates = np.abs(beside - steps[leaps])
+    neighbour_steps = 0.5 * (padded[leaps] + padded[leaps + 2])  # means of the steps before and after each leap
+    estimates = np.abs(neighbour_steps - steps[leaps])
     estimate = float(np.median(estimates))
     scatter = max(float(np.median(np.abs(estimates - estimate))), quantum, _PRIORS.period * estimate)
     if unit == COUNTS:
@@ -114,13 +114,13 @@ def _find_period(values: Array, steps: Array, leaps: NDArray[np.intp], unit: str
     sizes = np.abs(_wrap(steps, period))
     largest = float(np.quantile(sizes, _PRIORS.most))
     is_slow = largest <= _PRIORS.slow * period
-    unfilled = 2.0 * (largest + quantum) + _PRIORS.period * period if is_slow else _PRIORS.alike * period
+    unfilled = 2.0 * (largest + quantum) + _PRIORS.period * period if is_slow else _PRIORS.spoilt * period
     fills = -_PRIORS.period * period <= period - span <= unfilled
     zone = 1.5 * largest + quantum + _PRIORS.period * period
     before, after = values[leaps], values[leaps + 1]
     at_ends = (np.maximum(before, after) >= high - zone) & (np.minimum(before, after) <= low + zone)
     is_single = is_usual and (unit == COUNTS or period == _TURN)
-    if not fills or np.mean(at_ends) < 1.0 - _PRIORS.alike or not (is_slow or is_single):
+    if not fills or np.mean(at_ends) < 1.0 - _PRIORS.spoilt or not (is_slow or is_single):
         return None
     return _Period(period, largest)
 
@@ -144,8 +144,8 @@ def _nearest_turns(steps: Array, intervals: Array, period: float) -> Array:
         known = np.flatnonzero(np.isfinite(speeds))
         if known.size:
             place = np.clip(np.searchsorted(known, gaps), 1, max(1, known.size - 1))
-            beside = 0.5 * (speeds[known[place - 1]] + speeds[known[place % known.size]])
-            turns[gaps] = np.round((beside * intervals[gaps] - steps[gaps]) / period)
+            neighbour_speeds = 0.5 * (speeds[known[place - 1]] + speeds[known[place % known.size]])
+            turns[gaps] = np.round((neighbour_speeds * intervals[gaps] - steps[gaps]) / period)
     return turns
 
 

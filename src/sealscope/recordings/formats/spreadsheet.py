@@ -106,7 +106,7 @@ def _fill_merged(rows: list[list[Any]], ranges: Iterable[Any]) -> list[list[Any]
 
 
 def _find_comma_columns(rows: Sequence[Sequence[Any]]) -> set[int]:
-    """Find the columns in which numbers with a decimal comma are texts, as in a table that was pasted.
+    """Find the columns whose numbers are texts with a decimal comma.
 
     Raises InputError if the commas of all these texts may as well separate thousands.
     """
