@@ -14,17 +14,14 @@ from numpy.typing import NDArray
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.channels import Array
 from sealscope.recordings.priors import RECORDINGS
+from sealscope.recordings.quantisation import ROUNDING, smallest_step
 from sealscope.recordings.recording import Recording
 
-#: Changes up to this fraction of a reading's largest value are rounding errors: the reading does not move.
-ROUNDING = 1e-9
 _HOLD = RECORDINGS.hold
 #: Shortest run of equal values that can be stuck, and number of samples on either side with which it is compared.
 _MIN_STUCK, _NEIGHBOURHOOD = 5, 100
 _MAX_EXPECTED = 1e-6  # a run is stuck if fewer runs of its length than this are expected in the channel
 _MIN_JUMP = 3.5  # smallest jump at an end of a stuck run, in quantisation steps: more than three
-#: A longer channel is thinned to this many samples, or up to twice as many, to estimate the quantisation step.
-_QUANTUM_SAMPLES = 2**15
 
 
 def is_constant(values: Array) -> bool:
@@ -102,18 +99,6 @@ def find_runs(flags: NDArray[np.bool_]) -> NDArray[np.intp]:
     """Find the runs of True in `flags` (n,): first index and length of each (k, 2)."""
     edges = np.flatnonzero(np.diff(np.r_[False, flags, False].astype(np.int8)))  # starts and ends in turn
     return np.column_stack([edges[::2], edges[1::2] - edges[::2]])
-
-
-def smallest_step(values: Array) -> float:
-    """Find the smallest step of sorted `values` (n > 0,) that exceeds `ROUNDING` times their range; 0 if none does."""
-    steps = np.diff(values)
-    steps = steps[steps > ROUNDING * (values[-1] - values[0])]
-    return float(steps.min()) if steps.size else 0.0
-
-
-def estimate_quantum(values: Array) -> float:
-    """Estimate the quantisation step of finite values (n > 0,), thinned if they are many; 0 if all are equal."""
-    return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
 
 
 def find_stuck(values: Array) -> NDArray[np.intp]:

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import COUNTS, Array
-from sealscope.recordings.motion import estimate_quantum
 from sealscope.recordings.priors import RECORDINGS
+from sealscope.recordings.quantisation import estimate_quantum
 
 _PRIORS = RECORDINGS.angle
 _TURN = 2.0 * math.pi  # [rad]

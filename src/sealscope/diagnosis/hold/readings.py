@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.priors.hold import HOLD
-from sealscope.recordings.motion import estimate_quantum, find_runs
+from sealscope.recordings.motion import find_runs
+from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR
 

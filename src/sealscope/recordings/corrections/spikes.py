@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array
-from sealscope.recordings.motion import estimate_quantum
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding
+from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.spike

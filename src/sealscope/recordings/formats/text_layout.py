@@ -268,14 +268,14 @@ def _find_name_row(rows: Sequence[Sequence[str]]) -> int:
     """Find the row of names among the heading rows above the units, the lowest first; return its index.
 
     It is the lowest row, unless that names no quantity, as registers, comments or a row with one text in all cells, and
-    another row that fills as many columns names some. Of several such rows, the one that names most is chosen, and of
+    another row that fills the same columns names some. Of several such rows, the one that names most is chosen, and of
     equal ones the highest.
     """
-    n_filled = [sum(bool(cell.strip()) for cell in row) for row in rows]
+    filled = [{column for column, cell in enumerate(row) if cell.strip()} for row in rows]
     n_named = [0 if _is_ruler(row) or _is_type_row(row) else sum(map(_names_quantity, row)) for row in rows]
     if n_named[0]:
         return 0
-    candidates = [i for i in range(len(rows)) if n_named[i] and 2 * n_filled[i] > max(n_filled)]
+    candidates = [i for i in range(len(rows)) if n_named[i] and filled[i] >= filled[0]]
     return max(candidates, key=lambda i: (n_named[i], i), default=0)
 
 
