@@ -1,4 +1,4 @@
-"""The channels of a recording: their names, which are the thesis's symbols, their SI units and what they measure."""
+"""The channels of a recording: their names, which are the thesis's symbols, SI units, meanings and quantisation."""
 
 from __future__ import annotations
 
@@ -40,8 +40,24 @@ COUNTS = "count"
 
 #: Beginning of the history line that lists the unused columns of a file.
 UNUSED = "columns not used"
+#: Changes up to this fraction of a reading's largest value are rounding errors: the reading does not move.
+ROUNDING = 1e-9
+#: A longer channel is thinned to this many samples, or up to twice as many, to estimate its quantisation step.
+_QUANTUM_SAMPLES = 2**15
 
 
 def flow_source(channels: Container[str]) -> str | None:
     """Choose the best of `FLOW_SOURCES` for computing the flow to the cylinder; None if all are absent."""
     return next((name for name in FLOW_SOURCES if name in channels), None)
+
+
+def smallest_step(values: Array) -> float:
+    """Find the smallest step of sorted `values` (n > 0,) that exceeds `ROUNDING` times their range; 0 if none does."""
+    steps = np.diff(values)
+    steps = steps[steps > ROUNDING * (values[-1] - values[0])]
+    return float(steps.min()) if steps.size else 0.0
+
+
+def estimate_quantum(values: Array) -> float:
+    """Estimate the quantisation step of finite values (n > 0,), thinned if they are many; 0 if all are equal."""
+    return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import ROUNDING, Array, smallest_step
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quantisation import ROUNDING, smallest_step
 from sealscope.recordings.recording import Recording
 
 _HOLD = RECORDINGS.hold

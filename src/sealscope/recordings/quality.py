@@ -17,10 +17,9 @@ from numpy.typing import NDArray
 
 from sealscope.calls import checked_call
 from sealscope.paragraphs import format_count
-from sealscope.recordings.channels import COUNTS, METERS, SLOW, Array
+from sealscope.recordings.channels import COUNTS, METERS, SLOW, Array, smallest_step
 from sealscope.recordings.motion import find_runs, find_stuck, is_constant
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quantisation import smallest_step
 from sealscope.recordings.recording import Recording
 
 Severity = Literal["note", "warning", "fatal"]

@@ -20,8 +20,8 @@ from sealscope.diagnosis.priors.commissioned import COMMISSIONED
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.paragraphs import paragraphs
+from sealscope.recordings.channels import estimate_quantum
 from sealscope.recordings.oil import oil_temperature
-from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, LITRE_PER_MINUTE, P_ATM, from_si
 

@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.priors.hold import HOLD
+from sealscope.recordings.channels import estimate_quantum
 from sealscope.recordings.motion import find_runs
-from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR
 

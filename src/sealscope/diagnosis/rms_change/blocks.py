@@ -17,10 +17,10 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.channels import ROUNDING
 from sealscope.recordings.corrections.gaps import flag_bridged
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.quality import is_mostly_clipped
-from sealscope.recordings.quantisation import ROUNDING
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, Details, details, mean_squares, segment_means
 from sealscope.signals.filters import IntArray

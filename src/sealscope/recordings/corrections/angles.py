@@ -9,9 +9,9 @@ from dataclasses import replace
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import COUNTS
+from sealscope.recordings.formats.wrapped_angle import unwrap_angle
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
-from sealscope.recordings.wrapped_angle import unwrap_angle
 
 #: Channels that tell how far the shaft turns from sample to sample.
 _SIGNALS = ("omega", "x", "u")

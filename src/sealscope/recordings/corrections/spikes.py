@@ -12,10 +12,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.channels import SLOW, Array, estimate_quantum
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding
-from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.spike

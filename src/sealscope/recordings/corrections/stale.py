@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.channels import SLOW, Array
+from sealscope.recordings.channels import SLOW, Array, estimate_quantum
 from sealscope.recordings.motion import find_holds, find_runs, find_stuck
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding
-from sealscope.recordings.quantisation import estimate_quantum
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.stale

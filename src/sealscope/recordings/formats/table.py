@@ -42,7 +42,7 @@ from sealscope.recordings.formats.times.timebase import (
     time_base,
     timedelta_seconds,
 )
-from sealscope.recordings.wrapped_angle import unwrap_angle
+from sealscope.recordings.formats.wrapped_angle import unwrap_angle
 from sealscope.units import same_dimension, to_si
 
 MAX_VALUES = 2**28  # most values in the used columns of a file: 2 GiB of doubles, 16 hours of 9 channels at 500 Hz

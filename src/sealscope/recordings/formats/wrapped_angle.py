@@ -17,9 +17,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.channels import COUNTS, Array
+from sealscope.recordings.channels import COUNTS, Array, estimate_quantum
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quantisation import estimate_quantum
 
 _PRIORS = RECORDINGS.angle
 _TURN = 2.0 * math.pi  # [rad]
