@@ -108,6 +108,12 @@ class SizePriors(PriorTable):
     creep: float  # flow of a leak, estimated from the creep of a held load
 
 
+class TotalPriors(PriorTable):
+    """Total leakage of pump and piston."""
+
+    misfit: float  # flow that the terms do not describe, over the pump's mean flow in motion, a standard deviation
+
+
 class RepeatPriors(PriorTable):
     """Relative differences, between days, of the flow that the same motion needs."""
 
@@ -290,6 +296,7 @@ class InferencePriors(PriorTable):
     conditions: ConditionPriors
     oil: OilPriors
     size: SizePriors
+    total: TotalPriors
     repeats: RepeatPriors
     growth: GrowthPriors
     scale: StepSize

@@ -152,6 +152,8 @@ class BalanceLeak(LeakMeasure):
     def rise_flow(self) -> Estimate:
         """Mean flow [m^3/s] since its onset of the leakage above healthy recordings, or of the total without these."""
         if self.rise is None:
+            if (flow := self.balance.total_flow) is not None:
+                return flow
             total, pressure = self.balance.conductance, self.balance.mean_pressure()
             return self._add_law_uncertainty(Estimate(pressure * total.value, pressure * total.deviation))
         return self._add_law_uncertainty(self._mix_with_holds(self._rise_fits.flow))
@@ -412,35 +414,36 @@ class BalanceLeak(LeakMeasure):
     def total(self, detectable_flow: float | None) -> TotalLeakage:
         """Return the total leakage of pump and piston, with its interval and the limit for a healthy machine.
 
-        The flow is not stated behind a servo valve, since the valve's edges leak as well, nor if it may exceed that of
-        the pump. `detectable_flow`: as in `LeakMeasure.total`, computed with the assumed piston area and displacement.
+        The flow is stated where the recording identifies it (`RecordedBalance.total_flow`). `detectable_flow`: as in
+        `LeakMeasure.total`, computed with the assumed piston area and displacement.
         """
         balance = self.balance
-        size, pressure, pump_flow = balance.size, balance.mean_pressure(), balance.mean_flow
-        value, low, high = balance.conductance
+        size, pressure, pump_flow, flow = balance.size, balance.mean_pressure(), balance.mean_flow, balance.total_flow
         limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
-        is_single = len(balance.columns) == 1  # one balance for both chambers, so not behind a servo valve
-        # a leak that may exceed what the pump delivers is not known at all
-        is_stated = size.stated and is_single and high * pressure <= balance.blocks.moving_flow
-        # the uncertain factor from computed to true flows (`size.scale`) widens the interval at both ends
-        widening = 1.0 + WITHIN_95 * size.deviation
-        low = low * pressure * lpm_per_flow * (1.0 / widening if low > 0.0 else widening)
-        high = high * pressure * lpm_per_flow * (widening if high > 0.0 else 1.0 / widening)
+        lpm = interval_lpm = None
+        if flow is not None and size.stated:
+            lpm = flow.value * lpm_per_flow
+            half_width = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * size.deviation)) * lpm_per_flow
+            interval_lpm = (lpm - half_width, lpm + half_width)
         return TotalLeakage(
-            lpm=value * pressure * lpm_per_flow if is_stated else None,
-            interval_lpm=(low, high) if is_stated else None,
+            lpm=lpm,
+            interval_lpm=interval_lpm,
             pressure=pressure,
             findable_lpm=None if detectable_flow is None or not size.stated else detectable_flow * lpm_per_flow,
             # the limit is a true conductance, and so is not multiplied by `size.scale`
             healthy_lpm=limit * pressure / LITRE_PER_MINUTE if limit > 0.0 and self.rise is None else None,
-            pump_share=max(value, 0.0) * pressure / pump_flow if pump_flow > 0.0 and is_single else None,
+            pump_share=None if flow is None or not pump_flow > 0.0 else max(flow.value, 0.0) / pump_flow,
             findable_share=None if detectable_flow is None or not pump_flow > 0.0 else detectable_flow / pump_flow,
         )
 
     def history(self, onset_s: float | None) -> LeakCourse | None:
-        """Return the leakage over time [L/min], or its rise over the mean before `onset_s` [s]; None if no L/min."""
+        """Return the leakage over time [L/min], or its rise over the mean before `onset_s` [s].
+
+        It is NaN in blocks that allow more than the pump delivers. Return None if no L/min can be stated, or without an
+        onset if the total leakage is not known block by block: shut valves separate pump and piston at rest.
+        """
         balance = self.balance
-        if not balance.size.stated:
+        if not balance.size.stated or (onset_s is None and (balance.shut or balance.total_flow is None)):
             return None
         if onset_s is None:
             blocks, history = balance.blocks, balance.total_history
@@ -450,6 +453,8 @@ class BalanceLeak(LeakMeasure):
         value, deviation = history.mean, np.sqrt(np.maximum(np.diag(history.covariance), 0.0))
         lpm = blocks.mean_pressure(balance.pressure_offset) * balance.size.scale / LITRE_PER_MINUTE  # per conductance
         half_width = WITHIN_95 * np.hypot(deviation, value * balance.size.deviation)
+        max_flow = balance.blocks.moving_flow * balance.size.scale / LITRE_PER_MINUTE
+        lpm = np.where((np.abs(value) + half_width) * lpm <= max_flow, lpm, np.nan)
         low, high = (value - half_width) * lpm, (value + half_width) * lpm
         return LeakCourse(blocks.time, value * lpm, low, high, whole=onset_s is None)
 

@@ -125,7 +125,7 @@ class VolumeBalance:
         # limits the log odds of this recording alone, since a leak in it can look like open valves
         max_odds: float = INFERENCE.rest.alone
         odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
-        return self._build_balance(recording, recorded.regime(odds))
+        return self._build_balance(recording, recorded.regime(odds), recorded.shut)
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, without a position or without a flow.
@@ -149,8 +149,13 @@ class VolumeBalance:
             return None
         return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
 
-    def _build_balance(self, recording: Recording, regime: RegimeBlocks) -> RecordedBalance:
-        """Build the volume balance of a recording from its blocks for open or for shut valves while the pump rests."""
+    def _build_balance(
+        self, recording: Recording, regime: RegimeBlocks, by_state: RegimeBlocks | None = None
+    ) -> RecordedBalance:
+        """Build the volume balance of a recording from its blocks for open or for shut valves while the pump rests.
+
+        `by_state`: as in `RecordedBalance`.
+        """
         offset = float(regime.blocks.zero[0])  # sensor offset that was removed from p_A - p_B [Pa]
         oil_loss = compute_once(
             recording,
@@ -162,6 +167,7 @@ class VolumeBalance:
             regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
             plain=regime.plain, shut=regime.shut, locked=regime.shut,  # shut valves hold the load
             delay_changes=regime.delay_changes, delay_tests=regime.delay_tests,
+            by_state=by_state,
         )  # fmt: skip
 
     def learn(self, recording: Recording) -> Summary | None:
@@ -292,7 +298,7 @@ class VolumeBalance:
             balances = [self.balance(recording)]  # a balance without a position, or None
         else:
             regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
-            balances = [self._build_balance(recording, regime) for regime in regimes]
+            balances = [self._build_balance(recording, regime, recorded.shut) for regime in regimes]
         return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:

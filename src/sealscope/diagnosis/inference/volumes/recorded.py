@@ -9,7 +9,13 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import derive_drive_signals, flag_lowering, max_rest_rate
+from sealscope.diagnosis.inference.balance import (
+    RegimeBlocks,
+    derive_drive_signals,
+    find_rest_limits,
+    flag_lowering,
+    max_rest_rate,
+)
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -53,6 +59,7 @@ from sealscope.diagnosis.inference.onset import (
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
+from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, estimate_total_flow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
@@ -105,6 +112,7 @@ class RecordedBalance:
     - `locked`: true if shut valves hold the load at rest, so that these times measure the leaks (`chambers`).
     - `known_stroke`: ends of the motion in other recordings of the machine [m], None if unknown.
     - `delay_changes`: changes of channels' delays, which the blocks no longer contain; `delay_tests`: tests for them.
+    - `by_state`: the blocks for shut valves, which separate the states of the pump; None if it never rests.
     """
 
     blocks: Blocks
@@ -119,6 +127,7 @@ class RecordedBalance:
     known_stroke: tuple[float, float] | None = None
     delay_changes: tuple[DelayChange, ...] = ()
     delay_tests: tuple[DelayTest, ...] = ()
+    by_state: RegimeBlocks | None = None
 
     @property
     def is_creep(self) -> bool:
@@ -546,6 +555,43 @@ class RecordedBalance:
         """Mean total leakage of pump and piston [m^3/(s Pa)], which cannot be separated, with its 95 % interval."""
         weights = np.maximum(self.blocks.rows, 0.0)
         return self.total_history.average(weights / weights.sum())
+
+    @cached_property
+    def total_flow(self) -> Estimate | None:
+        """Mean leakage of pump and piston together over the recording [m^3/s] (`total`), None if not identified.
+
+        It needs the pump's angle or speed: a flow meter does not see the leakage inside the pump, a command not the
+        drive that slows down under load, and behind a servo valve the edges leak as well. The 95 % interval must
+        contain a flow above 0, and none above that which the pump delivers.
+        """
+        equation = self.equations[0]
+        is_pump_seen = flow_source(self.recording.channels) not in METERS and not equation.by_command
+        if len(self.columns) > 1 or self.is_creep or not is_pump_seen:
+            return None
+        regime = self.by_state
+        blocks, roles = (self.blocks, self.columns[0]) if regime is None else (regime.blocks, regime.columns[0])
+        is_step = self.test is not None and self.test.chance < RAREST
+        is_after = blocks.time >= self.test.onset().value if is_step and self.test is not None else None
+        flow = estimate_total_flow(blocks, roles, self._state_loads(float(blocks.zero[0])), is_after)
+        deviation = float(np.hypot(flow.deviation, flow.value * self.size.deviation))
+        return flow if 0.0 < flow.value + WITHIN_95 * deviation <= blocks.moving_flow else None
+
+    def _state_loads(self, offset: float) -> StateLoads:
+        """Measure the pressure in each state of the pump, given the sensor offset of p_A - p_B [Pa].
+
+        If the balance does not separate the states, or has no position, the piston always counts as moving.
+        """
+        channels, rate = dict(self.recording.channels), self.recording.rate
+        regime, limits = self.by_state, None
+        equation = self.equations[0] if regime is None else regime.equations[0]
+        if regime is not None:
+            limits = find_rest_limits(channels, rate, equation)
+        signals = Signals(channels, rate, offset=offset, rest_limits=limits)
+        pressure = np.abs(signals.pressure_difference)
+        left = equation.left
+        is_moving, is_holding = signals.moving(left) > 0.0, signals.holding(left) > 0.0
+        states = ~is_moving & ~is_holding, is_moving, is_holding
+        return StateLoads(*(StateLoad.measure(pressure, is_counted) for is_counted in states))
 
     def creep_log_odds(self) -> float:
         """Compute the log odds that a held load creeps by leakage, rather than that a control loop holds it.
