@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 
+import numpy as np
 import pytest
 
 from sealscope.diagnosis.verdict.severity import RepairLimit
@@ -85,6 +86,18 @@ def test_a_single_huge_bound_presses_no_other_flat(history, make_diagnosis):
     assert len(places(picture, "beyond")) == 1
     low, high, *_ = (float(picture.y(level)) for _, level in places(picture, "whisker"))
     assert low - high > 20.0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_axis_shows_a_leak_however_much_it_grows(history, make_diagnosis, seed):
+    """Days of small bounds made eight times their median the end of the axis, and all growth a symbol above it."""
+    growth = 0.5 * np.cumprod(np.random.default_rng(seed).uniform(1.2, 2.0, 6))
+    bounds = [make_diagnosis(verdict="no leak", bound_lpm=0.01, leak_lpm=None, leak_interval_lpm=None)] * 12
+    leaks = [make_diagnosis(verdict="leak", leak_lpm=lpm, leak_interval_lpm=(0.8 * lpm, 1.2 * lpm)) for lpm in growth]
+    days = [Judged(each, 1.7e9 + k * DAY, history[0].read) for k, each in enumerate([*bounds, *leaks])]
+    picture = history_pictures(days)["wide"]
+    assert not places(picture, "beyond")
+    assert [level for _, level in places(picture, "point")] == pytest.approx(list(growth), abs=1e-3 * growth[-1])
 
 
 def test_wrong_calls_are_refused(history, tmp_path):

@@ -12,7 +12,13 @@ import pytest
 from sealscope.diagnosis.trend.reading import LeakReading
 from sealscope.diagnosis.trend.trend import Trend
 from sealscope.diagnosis.trend.trend import trend as trend_of
-from sealscope.reporting.trend.page import render_trend_page, trend_pictures, write_trend_page
+from sealscope.reporting.trend.page import (
+    _cut_line,
+    find_pauses,
+    render_trend_page,
+    trend_pictures,
+    write_trend_page,
+)
 from sealscope.reporting.trend.text import figures, healthy_end, trend_text
 
 from ..diagnosis.test_trend import life
@@ -134,3 +140,18 @@ def test_total_leak_and_limit_have_one_meaning_each() -> None:
     assert "healthy recordings of this machine scatter as far" in page
     assert ">Total<" in page and ">Now<" not in page
     assert result.state.name in page and f"state-{result.state.symbol}" in page
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_line_stops_at_a_pause_and_goes_on_after_it(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    days = np.cumsum(rng.uniform(0.7, 1.3, 12))
+    days[5:] += rng.uniform(10.0, 20.0)
+    pauses = find_pauses(days.tolist())
+    assert pauses == [(days[4], days[5])]
+    vertices = [(float(days[0]), 1.0), (float(days[8]), 1.0), (float(days[8]), 2.0), (float(days[-1]), 3.0)]
+    first, last = _cut_line(vertices, pauses)
+    assert first == [(days[0], 1.0), (days[4], 1.0)]
+    assert last == [(days[5], 1.0), *vertices[1:]]
+    assert list(_cut_line(vertices, [])) == [vertices]
+    assert find_pauses([0.0, 1.0, 2.0]) == find_pauses([1.0]) == find_pauses([2.0, 2.0]) == []

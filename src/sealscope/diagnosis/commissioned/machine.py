@@ -226,7 +226,7 @@ class CommissionedMachine:
 
     def __str__(self) -> str:
         alarms = [f"  {'alarm':<14}{alarm}" for alarm in self.alarms]
-        return "\n".join([self.summary.text(self.healthy, self.rig), *alarms])
+        return "\n".join([self.summary.text(self.healthy, self.rig, self.limit), *alarms])
 
 
 def read_by_map(

@@ -19,6 +19,7 @@ from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.paragraphs import paragraphs
 from sealscope.recordings.channels import estimate_quantum
 from sealscope.recordings.oil import oil_temperature
@@ -56,10 +57,11 @@ class MachineSummary:
     smallest: SmallestLeak | None  # smallest detectable leak, None if no volume balance can state one
     problems: list[str] = field(default_factory=list)  # problems of the recordings, one line each
 
-    def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None) -> str:
+    def text(self, healthy: Sequence[SummarisedRecording], rig: Rig | None, limit: str | None = None) -> str:
         """Format the summary as a table of about ten lines.
 
-        `healthy` are the recordings from which it was made, and `rig` states the machine's sizes, if any are stated.
+        `healthy` are the recordings from which it was made, and `rig` states the machine's sizes, if any are stated;
+        `limit` is the stated repair limit, None for the default.
         """
         units = dict(healthy[0].units) if healthy else {}
         # units in the log of the first recording, or else the usual ones
@@ -90,6 +92,7 @@ class MachineSummary:
             ("duty", _format_duty(healthy, display_units.get("p_A", "bar"))),
             ("noise", ", ".join(noise)),
             *self._smallest_leak_rows(len(healthy), are_dated=bool(dates), needed=needed),
+            ("limit", _describe_limit(healthy, limit)),
             ("false alarms", f"{rate}; {n_alarms or 'none'} of them stand out of the others"),
             *(("check", problem) for problem in self.problems),
         ]
@@ -138,6 +141,25 @@ def _describe_rig(rig: Rig | None) -> str:
     if rig.circuit.has_asymmetric_pump:
         parts.append("asymmetric pump, as a recording shows")
     return ", ".join(parts) or "size not stated: L/min needs a rig, an area or a displacement"
+
+
+def _describe_limit(healthy: Sequence[SummarisedRecording], limit: str | None) -> str:
+    """Describe the repair limit: a stated one, or else the default beside one by the pump's flow, which is proposed.
+
+    The proposal is the fraction `limit.share` of `priors.toml` of the largest flow that the pump has in motion in a
+    healthy recording; there is none where flows have no unit.
+    """
+    if limit is not None:
+        return f"{RepairLimit.parse(limit)}, as stated"
+    text = f"none is stated: {RepairLimit.parse(None)} counts, which a maker allows a boom"
+    summaries = [recording.summaries.get(VOLUME_BALANCE, {}) for recording in healthy]
+    # "scale": factor from the flow of the balance to the true flow, 0 if unknown
+    flow = max((summary.get("delivered", 0.0) * summary.get("scale", 0.0) for summary in summaries), default=0.0)
+    if not flow > 0.0:
+        return text
+    proposal = RepairLimit(COMMISSIONED.limit.share * flow, "flow", stated=False)
+    share = f"{100.0 * COMMISSIONED.limit.share:g} % of the {flow / LITRE_PER_MINUTE:.3g} L/min that the pump delivers"
+    return f"{text}; {share} in motion would be --limit '{proposal}'"
 
 
 def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> str:

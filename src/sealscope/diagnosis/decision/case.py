@@ -88,6 +88,19 @@ class Case:
         n_tests = len({null_key(observable) for observable in self.observables})
         return min(1.0, n_tests * min(map(self.null.chance, self.observables), default=1.0))
 
+    @property
+    def rarest_change(self) -> str:
+        """Words for what the observable with the smallest calibrated p-value shows; "" without observables.
+
+        They are those of the event with the largest prior probability that changes it, or else its name.
+        """
+        rarest = min(self.observables, key=self.null.chance, default=None)
+        if rarest is None:
+            return ""
+        events = [event for event in load_events() if event.cause and event.changes(rarest)]
+        likeliest = max(events, key=lambda event: event.probability, default=None)
+        return rarest.name if likeliest is None else likeliest.description
+
     @cached_property
     def explanations(self) -> tuple[Explanation, ...]:
         """Sets of events that explain the test results, with posterior probabilities, the most probable first."""

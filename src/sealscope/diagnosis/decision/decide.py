@@ -94,7 +94,8 @@ def _decide_without_leak(case: Case) -> Evidence:
     bound = _leak_bound(case, alarm)
     judged_bound, max_bound = _bound_and_limit(case, bound)
     verdict: Verdict = NO_LEAK if math.isfinite(judged_bound) and judged_bound <= max_bound else CANNOT_TELL
-    fields: dict[str, Any] = {"cause": None if other is None else other.cause, "rarest_chance": case.rarest_chance}
+    fields: dict[str, Any] = {"cause": None if other is None else other.cause}
+    fields |= {"rarest_chance": case.rarest_chance, "rarest_change": case.rarest_change}
     if leak is not None:
         fields |= {
             "bound_lpm": bound * leak.lpm_per_flow if leak.lpm_per_flow is not None and np.isfinite(bound) else None,

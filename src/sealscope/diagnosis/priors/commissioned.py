@@ -1,4 +1,4 @@
-"""Typed tables of `commissioned/priors.toml`: how the smallest detectable leak of a machine is defined."""
+"""Typed tables of `commissioned/priors.toml`: a machine's smallest detectable leak, and its proposed repair limit."""
 
 from sealscope.storage.toml_file import PriorTable, read_priors
 
@@ -10,10 +10,17 @@ class SmallestLeakPriors(PriorTable):
     repeats: tuple[int, ...]  # factors on the number of healthy recordings, tried to find the one that halves this leak
 
 
+class LimitPriors(PriorTable):
+    """Repair limit that is proposed for a machine."""
+
+    share: float  # leak over the pump's flow in motion
+
+
 class CommissionedPriors(PriorTable):
-    """The only table of `commissioned/priors.toml`, which defines the smallest detectable leak of a machine."""
+    """All tables of `commissioned/priors.toml`."""
 
     smallest: SmallestLeakPriors
+    limit: LimitPriors
 
 
 COMMISSIONED = read_priors("sealscope.diagnosis.commissioned", CommissionedPriors)

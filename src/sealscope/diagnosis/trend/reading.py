@@ -18,7 +18,6 @@ from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
@@ -145,12 +144,14 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 
     True flows and conductances are `size.scale` (`recorded.Size`) times those of the balance with assumed sizes.
     """
-    size = solution.size
-    total = solution.conductance  # value and 95 % interval
+    size, flow = solution.size, solution.total_flow
+    level, error = solution.conductance.value, solution.conductance.deviation
+    if flow is not None:  # the total of the verdict; errors that repeat in all recordings change no trend
+        level, error = (number / solution.mean_pressure() for number in (flow.value, flow.noise))
     return {
         "basis": "volume balance",
-        "level": total.value * size.scale,
-        "error": (total.high - total.low) * size.scale / (2.0 * WITHIN_95),  # half-width: WITHIN_95 standard errors
+        "level": level * size.scale,
+        "error": error * size.scale,
         "states_flow": size.stated,
         # the area has a meaning only if it is stated, or if the position is in metres
         "area": machine.area if size.stated or solution.recording.units.get("x") == "m" else None,

@@ -203,7 +203,9 @@ class Diagnosis(Evidence):
     def next_check(self) -> str:
         """Next check to make on the machine, in one or two sentences."""
         has_bypass = self.machine is not None and self.machine.bypass
-        return action_of(self._condition, self.named_cause, parts=("bypass",) if has_bypass else ())
+        action = action_of(self._condition, self.named_cause, parts=("bypass",) if has_bypass else ())
+        unlike = self.unlike_healthy
+        return f"{action} Unlike them: {'; '.join(unlike)}." if unlike else action
 
     @property
     def state(self) -> MachineState:
@@ -228,22 +230,33 @@ class Diagnosis(Evidence):
         The result is False without that comparison, or if a cause of a change is stated. If the total leakage is surely
         above 0, an undetected leak must not be the whole of it.
         """
+        is_compared = self._find_test(AGAINST) is not None
+        return self.verdict == NO_LEAK and self.cause is None and is_compared and not self.unlike_healthy
+
+    @property
+    def unlike_healthy(self) -> tuple[str, ...]:
+        """Respects in which a recording without a leak is not shown to be like the healthy ones, in words.
+
+        Empty if there are none, if a cause of a change is stated, or without a comparison with healthy recordings.
+        """
         comparison = self._find_test(AGAINST)
-        if (
-            self.missing_channels
-            or self.verdict != NO_LEAK
-            or self.cause is not None
-            or comparison is None
-            or not _is_usual(comparison)
-        ):
-            return False
-        if self.rises_within or self.rarest_chance < _MIN_USUAL_CHANCE:
-            return False
-        total = self.total_leakage
-        if total is None or total.lpm is None or total.interval_lpm is None or self.bound_lpm is None:
-            return True
-        min_total, _ = total.interval_lpm
-        return min_total <= 0.0 or self.bound_lpm < total.lpm
+        if self.verdict != NO_LEAK or self.cause is not None or comparison is None:
+            return ()
+        reasons = []
+        if self.missing_channels:
+            reasons.append("it lacks " + ", ".join(map(str, self.missing_channels)))
+        if not _is_usual(comparison):
+            reasons.append("the leakage above theirs, which fewer than 1 in 20 of them show")
+        if self.rises_within:
+            reasons.append("the leakage rises within the recording, as in fewer than 1 in 20 of them")
+        if self.rarest_chance < _MIN_USUAL_CHANCE:
+            reasons.append(f"{self.rarest_change or 'a change'}, as in fewer than 1 in 20 of them")
+        total, bound_lpm = self.total_leakage, self.bound_lpm
+        if total is not None and total.lpm is not None and total.interval_lpm is not None and bound_lpm is not None:
+            min_total, _ = total.interval_lpm
+            if min_total > 0.0 and bound_lpm >= total.lpm:
+                reasons.append("a leak below the bound may be the whole of the leakage")
+        return tuple(reasons)
 
     @property
     def rises_within(self) -> bool:

@@ -163,6 +163,8 @@ class Evidence:
         95 % upper bound of a leak [L/min] if none is reported.
     rarest_chance : float
         Probability that a healthy recording shows anything as rare as the rarest of all changes in this one.
+    rarest_change : str
+        What this rarest change is of, in words such as "the free air in the oil"; "" if nothing was tested.
     """
 
     verdict: Verdict
@@ -188,6 +190,7 @@ class Evidence:
     ratio_interval: tuple[float, float] | None = None
     bound_lpm: float | None = None
     rarest_chance: float = 1.0
+    rarest_change: str = ""
 
     @property
     def alarmed(self) -> bool:

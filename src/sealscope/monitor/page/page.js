@@ -147,9 +147,18 @@ function flowRange(least, most) {
   return [Math.max(1.05 * Math.min(least, 0), -0.1 * top), top];
 }
 
+// an empty row in every pause that is longer than PAUSE usual distances: no line is drawn through it
+const PAUSE = 3;
+function withPauses(course) {
+  const steps = course.slice(1).map((row, k) => row.t - course[k].t);
+  const usual = [...steps].sort((one, other) => one - other)[Math.floor(steps.length / 2)];
+  return course.flatMap((row, k) => (k && steps[k - 1] > PAUSE * usual ? [{ t: course[k - 1].t + usual }, row] : [row]));
+}
+
 function draw(course, events) {
   const place = byId("chart");
-  const column = (name) => course.map((row) => row[name]);
+  const rows = withPauses(course);
+  const column = (name) => rows.map((row) => row[name] ?? null);
   const data = [column("t"), column("leak_low_lpm"), column("leak_high_lpm"), column("leak_lpm"), column("total_lpm")];
   const warmth = column("oil_celsius");
   const warm = warmth.some((value) => value !== null);

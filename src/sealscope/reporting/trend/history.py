@@ -84,10 +84,13 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
     # `or`: for type checkers
     days = [(entry.start_s or 0.0) / DAY if has_dates else float(k + 1) for k, entry in enumerate(ordered)]
     limit = ordered[-1].diagnosis.limit_lpm
-    # values above 8 times the median would flatten the others; they are drawn as a symbol at the top
-    max_shown = 8.0 * float(np.median([lpm for lpm, *_ in known_levels])) or math.inf  # inf for a median of 0
-    shown_values = [value for lpm, _, high in known_levels for value in (lpm, high)]
-    shown_values = [value for value in shown_values if value <= max_shown and value < math.inf]
+    leaks = [lpm for lpm, low, _ in known_levels if low is not None]
+    # every leak is within the frame, and so is the upper end of its interval up to twice the largest leak; a bound
+    # above these and above 8 times the median would flatten the others: it is drawn as a symbol at the top
+    max_shown = max(8.0 * float(np.median([lpm for lpm, *_ in known_levels])), 2.0 * max(leaks, default=0.0))
+    upper_ends = [min(high, max_shown) for _, low, high in known_levels if low is not None]
+    bounds = [lpm for lpm, low, _ in known_levels if low is None and lpm <= max_shown]
+    shown_values = [*leaks, *upper_ends, *bounds]
     shown_values += [] if limit is None or limit > max_shown else [limit]
     top = 1.08 * max(shown_values, default=0.0) or 1.0  # 8 % margin
 
@@ -98,7 +101,7 @@ def history_pictures(ordered: Sequence[Judged]) -> dict[str, Picture] | None:
         return f"{day:g}" if day.is_integer() else ""
 
     def draw_levels(picture: Picture) -> None:
-        """Draw each recording as a point with interval, or as a symbol for a bound, a too large or a missing value."""
+        """Draw each recording as a point with interval, or as a symbol for a bound, one above the frame, or none."""
         for entry, day, level in zip(ordered, days, levels, strict=True):
             if level is None:
                 picture.symbol("absent", day, down=picture.height - 4.0)

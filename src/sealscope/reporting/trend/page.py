@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +23,8 @@ SIZES = {"wide": (900.0, 320.0), "narrow": (420.0, 300.0)}
 _MARGINS = (58.0, 14.0, 12.0, 26.0)
 #: Width of a tick's label with its margin, and half of the label's width, in pixels.
 _TICK_WIDTH, _HALF_LABEL = 110.0, 22.0
+#: Pause between two recordings, over their median distance, from which no line is drawn through it.
+PAUSE = 3.0
 #: Distances between two ticks [d], from a minute to five years.
 _STEPS = (*(m / 1440 for m in (1, 5, 15, 60, 180, 360)), 1, 2, 7, 14, 30, 61, 91, 182, 365, 730, 1826)
 
@@ -108,8 +111,39 @@ def _draw_trend(trend: Trend, picture: Picture) -> None:
         title = f"{point.file}: {point.value:.3g} {trend.unit}"
         low, high = (point.value if end is None else end for end in (point.low, point.high))
         picture.point(style, point.day, point.value, (low, high), title)
+    pauses = find_pauses([point.day for point in trend.points])
     for episode in trend.episodes:
-        picture.line("course", *np.transpose(_fitted_line(days, episode)))  # days and levels of the vertices
+        for part in _cut_line(_fitted_line(days, episode), pauses):
+            picture.line("course", *np.transpose(part))  # days and levels of the vertices
+
+
+def find_pauses(days: list[float]) -> list[tuple[float, float]]:
+    """Find the pauses between recordings, as (begin, end) [d], in which no line is drawn.
+
+    `days` (n,): times of the recordings in order. A pause is longer than `PAUSE` times the median distance.
+    """
+    distances = np.diff(days)
+    usual = float(np.median(distances[distances > 0.0])) if np.any(distances > 0.0) else math.inf
+    return [(begin, end) for begin, end in pairwise(days) if end - begin > PAUSE * usual]
+
+
+def _cut_line(
+    vertices: list[tuple[float, float]], pauses: list[tuple[float, float]]
+) -> Iterator[list[tuple[float, float]]]:
+    """Cut a line with `vertices` (day, level), in the order of time, at the `pauses`; yield its parts."""
+    days, levels = (list(values) for values in zip(*vertices, strict=True))
+    begin = days[0]
+    for pause_begin, pause_end in [*pauses, (days[-1], math.inf)]:
+        if pause_begin < begin:
+            continue
+        end = min(pause_begin, days[-1])
+        inner = [vertex for vertex in vertices if begin < vertex[0] < end]
+        ends = [(day, float(np.interp(day, days, levels))) for day in (begin, end)]
+        # at a step two vertices have one day: the part before it ends at the lower one
+        yield [ends[0], *inner, ends[1] if end < days[-1] else vertices[-1]]
+        begin = pause_end
+        if begin > days[-1]:
+            return
 
 
 def _y_limits(trend: Trend) -> tuple[float, float]:

@@ -153,7 +153,7 @@ class BalanceLeak(LeakMeasure):
         """Mean flow [m^3/s] since its onset of the leakage above healthy recordings, or of the total without these."""
         if self.rise is None:
             if (flow := self.balance.total_flow) is not None:
-                return flow
+                return Estimate(flow.value, flow.deviation)
             total, pressure = self.balance.conductance, self.balance.mean_pressure()
             return self._add_law_uncertainty(Estimate(pressure * total.value, pressure * total.deviation))
         return self._add_law_uncertainty(self._mix_with_holds(self._rise_fits.flow))

@@ -184,6 +184,7 @@ class VolumeBalance:
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
           valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before the valves shut;
         - `sign_log_odds`, with a position: log odds that the recorded flow has the right sign, for each balance;
+        - `delivered`: mean flow of the pump in motion [m^3/s], as computed with the assumed sizes;
         - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
@@ -198,6 +199,7 @@ class VolumeBalance:
         summary = {
             "terms": list(balance.columns[0].names),
             "scale": balance.size.scale if balance.size.stated else 0.0,
+            "delivered": balance.blocks.moving_flow,
             "stroke": balance.recorded_stroke,
             "creep_odds": balance.creep_log_odds() if balance.is_creep else None,
             **balance.recording_sums._asdict(),

@@ -59,7 +59,7 @@ from sealscope.diagnosis.inference.onset import (
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
-from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, estimate_total_flow
+from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, TotalFlow, estimate_total_flow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.diagnosis.verdict.machine import measures_flow
@@ -557,7 +557,7 @@ class RecordedBalance:
         return self.total_history.average(weights / weights.sum())
 
     @cached_property
-    def total_flow(self) -> Estimate | None:
+    def total_flow(self) -> TotalFlow | None:
         """Mean leakage of pump and piston together over the recording [m^3/s] (`total`), None if not identified.
 
         It needs the pump's angle or speed: a flow meter does not see the leakage inside the pump, a command not the

@@ -30,7 +30,6 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
 from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -38,6 +37,23 @@ from sealscope.recordings.recording import Array
 #: Number of blocks over which errors are correlated.
 N_CORRELATED = 3
 _TINY = float(np.finfo(float).tiny)
+
+
+class TotalFlow(NamedTuple):
+    """Mean leakage of pump and piston over a recording [m^3/s], as computed with the assumed sizes.
+
+    Its standard deviation has two parts: `noise` differs from recording to recording, while `systematic` errors, by the
+    law of the leakage and by flow that no term describes, are alike in those of one machine.
+    """
+
+    value: float
+    noise: float
+    systematic: float
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the flow, which does not include the uncertain scale of the flows."""
+        return float(np.hypot(self.noise, self.systematic))
 
 
 class StateLoad(NamedTuple):
@@ -75,8 +91,8 @@ class StateLoads(NamedTuple):
 
 def estimate_total_flow(
     blocks: Blocks, roles: ColumnRoles, loads: StateLoads, is_after_onset: NDArray[np.bool_] | None = None
-) -> Estimate:
-    """Estimate the mean leakage of pump and piston over a recording [m^3/s], as computed with the assumed sizes.
+) -> TotalFlow:
+    """Estimate the mean leakage of pump and piston over a recording.
 
     Parameters
     ----------
@@ -92,8 +108,8 @@ def estimate_total_flow(
 
     Returns
     -------
-    Estimate
-        The flow; its deviation does not include the uncertain scale of the flows (`Size.deviation`).
+    TotalFlow
+        The flow, with the parts of its standard deviation.
     """
     gram, pressure = blocks.gram[:, 0], sum(load.pressure for load in loads)
     weights, excesses = {roles.leak: pressure}, {roles.leak: _mean_excess(*loads)}
@@ -117,7 +133,7 @@ def estimate_total_flow(
     coefficients, value, deviation = _weigh_coefficients(replace(blocks, gram=gram[:, None]), roles, weights, states)
     by_law = sum(abs(coefficients.get(column, 0.0) * weights[column]) * excess for column, excess in excesses.items())
     misfit = INFERENCE.total.misfit * blocks.moving_flow
-    return Estimate(value, float(np.linalg.norm([deviation, INFERENCE.healthy.turbulent * by_law, misfit])))
+    return TotalFlow(value, deviation, float(np.hypot(INFERENCE.healthy.turbulent * by_law, misfit)))
 
 
 def _mean_excess(*loads: StateLoad) -> float:
@@ -137,10 +153,10 @@ def _append_step(gram: Array, column: int, is_after: NDArray[np.bool_]) -> Array
     return np.asarray(gram[:, index][:, :, index] * factors[:, :, None] * factors[:, None, :])
 
 
-def _subtract_columns(gram: Array, column: int, others: list[int]) -> Array:
-    """Subtract `others` from one `column` of the regression whose Gram matrices (K, m, m) are given."""
+def _subtract_columns(gram: Array, column: int, subtracted: list[int]) -> Array:
+    """Subtract columns `subtracted` from one `column` of the regression whose Gram matrices (K, m, m) are given."""
     transform = np.eye(gram.shape[1])
-    transform[others, column] = -1.0
+    transform[subtracted, column] = -1.0
     return np.asarray(transform.T @ gram @ transform)
 
 
