@@ -244,7 +244,7 @@ class Diagnosis(Evidence):
             return ()
         reasons = []
         if self.missing_channels:
-            reasons.append("it lacks " + ", ".join(map(str, self.missing_channels)))
+            reasons.append("channels that they have are missing")
         if not _is_usual(comparison):
             reasons.append("the leakage above theirs, which fewer than 1 in 20 of them show")
         if self.rises_within:
