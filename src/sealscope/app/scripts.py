@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from sealscope.app.session import REPORTS, SessionMachine
+from sealscope.app.session import HOLD_FIELDS, REPORTS, SessionMachine
 from sealscope.app.workbench import Workbench
 from sealscope.recordings.formats.columns import GROUP, REST
 
@@ -65,6 +65,19 @@ def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict
         python = [
             f"days = [{reading} for file in {_list(workbench, files)}]",
             f"print(ss.trend(days, {rig}healthy={max(1, len(machine.healthy))}{limit}))",
+        ]
+    elif screen == "hold":
+        areas = [text for area in machine.area for text in ("--area", area)]
+        stated = [text for name, value in machine.hold.items() for text in (HOLD_FIELDS[name], value)]
+        is_log = not machine.hold.get("collected") or key in paths
+        command = ["sealscope", "hold", *(chosen if is_log else []), *(_map_options(machine) if is_log else [])]
+        command += [*areas, *stated]
+        settings = "".join(f", {name}={value!r}" for name, value in machine.hold.items())
+        area = f"area={list(machine.area)!r}" if machine.area else "area=None"
+        python = [
+            f"for file in {_list(workbench, chosen)}:",
+            f"    recording = ss.read(file, map={machine.channel_map!r}{_rate(machine)})",
+            f"    print(*ss.hold_test(recording, {area}{settings}, file=file), sep='\\n')",
         ]
     elif screen == "channels":
         command = ["sealscope", "inspect", *chosen, *_map_options(machine)]

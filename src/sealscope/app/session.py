@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from sealscope.diagnosis.commissioned.machine import recordings_in
+from sealscope.diagnosis.hold.set_up import parse_set_up
 from sealscope.diagnosis.verdict.machine import build_stated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
@@ -30,6 +31,13 @@ _HEAD = "# A session of `sealscope app`: logs, machines and verdicts. `sealscope
 _MAX_ENTRIES = 20_000
 #: How long another process may hold the file [s].
 _WAIT_S = 20.0
+#: What may be stated of a hold test, by the arguments of `sealscope.hold_test`, and by the command line's options.
+HOLD_FIELDS = {
+    **{name: f"--{name}" for name in ("limit", "volume", "oil", "collected", "valve", "capped")},
+    "reference": "--at",
+    "start": "--from",
+    "end": "--until",
+}
 #: What a person makes of a recording of a machine.
 Mark = Literal["healthy", "rejected", "suspect"]
 MARKS: tuple[Mark, ...] = ("healthy", "rejected", "suspect")
@@ -66,7 +74,8 @@ class SessionMachine:
     """A machine of a session: what is stated of it, as texts of the command line's options, and its recordings' keys.
 
     `map` has the column of each channel, with the entries "*" and "group" as for `sealscope.read`; `bore`, `rod` and
-    `rods` (the sides with a rod) are kept to be shown again: `area` follows from them. `repairs`: dates.
+    `rods` (the sides with a rod) are kept to be shown again: `area` follows from them. `repairs`: dates;
+    `hold`: what is stated of a hold test (`HOLD_FIELDS`).
     """
 
     name: str
@@ -83,6 +92,7 @@ class SessionMachine:
     rejected: tuple[str, ...] = ()
     suspect: tuple[str, ...] = ()
     repairs: tuple[str, ...] = ()
+    hold: dict[str, str] = field(default_factory=dict)
     commissioned: bool = False
     verdicts: tuple[ReachedVerdict, ...] = ()
 
@@ -102,6 +112,10 @@ class SessionMachine:
         if not self.name.isprintable():
             raise InputError(f"a machine's name must be printable, got {self.name!r}")
         check_request(self.channel_map, self.rate)
+        if unknown := self.hold.keys() - HOLD_FIELDS:
+            raise InputError(f"a hold test has {', '.join(HOLD_FIELDS)}, got {min(unknown)[:60]!r}")
+        stated = {name: self.hold.get(name) for name in HOLD_FIELDS if name not in ("start", "end")}
+        parse_set_up(area=self.area or None, **stated)
         RepairLimit.parse(self.limit)
         self.build_rig()
 

@@ -303,6 +303,7 @@ _READERS: dict[str, Callable[[Workbench, _Query], Any]] = {
     "learnt": lambda bench, query: bench.learnt(query("machine")),
     "verdict": lambda bench, query: {"verdict": bench.verdict(query("machine"), query("file"))},
     "trend": lambda bench, query: bench.trend(query("machine")),
+    "hold": lambda bench, query: {"results": bench.describe_hold(query("machine"), query("file"))},
     "limit": _say_limit,
     "script": lambda bench, query: write_script(bench, query("screen"), query("machine"), query("file")),
 }
@@ -330,6 +331,11 @@ def _report(bench: Workbench, values: Mapping[str, Any]) -> Any:
 
 def _trend_page(bench: Workbench, values: Mapping[str, Any]) -> Any:
     page = bench.write_trend(_text(values, "machine"))
+    return {"page": page, "address": f"/report/{quote(page)}"}
+
+
+def _hold_page(bench: Workbench, values: Mapping[str, Any]) -> Any:
+    page = bench.write_hold(_text(values, "machine"), _text(values, "file"))
     return {"page": page, "address": f"/report/{quote(page)}"}
 
 
@@ -365,6 +371,7 @@ _CHANGES: dict[str, Callable[[Workbench, Mapping[str, Any]], Any]] = {
     "report": _report,
     "trend": lambda bench, values: bench.trend_in_background(_texts(values, "machines")).as_dict(),
     "trend-page": _trend_page,
+    "hold-page": _hold_page,
     "watch": lambda bench, values: {"file": write_watch(bench, _text(values, "machine"), _text(values, "folder"))},
     "cancel": _cancel,
 }

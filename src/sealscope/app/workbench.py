@@ -40,6 +40,8 @@ from sealscope.app.tables import MappedTable, Source, TableCache, mean_rates
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
 from sealscope.diagnosis.commissioned.machine_file import read_machine, write_machine
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.hold.hold_test import hold_test
+from sealscope.diagnosis.hold.result import HoldCurve, HoldResult
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
 from sealscope.diagnosis.trend.trend import Trend, trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -49,6 +51,7 @@ from sealscope.recordings.formats.columns import GROUP
 from sealscope.recordings.joining import file_seconds, start_seconds
 from sealscope.recordings.mending import StatedLayout, mend, preview_text
 from sealscope.recordings.recording import Recording
+from sealscope.reporting.hold import hold_text, write_hold_page
 from sealscope.reporting.messages import short_text
 from sealscope.reporting.page import report
 from sealscope.reporting.schematic import build_circuit, draw_circuit
@@ -309,9 +312,11 @@ class Workbench:
 
     def change_machine(self, name: str, values: Mapping[str, Any]) -> SessionMachine:
         """Change what is stated of a machine, or add one; decimal commas are read, and areas follow from the bore."""
-        unknown = set(values) - {*_TEXTS, "map", "rate", "area", "repairs"}
+        unknown = set(values) - {*_TEXTS, "map", "rate", "area", "repairs", "hold"}
         if unknown:
-            raise InputError(f"a machine has {', '.join(_TEXTS)}, map, rate, area, repairs, got {min(unknown)[:60]!r}")
+            raise InputError(
+                f"a machine has {', '.join(_TEXTS)}, map, rate, area, repairs, hold, got {min(unknown)[:60]!r}"
+            )
         changed: dict[str, Any] = {}
         for text_name in _TEXTS:
             if text_name in values:
@@ -329,6 +334,9 @@ class Workbench:
             changed["map"] = {str(channel): column.strip() for channel, column in columns.items() if column.strip()}
         if "area" in values:
             changed["area"] = tuple(to_point(str(text)) for text in values["area"] or () if str(text).strip())
+        if "hold" in values:
+            stated = {str(field): to_point(str(text or "")) for field, text in dict(values["hold"]).items()}
+            changed["hold"] = {field: text for field, text in stated.items() if text}
         if "repairs" in values:
             changed["repairs"] = tuple(map(str, values["repairs"]))
 
@@ -669,6 +677,32 @@ class Workbench:
         make_folder(folder)
         return write_trend_page(folder / f"{name} trend.html", result, title=name).name
 
+    # ---- hold test
+
+    def hold(self, name: str, key: str) -> tuple[HoldResult, ...]:
+        """Judge the held loads in a log of a machine, or without a log the oil that was collected."""
+        stated = self.folder.read().find_machine(name)
+        settings: dict[str, Any] = {"area": stated.area or None, **stated.hold}
+        if not key:
+            if "collected" not in stated.hold:
+                raise InputError("a hold test needs a log, or the oil that was collected, such as 12 mL in 10 min")
+            return hold_test(**{n: value for n, value in settings.items() if n not in ("start", "end")})
+        path = self.find_log(key)
+        return hold_test(read_for(stated, path), file=str(path), **settings)
+
+    def describe_hold(self, name: str, key: str) -> list[dict[str, Any]]:
+        """Return the results of a hold test as plain values, each with its text and its curve."""
+        return [
+            result.as_dict() | {"text": hold_text(result), "curve": to_plain(_reduce_curve(result.curve))}
+            for result in self.hold(name, key)
+        ]
+
+    def write_hold(self, name: str, key: str) -> str:
+        """Write the page of a hold test; return its name."""
+        folder = self.folder.folder / REPORTS
+        make_folder(folder)
+        return write_hold_page(self.hold(name, key), folder / f"{name} hold test.html").name
+
     # ---- limit
 
     def limit_lpm(self, text: str | None, name: str, rated_rpm: str = "") -> dict[str, Any]:
@@ -693,3 +727,11 @@ class Workbench:
         rig = machine.build_rig()
         area = 0.5 * (rig.cylinder.A_A + rig.cylinder.A_B) if rig is not None and rig.states("cylinder.A_A") else None
         return {"text": text, "words": str(limit), "lpm": limit.flow_lpm(area)}
+
+
+def _reduce_curve(curve: HoldCurve | None) -> dict[str, Any] | None:
+    """Return the trace of a hold as lists."""
+    if curve is None:
+        return None
+    names = ("t", "values", "fit", "low", "high")
+    return {"channel": curve.channel, "unit": curve.unit} | {name: getattr(curve, name).tolist() for name in names}
