@@ -407,8 +407,9 @@ class Workbench:
         table = self.table(kind, key, name)
         state: dict[str, Any] = {"names": table.names, "about": table.details, "complete": table.complete}
         state |= {"error": table.error, "count": table.count}
-        if any(not 0 <= index < len(table.names) for index in indices):
-            raise InputError(f"a column must be one of {len(table.names)}, got {max(indices)}")
+        if any(not 0 <= index < len(table.names) for index in indices):  # as of a map that has changed
+            text = f"a column must be one of {len(table.names)}, got {max(indices)}"
+            return {"t": [], "lines": [], "first": 0.0, "last": 0.0} | state | {"error": table.error or text}
         if kind == "balance":
             return mean_rates(table, indices, begin, end, pixels, _FLOW_S) | state
         return table.window(indices, begin, end, pixels) | state

@@ -1,7 +1,6 @@
 // The screen of the channels: every column drawn, given a place in the machine's drawing, and checked.
 import { app, ask, attempt, drawn, ensureMachine, fillSelect, go, machineNow, make, miniature, refresh, rowsRead, tell } from "./main.mjs";
 import { Linked, Trace } from "./charts.mjs";
-
 let link = new Linked();
 let columns = [];
 let proposal = { map: {}, groups: [], problem: "" };
@@ -13,10 +12,7 @@ export async function show() {
   const file = app.file;
   byId("channel-file").disabled = !app.keys.length;
   update();
-  if (!file || !app.rows.has(file)) {
-    byId("channel-state").textContent = "Open a log first.";
-    return;
-  }
+  if (!file || !app.rows.has(file)) { byId("channel-state").textContent = "Open a log first."; return; }
   const machine = await ensureMachine();
   fillSizes(machine);
   byId("channel-state").textContent = "Reading …";
@@ -25,9 +21,7 @@ export async function show() {
   await showMap();
 }
 
-export function update() {
-  fillSelect(byId("channel-file"), app.keys.map((key) => [key, app.rows.get(key)?.name || key]), app.file);
-}
+export function update() { fillSelect(byId("channel-file"), app.keys.map((key) => [key, app.rows.get(key)?.name || key]), app.file); }
 
 async function loadColumns(file, machine) {
   const query = { table: "columns", file, machine: machine.name, columns: "", pixels: 60 };
@@ -59,7 +53,6 @@ async function loadProposal(file, machine) {
     }) }),
   );
 }
-
 // the map in force: what the machine states, completed by the proposal where it says auto
 function mapNow() {
   const stated = machineNow()?.map || {};
@@ -88,10 +81,7 @@ function showColumns() {
     select.addEventListener("change", () => assign(select.value, column, channel));
     const card = make("div", { class: `column-card${channel ? " used" : ""}`, draggable: "true", "data-index": column.index }, make("strong", { text: column.name }), select, miniature({ [channel || "column"]: picture }, `Course of ${column.name}`),
       make("span", { class: "quiet", text: values.length ? `${Number(low.toPrecision(5))} to ${Number(high.toPrecision(5))}` : "no numbers" }));
-    card.addEventListener("dragstart", (event) => {
-      held = column;
-      event.dataTransfer.setData("text/plain", column.name);
-    });
+    card.addEventListener("dragstart", (event) => { held = column; event.dataTransfer.setData("text/plain", column.name); });
     card.addEventListener("dragend", () => (held = null));
     return card;
   }));
@@ -102,27 +92,15 @@ function place(target, channel) {
   target.setAttribute("role", "button");
   const column = mapNow()[channel];
   target.setAttribute("aria-label", `${channel}: ${column || "not recorded"}`);
-  target.addEventListener("dragover", (event) => {
-    event.preventDefault();
-    target.classList.add("over");
-  });
+  target.addEventListener("dragover", (event) => { event.preventDefault(); target.classList.add("over"); });
   target.addEventListener("dragleave", () => target.classList.remove("over"));
-  target.addEventListener("drop", (event) => {
-    event.preventDefault();
-    target.classList.remove("over");
-    if (held) assign(channel, held, "");
-  });
+  target.addEventListener("drop", (event) => { event.preventDefault(); target.classList.remove("over"); if (held) assign(channel, held, ""); });
   const find = () => {
     const card = byId("columns").querySelector(`[data-index="${column ? columnOf(column)?.index : ""}"]`) || byId("columns").firstChild;
     if (card) card.querySelector("select").focus();
   };
   target.addEventListener("click", find);
-  target.addEventListener("keydown", (event) => {
-    if (event.key === "Enter" || event.key === " ") {
-      event.preventDefault();
-      find();
-    }
-  });
+  target.addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); find(); } });
 }
 
 async function assign(channel, column, earlier) {
@@ -130,10 +108,7 @@ async function assign(channel, column, earlier) {
   const same = columns.filter((other) => bare(other.name) === bare(column.name)).length > 1 || / \(column \d+\)$/.test(column.name);
   const text = same ? `#${column.index + 1}` : column.name;
   let map = Object.keys(stated).length ? stated : { "*": "auto" };
-  if (earlier && (!channel || earlier !== channel)) {
-    map = { ...mapNow() };
-    delete map[earlier];
-  }
+  if (earlier && (!channel || earlier !== channel)) { map = { ...mapNow() }; delete map[earlier]; }
   if (channel) map[channel] = text;
   await change({ map });
 }
@@ -141,10 +116,7 @@ async function assign(channel, column, earlier) {
 async function change(values) {
   const done = await attempt(() => tell("machine", { machine: app.machine, values }));
   if (!done) return;
-  if (done.name && done.name !== app.machine) {
-    go("channels", app.file, done.name);
-    return;
-  }
+  if (done.name && done.name !== app.machine) { go("channels", app.file, done.name); return; }
   showColumns();
   await showMap();
 }
@@ -175,10 +147,7 @@ async function showMap() {
   parsed.setAttribute("aria-label", `${title ? title.textContent : "The machine"}: places of its channels`);
   byId("drawing").replaceChildren(parsed);
   const inDrawing = new Set();
-  for (const target of parsed.querySelectorAll("[data-channel]")) {
-    inDrawing.add(target.dataset.channel);
-    place(target, target.dataset.channel);
-  }
+  for (const target of parsed.querySelectorAll("[data-channel]")) { inDrawing.add(target.dataset.channel); place(target, target.dataset.channel); }
   const others = [...byId("channel-options").content.children].map((option) => option.value).filter((channel) => !inDrawing.has(channel) && channel !== "q_comp");
   byId("places").replaceChildren(...others.map((channel) => {
     const button = make("button", { type: "button", class: "small", text: `${channel}${map[channel] ? ` = ${map[channel]}` : ""}` });
@@ -241,9 +210,7 @@ async function draw() {
       if (volumes.about.delay) byId("checks").append(make("li", { text: `Delay: the position lags the flow by ${Number((1000 * volumes.about.delay.value).toPrecision(2))} ms.` }));
       new Trace(slot, link, { title: "Volume of the pump against that of the piston: they must close", unit, lines, fetch: query("volumes", piston > 0 ? [0, piston] : [0]), height: 200 });
     } else if (volumes.error) byId("checks").append(make("li", { class: "warning", text: volumes.error }));
-  } catch (error) {
-    byId("checks").append(make("li", { class: "warning", text: error.message }));
-  }
+  } catch (error) { byId("checks").append(make("li", { class: "warning", text: error.message })); }
 }
 
 function fillSizes(machine) {
@@ -251,7 +218,6 @@ function fillSizes(machine) {
   for (const name of ["name", "bore", "rod", "rods", "displacement", "limit", "rate"]) if (document.activeElement !== fields[name]) fields[name].value = machine[name] ?? "";
   [fields.area_a.value, fields.area_b.value] = [machine.area[0] || "", machine.area[1] || ""];
 }
-
 byId("channel-file").addEventListener("change", (event) => go("channels", event.target.value));
 byId("sizes").addEventListener("submit", (event) => event.preventDefault());
 byId("sizes").addEventListener("change", async (event) => {
@@ -262,9 +228,7 @@ byId("sizes").addEventListener("change", async (event) => {
       const limit = await ask("limit", { text: fields.limit.value, machine: app.machine, rpm: fields.rpm.value });
       byId("limit-words").textContent = `Repair at ${limit.words}${limit.lpm === null ? "" : `, ${Number(limit.lpm.toPrecision(3))} L/min`}.`;
       await change({ limit: limit.text || "" });
-    } catch (error) {
-      byId("limit-words").textContent = error.message;
-    }
+    } catch (error) { byId("limit-words").textContent = error.message; }
     return;
   }
   const values = name.startsWith("area") ? { area: [fields.area_a.value, fields.area_b.value].filter(Boolean) } : { [name]: event.target.value };

@@ -1,10 +1,8 @@
 // Charts over time: a labelled figure whose window is asked of the server, with a cursor by arrow keys, a spoken
 // reading and a table of what is seen; and a plot of single results over dates.
 import { make, drawn } from "./main.mjs";
-
 const digits = (value) => (value === null || value === undefined || Number.isNaN(value) ? "–" : String(Number(value.toPrecision(4))).replace("-", "−"));
 const seconds = (t) => `${Number(t.toFixed(4))} s`;
-
 // charts whose time axes move together
 export class Linked {
   constructor() {
@@ -15,7 +13,6 @@ export class Linked {
     this.last = 1;
     this.waiting = 0;
   }
-
   move(begin, end) {
     const shortest = Math.max(1e-6, (this.last - this.first) * 1e-9);
     const length = Math.min(Math.max(end - begin, shortest), this.last - this.first);
@@ -25,25 +22,11 @@ export class Linked {
     clearTimeout(this.waiting);
     this.waiting = setTimeout(() => this.charts.forEach((chart) => chart.load()), 60);
   }
-
-  whole() {
-    this.move(this.first, this.last);
-  }
-
-  zoom(factor, at = (this.begin + this.end) / 2) {
-    this.move(at - (at - this.begin) * factor, at + (this.end - at) * factor);
-  }
-
-  pan(share) {
-    const step = share * (this.end - this.begin);
-    this.move(this.begin + step, this.end + step);
-  }
-
-  close() {
-    for (const chart of this.charts.splice(0)) chart.close();
-  }
+  whole() { this.move(this.first, this.last); }
+  zoom(factor, at = (this.begin + this.end) / 2) { this.move(at - (at - this.begin) * factor, at + (this.end - at) * factor); }
+  pan(share) { const step = share * (this.end - this.begin); this.move(this.begin + step, this.end + step); }
+  close() { for (const chart of this.charts.splice(0)) chart.close(); }
 }
-
 // options: title, unit, lines [{name, colour, column, dash}], fetch(begin, end, pixels), marks [{t, label}],
 // shades [[begin, end, weight]], level {value, label}, height
 export class Trace {
@@ -67,25 +50,15 @@ export class Trace {
     this.watcher.observe(this.box);
     this.ready = this.load();
   }
-
-  get width() {
-    return Math.max(240, this.box.clientWidth || 240);
-  }
-
+  get width() { return Math.max(240, this.box.clientWidth || 240); }
   async load() {
     const asked = (this.asked = Symbol());
     let data;
     try {
       data = await this.options.fetch(this.link.begin, this.link.end, Math.round(this.width));
-    } catch (error) {
-      this.reading.textContent = error.message;
-      return;
-    }
+    } catch (error) { this.reading.textContent = error.message; return; }
     if (asked !== this.asked) return;
-    if (data.error && !data.t.length) {
-      this.reading.textContent = data.error;
-      return;
-    }
+    if (data.error && !data.t.length) { this.reading.textContent = data.error; return; }
     this.data = data;
     if (!this.options.lines.length) return;
     this.link.first = Math.min(data.first, this.link.begin === null ? data.first : this.link.first);
@@ -95,12 +68,8 @@ export class Trace {
     if (following && !this.partial) Object.assign(this.link, { begin: data.first, end: data.last });
     if (following && this.partial) Object.assign(this.link, { begin: data.first, end: data.last, last: data.last });
     this.draw();
-    if (this.partial) {
-      this.reading.textContent = `reading: ${data.count} rows so far`;
-      this.again = setTimeout(() => this.load(), 300);
-    }
+    if (this.partial) { this.reading.textContent = `reading: ${data.count} rows so far`; this.again = setTimeout(() => this.load(), 300); }
   }
-
   draw() {
     const { options, data, link } = this;
     const rows = [data.t, ...options.lines.map((line) => data.lines[line.column])];
@@ -146,11 +115,7 @@ export class Trace {
     }
     this.fillTable();
   }
-
-  place(begin, end) {
-    if (this.plot) this.plot.setScale("x", { min: begin, max: end });
-  }
-
+  place(begin, end) { if (this.plot) this.plot.setScale("x", { min: begin, max: end }); }
   shade(plot) {
     const { left, top, width, height } = plot.bbox;
     const context = plot.ctx;
@@ -167,7 +132,6 @@ export class Trace {
     }
     context.restore();
   }
-
   markOver(plot) {
     const { left, top, width, height } = plot.bbox;
     const context = plot.ctx;
@@ -202,14 +166,12 @@ export class Trace {
     }
     context.restore();
   }
-
   read(index) {
     if (index === null || index === undefined || !this.data) return;
     this.cursor = index;
     const values = this.options.lines.map((line) => `${line.name} ${digits(this.data.lines[line.column][index])}`);
     this.reading.textContent = `${seconds(this.data.t[index])}: ${values.join(", ")} ${this.options.unit}`;
   }
-
   press(event) {
     if (!this.plot || !this.data) return;
     const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
@@ -228,12 +190,7 @@ export class Trace {
     else return;
     event.preventDefault();
   }
-
-  at() {
-    const t = this.cursor === null ? null : this.data.t[this.cursor];
-    return t === null || t < this.link.begin || t > this.link.end ? undefined : t;
-  }
-
+  at() { const t = this.cursor === null ? null : this.data.t[this.cursor]; return t === null || t < this.link.begin || t > this.link.end ? undefined : t; }
   fillTable() {
     if (!this.table.open || !this.data) return;
     const { t, lines } = this.data;
@@ -243,14 +200,12 @@ export class Trace {
     for (let k = 0; k < t.length; k += step) body.push(make("tr", {}, make("td", { text: digits(t[k]) }), ...this.options.lines.map((line) => make("td", { text: digits(lines[line.column][k]) }))));
     this.table.lastChild.replaceChildren(make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
   }
-
   resize() {
     clearTimeout(this.sizing);
     this.sizing = setTimeout(() => {
       if (this.plot && this.box.clientWidth && this.plot.width !== this.width) this.plot.setSize({ width: this.width, height: this.plot.height });
     }, 80);
   }
-
   close() {
     this.asked = null;
     clearTimeout(this.again);
@@ -259,7 +214,6 @@ export class Trace {
     this.figure.remove();
   }
 }
-
 // single results over dates; points: {t, value, low, high, bound, label, leak, chosen, go}; options: title, unit, limit,
 // log, join, repairs, lines of several machines by `series`
 export function dotPlot(points, options) {

@@ -1,6 +1,5 @@
 // The screen of the healthy days: what duty they cover, commissioning, and what was learnt.
 import { app, ask, attempt, dateOf, ensureMachine, go, lengthOf, machineNow, make, miniature, rowsRead, tell } from "./main.mjs";
-
 const BINS = 6;
 const DUTIES = [
   ["oil_degC", "Oil temperature", "°C"],
@@ -37,17 +36,14 @@ function showCoverage(rows, ticked) {
     const known = rows.filter((row) => valueOf(row, name) !== null);
     const unit = name === "speed" ? known[0]?.duty.speed_unit || "" : stated;
     const figure = make("figure", {}, make("figcaption", { text: words }));
-    if (!known.length) {
-      figure.append(make("p", { class: "quiet", text: "not recorded" }));
-      return figure;
-    }
+    if (!known.length) { figure.append(make("p", { class: "quiet", text: "not recorded" })); return figure; }
     const values = known.map((row) => valueOf(row, name));
     // at least a fifth of the largest value wide: equal days are equal
     const [least, most] = [Math.min(...values), Math.max(...values)];
     const half = Math.max(most - least, 0.2 * Math.max(Math.abs(least), Math.abs(most)), 1e-9) / 2;
     const [low, high] = [(least + most) / 2 - half, (least + most) / 2 + half];
     const width = (high - low) / BINS || 1;
-    const bin = (value) => Math.min(BINS - 1, Math.floor((value - low) / width));
+    const bin = (value) => Math.max(0, Math.min(BINS - 1, Math.floor((value - low) / width)));
     const counts = Array.from({ length: BINS }, () => [0, 0]);
     for (const row of known) counts[bin(valueOf(row, name))][ticked.has(row.key) ? 0 : 1] += 1;
     const cells = make("div", { class: "cells", role: "img", "aria-label": `${words}: ${counts.map(([yes, no], k) => `${(low + k * width).toPrecision(3)} to ${(low + (k + 1) * width).toPrecision(3)} ${unit}: ${yes} healthy, ${no} other`).join("; ")}` },
@@ -101,11 +97,7 @@ async function showLearnt(machine) {
   );
 }
 
-const judgeAndGo = (key) => attempt(async () => {
-  await tell("judge", { machine: app.machine, files: [key] });
-  go("verdict", key);
-});
-
+const judgeAndGo = (key) => attempt(async () => { await tell("judge", { machine: app.machine, files: [key] }); go("verdict", key); });
 byId("commission").addEventListener("click", () => attempt(() => tell("commission", { machine: app.machine })));
 byId("tick-all").addEventListener("click", () => mark(rowsRead().filter((row) => !machineNow().rejected.includes(row.key)).map((row) => row.key), "healthy"));
 byId("tick-none").addEventListener("click", () => mark(rowsRead().map((row) => row.key), ""));

@@ -1,9 +1,7 @@
 // The screen of the hold test: a clock, what is stated, the result against the limit, and its page.
 import { app, ask, attempt, ensureMachine, fillSelect, machineNow, make, tell } from "./main.mjs";
 import { Linked, Trace } from "./charts.mjs";
-
-let link = new Linked();
-let ticking = 0;
+let link = new Linked(), ticking = 0;
 
 export async function show() {
   const machine = await ensureMachine();
@@ -11,9 +9,7 @@ export async function show() {
   update();
 }
 
-export function update() {
-  fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], app.file);
-}
+export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], app.file); }
 
 async function judge(again) {
   const file = byId("hold-file").value;
@@ -41,14 +37,10 @@ async function judge(again) {
   }
   byId("hold-state").textContent = again ? "Judged again while the log grows." : `${results.length} ${results.length === 1 ? "hold" : "holds"} judged.`;
 }
-
 byId("hold-form").addEventListener("submit", (event) => {
   event.preventDefault();
   const hold = Object.fromEntries([...byId("hold-form").querySelectorAll("input")].map((input) => [input.name, input.value]));
-  attempt(async () => {
-    await tell("machine", { machine: app.machine, values: { hold } });
-    await judge(false);
-  });
+  attempt(async () => { await tell("machine", { machine: app.machine, values: { hold } }); await judge(false); });
 });
 byId("hold-start").addEventListener("click", () => {
   clearInterval(ticking);
@@ -60,9 +52,6 @@ byId("hold-start").addEventListener("click", () => {
     count += 1;
     const live = byId("hold-file").value && byId("hold-results").childElementCount;
     if (live && (count % 15 === 0 || !left)) judge(true).catch((error) => (byId("hold-state").textContent = error.message));
-    if (!left) {
-      clearInterval(ticking);
-      byId("hold-state").textContent = "The time is over: judge the hold.";
-    }
+    if (!left) { clearInterval(ticking); byId("hold-state").textContent = "The time is over: judge the hold."; }
   }, 1000);
 });

@@ -1,21 +1,15 @@
 // The screen of the logs: folders and dropped files, what each holds, and logs that are read differently.
 import { app, ask, attempt, dateOf, go, lengthOf, make, miniature, refresh, say, tell } from "./main.mjs";
-
 const PIECE = 4_000_000;
 let mended = "";
 
-export function show() {
-  update();
-}
+export function show() { update(); }
 
 export function update() {
   const body = byId("log-table").tBodies[0];
   const kept = new Map([...body.rows].map((row) => [row.dataset.key, row]));
   const wanted = app.keys.map((key) => app.rows.get(key)).filter(Boolean);
-  const rows = wanted.map((row) => {
-    const known = kept.get(row.key);
-    return known && known.dataset.version === String(row.version) ? known : rowOf(row);
-  });
+  const rows = wanted.map((row) => { const known = kept.get(row.key); return known && known.dataset.version === String(row.version) ? known : rowOf(row); });
   const unchanged = rows.length === body.rows.length && rows.every((row, k) => body.rows[k] === row);
   if (!unchanged) body.replaceChildren(...rows);
   const bad = wanted.filter((row) => row.state === "unreadable").length;
@@ -41,7 +35,7 @@ function rowOf(row) {
     return made;
   }
   const grave = row.findings.filter((finding) => finding.severity !== "note");
-  const findings = make("td");
+  const findings = make("td", { "data-head": "Findings" });
   if (!row.findings.length) findings.append(make("span", { class: "fine", text: "none" }));
   else {
     const list = make("ul", {}, ...row.findings.map((finding) => make("li", { class: finding.severity, text: `${finding.severity}: ${finding.text}` })));
@@ -52,7 +46,6 @@ function rowOf(row) {
   made.append(make("td", {}, miniature(row.picture, `Course of ${Object.keys(row.picture).join(", ")} in ${row.name}`)), name, make("td", { text: dateOf(row) }), make("td", { text: `${lengthOf(row.seconds)} at ${Number(row.rate.toPrecision(5))} Hz` }), make("td", { text: row.channels.join(", ") }, unused), findings, make("td", {}, open, " ", mend));
   return made;
 }
-
 // ---- files that are dropped: in pieces, each at its offset, resumed after a break
 
 async function take(file) {
@@ -75,10 +68,7 @@ async function take(file) {
       bar.value = offset;
     } catch (error) {
       failures += 1;
-      if (error.final || failures > 20) {
-        item.append(make("span", { class: "bad", text: ` ${error.message}` }));
-        return;
-      }
+      if (error.final || failures > 20) { item.append(make("span", { class: "bad", text: ` ${error.message}` })); return; }
       offset = null;
       await new Promise((later) => setTimeout(later, 300 * failures));
     }
@@ -86,12 +76,7 @@ async function take(file) {
   item.remove();
 }
 
-async function takeAll(files) {
-  say("");
-  for (const file of files) await take(file);
-  await refresh();
-}
-
+async function takeAll(files) { say(""); for (const file of files) await take(file); await refresh(); }
 byId("drop-files").addEventListener("change", (event) => takeAll([...event.target.files]).finally(() => (event.target.value = "")));
 const drop = byId("drop");
 for (const kind of ["dragover", "dragleave", "drop"]) {
@@ -105,7 +90,6 @@ byId("open").addEventListener("submit", async (event) => {
   event.preventDefault();
   if (await attempt(() => tell("open", { path: byId("open-path").value }))) byId("open-path").value = "";
 });
-
 // ---- a log that is read differently
 
 async function showMend(key) {
@@ -132,17 +116,11 @@ async function preview() {
     );
     byId("mend-problem").textContent = seen.problem;
     byId("mend-problem").className = seen.problem ? "bad" : "";
-  } catch (error) {
-    byId("mend-problem").textContent = error.message;
-    byId("mend-problem").className = "bad";
-  }
+  } catch (error) { byId("mend-problem").textContent = error.message; byId("mend-problem").className = "bad"; }
 }
 
 let typing = 0;
-byId("mend-form").addEventListener("input", () => {
-  clearTimeout(typing);
-  typing = setTimeout(preview, 250);
-});
+byId("mend-form").addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(preview, 250); });
 byId("mend-lines").addEventListener("click", (event) => {
   if (!event.target.dataset.line) return;
   byId("mend-form").elements.first_row.value = event.target.dataset.line;

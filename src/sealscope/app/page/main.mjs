@@ -5,7 +5,6 @@ import * as healthy from "./healthy.mjs";
 import * as verdict from "./verdict.mjs";
 import * as trend from "./trend.mjs";
 import * as hold from "./hold.mjs";
-
 const screens = { logs, channels, healthy, verdict, trend, hold };
 export const app = { version: -1, rows: new Map(), keys: [], machines: [], jobs: [], sources: [], problems: [], screen: "logs", machine: "", file: "" };
 
@@ -26,28 +25,20 @@ export function drawn(kind, values = {}, ...children) {
   return made;
 }
 
-export function say(problem) {
-  byId("problem").textContent = problem || "";
-  byId("problem").hidden = !problem;
-}
+export function say(problem) { byId("problem").textContent = problem || ""; byId("problem").hidden = !problem; }
 
 async function answerOf(request) {
   let answer;
   try {
     answer = await request;
-  } catch {
-    throw new Error("the workbench does not answer: start it anew with sealscope app");
-  }
+  } catch { throw new Error("the workbench does not answer: start it anew with sealscope app"); }
   const values = await answer.json().catch(() => ({ error: `the answer cannot be read (${answer.status})` }));
   if (!answer.ok) throw new Error(values.error || `refused (${answer.status})`);
   return values;
 }
-
 export const ask = (what, query = {}) => answerOf(fetch(`/api/${what}?${new URLSearchParams(query)}`));
-
 export const tell = (what, values = {}) =>
   answerOf(fetch(`/api/${what}`, { method: "POST", headers: { "Content-Type": "application/json", "X-Sealscope": "app" }, body: JSON.stringify(values) }));
-
 // do what a person asked for; an error is shown above the screen
 export async function attempt(work) {
   say("");
@@ -55,15 +46,10 @@ export async function attempt(work) {
     const value = await work();
     await refresh();
     return value === undefined ? true : value;
-  } catch (error) {
-    say(error.message);
-    return null;
-  }
+  } catch (error) { say(error.message); return null; }
 }
-
 export const machineNow = () => app.machines.find((machine) => machine.name === app.machine) || null;
 export const rowsRead = () => app.keys.map((key) => app.rows.get(key)).filter((row) => row && row.state === "read");
-
 // a date with its zone: what the log states, else the logger's clock without a zone
 export function dateOf(row) {
   const t = row.start_s ?? null;
@@ -76,7 +62,6 @@ export function lengthOf(seconds) {
   if (seconds < 120) return `${Number(seconds.toPrecision(3))} s`;
   return seconds < 7200 ? `${Number((seconds / 60).toPrecision(3))} min` : `${Number((seconds / 3600).toPrecision(3))} h`;
 }
-
 // a small picture of minima and maxima, 0 .. 1, of each line
 export function miniature(picture, label) {
   const svg = drawn("svg", { class: "mini", viewBox: "0 0 100 100", preserveAspectRatio: "none", role: "img", "aria-label": label });
@@ -103,9 +88,7 @@ export function fillSelect(select, entries, value) {
   if (entries.some(([key]) => key === value)) select.value = value;
 }
 
-export function go(screen, file = app.file, machine = app.machine) {
-  location.hash = [screen, machine, file].map(encodeURIComponent).join("|");
-}
+export function go(screen, file = app.file, machine = app.machine) { location.hash = [screen, machine, file].map(encodeURIComponent).join("|"); }
 
 let shown = "";
 function follow() {
@@ -171,9 +154,7 @@ export async function refresh() {
 async function poll() {
   try {
     await refresh();
-  } catch (error) {
-    say(error.message);
-  }
+  } catch (error) { say(error.message); }
   const busy = app.jobs.some((job) => ["running", "waiting"].includes(job.state));
   setTimeout(poll, document.hidden ? 5000 : busy ? 500 : 2000);
 }
@@ -185,7 +166,6 @@ export async function ensureMachine() {
   await refresh();
   return machineNow();
 }
-
 byId("machine").addEventListener("change", (event) => go(app.screen, app.file, event.target.value));
 byId("new-machine").addEventListener("click", () =>
   attempt(async () => {

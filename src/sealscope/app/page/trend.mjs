@@ -1,7 +1,6 @@
 // The screen of the trends: machines beside each other, repairs, and the folder that is watched from now on.
 import { app, ask, attempt, ensureMachine, machineNow, make, tell } from "./main.mjs";
 import { dotPlot } from "./charts.mjs";
-
 const chosen = new Set();
 
 export async function show() {
@@ -14,11 +13,7 @@ export async function update() {
   byId("trend-machines").replaceChildren(...app.machines.map((machine) => {
     const box = make("input", { type: "checkbox" });
     box.checked = chosen.has(machine.name);
-    box.addEventListener("change", () => {
-      if (box.checked) chosen.add(machine.name);
-      else chosen.delete(machine.name);
-      update();
-    });
+    box.addEventListener("change", () => { if (box.checked) chosen.add(machine.name); else chosen.delete(machine.name); update(); });
     return make("label", {}, box, make("span", { text: machine.name }));
   }));
   const recorded = byId("trend-kind").value === "recorded";
@@ -47,11 +42,7 @@ export async function update() {
     ];
   }));
 }
-
-byId("trend-form").addEventListener("submit", (event) => {
-  event.preventDefault();
-  attempt(() => tell("trend", { machines: [...chosen] }));
-});
+byId("trend-form").addEventListener("submit", (event) => { event.preventDefault(); attempt(() => tell("trend", { machines: [...chosen] })); });
 byId("trend-kind").addEventListener("change", update);
 byId("trend-log").addEventListener("change", update);
 byId("repair-form").addEventListener("submit", (event) => {

@@ -1,10 +1,9 @@
 // The screen of the verdicts: by date, and for one recording the signals, the evidence and the balance of its flows.
 import { app, ask, attempt, dateOf, ensureMachine, fillSelect, go, machineNow, make, rowsRead, say, tell } from "./main.mjs";
 import { Linked, Trace, dotPlot } from "./charts.mjs";
-
 const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--ink", piston: "--total", creep: "--ink", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
 let link = new Linked();
-let result = null;
+let result = null, limit = null, renewed = "";
 let drawnFor = "";
 
 export async function show() {
@@ -27,6 +26,7 @@ export async function update() {
   const answer = verdicts.has(key) ? await ask("verdict", { machine: machine.name, file: key }).catch((error) => say(error.message)) : { verdict: null };
   if (!answer || key !== app.file) return;
   result = answer.verdict;
+  limit = (await ask("limit", { text: machine.limit || "", machine: machine.name }).catch(() => ({ lpm: null }))).lpm;
   showDates(machine, verdicts, rows);
   showHead(machine, verdicts.get(key), key);
   if (app.rows.get(key)?.state === "read") await draw(machine, key);
@@ -44,7 +44,7 @@ function showDates(machine, verdicts, rows) {
   });
   const list = make("ul", { class: "checks" }, ...points.map((point) => make("li", { class: point.leak ? "bad" : "" }, make("a", { href: point.go, text: point.label }))));
   byId("by-date").replaceChildren(
-    dotPlot(points, { title: "Verdicts by date", unit: "L/min", limit: result && result.limit_lpm, empty: ordered.length ? "No leak is stated in L/min: state the area or the displacement on the screen Channels." : "No log is judged yet." }),
+    dotPlot(points, { title: "Verdicts by date", unit: "L/min", limit: limit ?? (result && result.limit_lpm), empty: ordered.length ? "No leak is stated in L/min: state the area or the displacement on the screen Channels." : "No log is judged yet." }),
     points.length ? make("details", { open: points.length < 6 }, make("summary", { text: `${points.length} verdicts as a list` }), list) : "",
   );
 }
@@ -55,6 +55,11 @@ function showHead(machine, kept, key) {
   if (place.hidden) return;
   const row = app.rows.get(key);
   const judge = make("button", { type: "button", text: kept ? "Judge again" : "Judge this log", onclick: () => attempt(() => tell("judge", { machine: machine.name, files: [key] })) });
+  if (kept && !result && renewed !== `${machine.name}|${key}`) {
+    // of an earlier day: its figures are judged again
+    renewed = `${machine.name}|${key}`;
+    tell("judge", { machine: machine.name, files: [key] }).catch((error) => say(error.message));
+  }
   if (!kept || !result) {
     place.replaceChildren(make("p", { class: "verdict-line", text: kept ? `${row.name}: ${kept.summary || kept.verdict}` : `${row.name} is not judged yet` }), make("p", { class: "quiet", text: row.state === "unreadable" ? row.error : dateOf(row) }), make("div", { class: "actions" }, judge));
     return;
@@ -139,7 +144,6 @@ async function draw(machine, key) {
   const more = head.names.map((name, column) => ({ name: name.replace(/ \[.*/, ""), unit: /\[(.*)\]$/.exec(name)[1], column })).filter((line) => !pressures.includes(line.name));
   for (const line of more) add(line.name, [line.name], "channels", line.unit, [line.column], { height: 130 });
 }
-
 // values at other times, by the nearest one before
 function resample(from, line, to) {
   let k = 0;
@@ -148,7 +152,6 @@ function resample(from, line, to) {
     return from.length && t >= from[0] && t <= from[from.length - 1] ? line[k] : null;
   });
 }
-
 byId("verdict-file").addEventListener("change", (event) => go("verdict", event.target.value));
 byId("overlay").addEventListener("change", update);
 byId("overlay-shift").addEventListener("change", update);
