@@ -34,7 +34,7 @@ from sealscope.storage.plain_values import to_plain
 from sealscope.units import LITRE_PER_MINUTE
 
 #: Rows of a text log that are read at a time, for its first picture.
-PART_ROWS = 100_000
+PART_ROWS = 30_000
 #: Points of a small picture, and format of the stored rows.
 _PICTURE, _VERSION = 64, 2
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")

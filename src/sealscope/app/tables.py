@@ -155,6 +155,7 @@ class TableCache:
         self._folder = folder or cache_folder()
         self._tables: dict[str, MappedTable] = {}
         self._lock = threading.Lock()
+        self.n_filling = 0  # tables that somebody waits for; other work lets them go first
 
     def open(self, key: str, source: Source, wait: float = 0.0) -> MappedTable:
         """Return the table of a key, and begin to fill it by `source` if it is new.
@@ -210,6 +211,7 @@ class TableCache:
 
     def _fill(self, table: MappedTable, folder: Path, source: Source) -> None:
         """Write the rows of a source to a table; an error becomes the table's `error`."""
+        self.n_filling += 1
         try:
             for names, details, t, columns in source():
                 table.names, table.details = list(names), dict(details)
@@ -225,6 +227,7 @@ class TableCache:
         except Exception as error:  # a defect must be said, not end in silence
             table.error = f"cannot read, got {type(error).__name__}: {error}"
         finally:
+            self.n_filling -= 1
             table.begun.set()
 
     def _prune(self) -> None:

@@ -66,6 +66,8 @@ _LIST_S = 2.0
 _WAIT_S = 2.0
 #: Shortest time over which the flows of the balance are averaged [s].
 _FLOW_S = 0.05
+#: Most pauses of the reading of all logs for the one that somebody looks at, and their length [s].
+_MAX_PAUSES, _PAUSE_S = 200, 0.05
 #: A decimal comma, as in `5,2 mL/min`.
 _COMMA = re.compile(r"(?<=\d),(?=\d)")
 #: Texts of a machine that may be changed, of those the ones with a decimal comma.
@@ -171,6 +173,10 @@ class Workbench:
         """Describe logs, one after the other."""
         for number, key in enumerate(keys):
             job.progress(number, len(keys), Path(key).name)
+            for _ in range(_MAX_PAUSES):  # what somebody looks at goes first
+                if self.cache.n_filling == 0:
+                    break
+                time.sleep(_PAUSE_S)
             with self._lock:
                 if key not in self._rows:
                     continue

@@ -3,7 +3,7 @@ import { app, ask, attempt, dateOf, ensureMachine, fillSelect, go, machineNow, m
 import { Linked, Trace, dotPlot } from "./charts.mjs";
 const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--ink", piston: "--total", creep: "--ink", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
 let link = new Linked();
-let result = null, limit = null, renewed = "";
+let result = null, limit = null, renewed = "", pages = new Map();
 let drawnFor = "";
 
 export async function show() {
@@ -69,6 +69,8 @@ function showHead(machine, kept, key) {
   const facts = [["Why", result.reason], ["Since", result.onset_s === null ? "" : `${Number(result.onset_s.toFixed(1))} s${result.onset_interval_s ? ` (${result.onset_interval_s.map((t) => Number(t.toFixed(1))).join(" to ")} s)` : ""}`], ["How sure", result.odds || ""], ["Limit", result.limit_lpm === null ? "" : `${litres(result.limit_lpm)} L/min`], ["Compared with", result.against ? `${result.against} healthy days` : "its own beginning"], ["Next", result.next_check]];
   const opinion = (value, text) => make("button", { type: "button", "aria-pressed": String(kept.opinion === value), text, onclick: () => attempt(() => tell("opinion", { machine: machine.name, file: key, opinion: kept.opinion === value ? "" : value })) });
   const report = make("p", { role: "status" });
+  const written = pages.get(`${machine.name}|${key}`);
+  if (written) report.append(make("a", { href: written.address, target: "_blank", rel: "noopener", text: `reports/${written.page}` }));
   place.replaceChildren(
     make("p", { class: "verdict-line" }, badge(result.state), make("span", { text: `${row.name}: ${result.summary}` }), make("span", { class: result.verdict === "leak" ? "bad" : "", text: figure })),
     make("dl", {}, ...facts.filter(([, text]) => text).flatMap(([name, text]) => [make("dt", { text: name }), make("dd", { text })])),
@@ -79,8 +81,8 @@ function showHead(machine, kept, key) {
       }) }),
       make("button", { type: "button", text: "Write the report’s page", onclick: () => attempt(async () => {
         report.textContent = "writing …";
-        const page = await tell("report", { machine: machine.name, file: key });
-        report.replaceChildren(make("a", { href: page.address, target: "_blank", rel: "noopener", text: `reports/${page.page}` }));
+        pages.set(`${machine.name}|${key}`, await tell("report", { machine: machine.name, file: key }));
+        showHead(machine, kept, key);
       }) }), judge),
     report,
   );

@@ -131,8 +131,7 @@ def read_text_parts(path: Path, request: Request, every: float, rows: float | No
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
     if first is not None and min(every, inf if rows is None else rows) < inf and not is_reversed:
         # convert a copy of the first block to know its rate (`join_blocks` empties it); then forget its last time
-        rate = make_part([first[:]], state).rate
-        rows_per_part = max(1, round(every * rate)) if rows is None else rows
+        rows_per_part = max(1, round(every * make_part([first[:]], state).rate)) if rows is None else rows
         state = TimeState(state.head, state.rate, state.resolution)
     pending: list[_Block] = []
     for part_blocks in _split_blocks([] if first is None else chain([first], blocks), rows_per_part):
