@@ -78,7 +78,7 @@ def work(view: Page, logs: Path) -> None:
     until(view, "document.querySelector('#map-table th')")
     fill(view, {"name": "press 7"})
     until(view, "document.getElementById('machine').value === 'press 7'")
-    fill(view, {"bore": "40 mm", "rod": "25 mm", "displacement": "4,9 cm^3/rev", "limit": "25 mL/min"})
+    fill(view, {"bore": "63 mm", "rod": "35 mm", "displacement": "16 cm^3/rev", "limit": "25 mL/min"})
     view.click("[data-screen=healthy]")
     until(view, "document.querySelectorAll('#day-table tbody tr').length === 9")
     for number in range(6):

@@ -197,3 +197,41 @@ def test_groups_of_actuators_are_kept_apart(bench, client, tmp_path: Path) -> No
         tell(client, "machine", machine=f"press {number}", values={"map": {"*": "auto", "group": group}})
         read = client.get("/api/channels", params={"file": str(log), "machine": f"press {number}"}).json()
         assert read["channels"] == ["p_A", "p_B", "x"] and all(f"Press {number}" in c for c in read["columns"].values())
+
+
+def test_a_hold_is_judged_as_the_command_line_does(bench, client, tmp_path: Path) -> None:
+    t = np.arange(0.0, 300.0, 0.5)
+    x = 200.0 - 0.02 * t + np.random.default_rng(3).normal(0, 0.01, len(t))
+    rows = [f"{a:.1f},{b:.4f},{110.0 - 0.001 * a:.3f}" for a, b in zip(t, x, strict=True)]
+    log = tmp_path / "held.csv"
+    log.write_text("\n".join(["t [s],x [mm],p_A [bar]", *rows]) + "\n", encoding="utf-8")
+    tell(client, "open", path=str(log))
+    settle(bench)
+    tell(client, "machine", machine="m", values={"area": ["3117 mm^2"], "hold": {"limit": "24 mm in 3 min"}})
+    (result,) = client.get("/api/hold", params={"machine": "m", "file": str(log)}).json()["results"]
+    (expected,) = ss.hold_test(ss.read(log), area="3117 mm^2", limit="24 mm in 3 min", file=log)
+    assert result["result"] == "pass" and result["creep_mm_per_min"] == pytest.approx(1.2, abs=0.05)
+    assert result["leak_lpm"] == expected.leak_lpm and len(result["curve"]["t"]) == len(result["curve"]["fit"])
+    assert write_script(bench, "hold", "m", str(log))["command"].endswith("--limit '24 mm in 3 min'")
+    page = tell(client, "hold-page", machine="m", file=str(log))
+    assert client.get(page["address"]).status_code == 200
+    answer = client.get("/api/hold", params={"machine": "m", "file": ""})
+    assert answer.status_code == 400 and "collected" in answer.json()["error"]
+
+
+def test_a_job_is_cancelled_and_the_next_is_done(bench) -> None:
+    reached: list[int] = []
+
+    def work(job) -> None:
+        for step in range(1000):
+            job.progress(step, 1000)
+            reached.append(step)
+            if step == 3:
+                bench.work.cancel(job.number)
+
+    first = bench.work.submit("count", "to 1000", work)
+    second = bench.work.submit("count", "to 1", lambda job: job.progress(1, 1))
+    third = bench.work.submit("fail", "at once", lambda job: {}[job])
+    settle(bench)
+    assert (first.state, second.state, third.state) == ("cancelled", "done", "failed")
+    assert reached == [0, 1, 2, 3] and "KeyError" in third.error

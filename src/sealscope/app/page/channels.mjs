@@ -24,7 +24,7 @@ export async function show() {
 export function update() { fillSelect(byId("channel-file"), app.keys.map((key) => [key, app.rows.get(key)?.name || key]), app.file); }
 
 async function loadColumns(file, machine) {
-  const query = { table: "columns", file, machine: machine.name, columns: "", pixels: 60 };
+  const query = { table: "columns", file, machine: machine.name, columns: "", pixels: 150 };
   const first = await ask("window", query);
   columns = [];
   if (!first.names.length) throw new Error(first.error || "no columns could be read");

@@ -43,7 +43,7 @@ export class Trace {
     this.reading = make("p", { class: "reading", role: "status", "aria-live": "polite" });
     this.table = make("details", {}, make("summary", { text: "Table of what is seen" }), make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Table: ${options.title}` }));
     this.table.addEventListener("toggle", () => this.fillTable());
-    this.figure = make("figure", { class: "trace" }, make("figcaption", {}, make("span", { text: options.title }), this.key, this.tools), this.box, this.reading, this.table);
+    this.figure = make("figure", { class: "trace" }, make("figcaption", {}, make("span", { text: options.title }), this.key, this.tools), this.box, make("div", { class: "under" }, this.reading, this.table));
     place.append(this.figure);
     this.box.addEventListener("keydown", (event) => this.press(event));
     this.watcher = new ResizeObserver(() => this.resize());
@@ -217,7 +217,7 @@ export class Trace {
 // single results over dates; points: {t, value, low, high, bound, label, leak, chosen, go}; options: title, unit, limit,
 // log, join, repairs, lines of several machines by `series`
 export function dotPlot(points, options) {
-  const width = Math.max(330, Math.min(1400, document.querySelector("main").clientWidth - 34)), height = width < 600 ? 240 : 270, left = 62, right = 14, top = 14, bottom = 34;
+  const width = Math.max(330, Math.min(1400, document.querySelector("main").clientWidth - 34)), height = width < 600 ? 220 : 210, left = 62, right = 14, top = 14, bottom = 34;
   const known = points.filter((point) => point.t !== null && point.t !== undefined && (point.value ?? point.bound) !== null);
   const svg = drawn("svg", { class: "dots", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `${options.title}, ${options.unit}` });
   if (!known.length) return make("p", { class: "quiet", text: options.empty || "Nothing to draw yet." });

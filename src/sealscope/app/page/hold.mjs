@@ -9,7 +9,7 @@ export async function show() {
   update();
 }
 
-export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], app.file); }
+export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], byId("hold-file").value || app.file); }
 
 async function judge(again) {
   const file = byId("hold-file").value;

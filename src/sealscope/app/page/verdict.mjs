@@ -45,7 +45,7 @@ function showDates(machine, verdicts, rows) {
   const list = make("ul", { class: "checks" }, ...points.map((point) => make("li", { class: point.leak ? "bad" : "" }, make("a", { href: point.go, text: point.label }))));
   byId("by-date").replaceChildren(
     dotPlot(points, { title: "Verdicts by date", unit: "L/min", limit: limit ?? (result && result.limit_lpm), empty: ordered.length ? "No leak is stated in L/min: state the area or the displacement on the screen Channels." : "No log is judged yet." }),
-    points.length ? make("details", { open: points.length < 6 }, make("summary", { text: `${points.length} verdicts as a list` }), list) : "",
+    points.length ? make("details", { open: points.length < 2 }, make("summary", { text: `${points.length} verdicts as a list` }), list) : "",
   );
 }
 
@@ -130,13 +130,13 @@ async function draw(machine, key) {
   };
   const pressures = ["p_A", "p_B"].filter((name) => columnOf(name) >= 0);
   if (blocks.length) place.append(make("p", { class: "quiet", text: "Blue: the seconds that carry the evidence, the darker the more." }));
-  if (pressures.length) add("Chamber pressures", pressures, "channels", unitOf(pressures[0]), pressures.map(columnOf));
+  if (pressures.length) add("Chamber pressures", pressures, "channels", unitOf(pressures[0]), pressures.map(columnOf), { height: 150 });
   if (flows.names.length) {
     const parts = flows.names;
-    add(`Where the oil goes: ${parts[0]} = ${parts.slice(1).join(" + ")}`, parts.filter((name) => name !== "residual"), "balance", flows.about.unit, parts.map((name, k) => k).filter((k) => parts[k] !== "residual"), { height: 230 });
+    add(`Where the oil goes: ${parts[0]} = ${parts.slice(1).join(" + ")}`, parts.filter((name) => name !== "residual"), "balance", flows.about.unit, parts.map((name, k) => k).filter((k) => parts[k] !== "residual"), { height: 200 });
     const leak = parts.indexOf("leakage");
     const rest = parts.indexOf("residual");
-    add("Leakage of pump and piston, and what no term explains", ["leakage", "residual"], "balance", flows.about.unit, [leak, rest]);
+    add("Leakage of pump and piston, and what no term explains", ["leakage", "residual"], "balance", flows.about.unit, [leak, rest], { height: 150 });
   } else place.append(make("p", { class: "quiet", text: flows.error }));
   if (result && result.course) {
     const { t, lpm, low, high } = result.course;
