@@ -27,7 +27,7 @@ DAYS = (
     ("2026-03-05", 1700, None), ("2026-03-19", 2000, None), ("2026-05-07", 2000, "0.01 L/min"),
     ("2026-05-28", 1900, "0.035 L/min from 30 s"),
 )  # fmt: skip
-SCREENS = {"logs": 900, "channels": 1180, "healthy": 1000, "verdict": 1330, "trend": 700, "hold": 1150}
+SCREENS = {"logs": 900, "channels": 1180, "healthy": 1000, "verdict": 1500, "trend": 700, "hold": 1150}
 
 
 def write_logs(folder: Path) -> None:

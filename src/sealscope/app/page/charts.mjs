@@ -241,7 +241,7 @@ export function dotPlot(points, options) {
   for (const tick of ticks) svg.append(drawn("path", { class: "axis", d: `M${left} ${y(tick)}H${width - right}` }), text(Math.abs(tick) < 0.004 * highest && !options.log ? "0" : digits(Number(tick.toPrecision(2))), left - 6, y(tick) + 4, "end"));
   for (const share of [0, 0.5, 1]) svg.append(text(isoTime(begin + share * (end - begin), true).slice(0, 10), left + share * (width - left - right), height - 10, ["start", "middle", "end"][share * 2]));
   svg.append(text(options.unit, left, 11, "start"));
-  if (limit !== null) svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${width - right}` }), text(`limit ${digits(limit)}`, width - right, y(limit) - 5, "end", "limit-text"));
+  if (limit !== null) svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${width - right}` }), text(`limit ${digits(limit)}`, left + 6, y(limit) - 5, "start", "limit-text"));
   for (const t of options.repairs || []) svg.append(drawn("path", { class: "repair", d: `M${x(t)} ${top}V${height - bottom}` }), text("repair", x(t) + 4, top + 10, "start"));
   const ordered = [...known].sort((a, b) => a.t - b.t);
   if (options.join) {
