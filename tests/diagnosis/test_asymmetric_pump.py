@@ -6,6 +6,8 @@ from a simulator or from the detector.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -73,6 +75,19 @@ def stated(displacement: float | None = None) -> Rig:
 def test_flows_per_speed_under_both_loads_tell_an_asymmetric_pump(is_asymmetric: bool) -> None:
     recordings = [clamp(seed, is_asymmetric=is_asymmetric) for seed in range(3)]
     assert recognise_circuit(stated(), recordings) == ("asymmetric" if is_asymmetric else "closed")
+
+
+def test_a_speed_without_a_sign_shows_no_asymmetric_pump() -> None:
+    """Neither where the motion restores its sign, nor where a pump at constant speed runs on behind a valve."""
+    signed = [clamp(seed, is_asymmetric=False) for seed in range(3)]
+    unsigned = [replace(part, channels={**part.channels, "omega": np.abs(part["omega"])}) for part in signed]
+    assert recognise_circuit(stated(), unsigned) == "closed"
+    random = np.random.default_rng(1)
+    constant = [150.0 + random.standard_normal(len(part)) for part in signed]
+    running = [
+        replace(part, channels={**part.channels, "omega": omega}) for part, omega in zip(signed, constant, strict=True)
+    ]
+    assert recognise_circuit(stated(), running) != "asymmetric"
 
 
 @pytest.mark.parametrize("displacement", [None, DISPLACEMENT_A, DISPLACEMENT_B])

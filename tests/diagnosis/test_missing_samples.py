@@ -239,7 +239,9 @@ def test_a_speed_without_a_sign_gets_it_from_the_motion(late_leak: Recording, fl
     unsigned = replace(signed, channels={**channels, flow: np.abs(speed)})
     assert step_of(unsigned)[:2] == pytest.approx(step_of(signed)[:2], rel=0.05)
     (finding,) = (own for own in inspect_recording(unsigned).findings if own.code == "unsigned_speed")
-    assert "has no sign" in finding.text and finding.severity == "note"  # mended: no fault to rule out first
+    assert (
+        "never changes its sign and the piston does" in finding.text and finding.severity == "note"
+    )  # mended: no fault to rule out first
     assert not any(own.code == "unsigned_speed" for own in inspect_recording(signed).findings)
 
 

@@ -42,7 +42,7 @@ def choose(headings: list[str], **options: str) -> dict[str, str]:
     """Choose the columns by the map "auto", or by a `group`: channel -> heading."""
     labels = [Label.parse(heading) for heading in ["t [s]", *headings]]
     choice = choose_columns(labels, Request({"*": "auto", **options}))
-    return {channel: labels[next(iter(formula.factors))].whole for channel, formula in choice.channels.items()}
+    return {channel: labels[formula.columns[0]].whole for channel, formula in choice.channels.items()}
 
 
 @pytest.mark.parametrize("seed", range(60))

@@ -52,8 +52,11 @@ def test_a_formula_is_the_affine_function_that_it_says(tmp_path: Path, a: float,
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("ADC_1*ADC_2 bar", "formula"),
-        ("2*ADC_1/ADC_2 bar", "formula"),
+        ("2*max(ADC_1) bar", "formula"),
+        ("2*abs(ADC_1, ADC_2) bar", "formula"),
+        ("sqrt(-1)*ADC_1 bar", "formula"),
+        ("ADC_1.real*2 bar", "ADC_1.real"),
+        ("(lambda: 2)*ADC_1 bar", "formula"),
         ("ADC_1*1/0 bar", "formula"),
         ("2*3 bar", "formula"),
         ("ADC_1*1e999 bar", "formula"),
@@ -65,9 +68,38 @@ def test_a_formula_is_the_affine_function_that_it_says(tmp_path: Path, a: float,
         ("ADC*2 bar", "column"),
     ],
 )
-def test_what_is_no_affine_formula_is_refused_in_a_line(tmp_path: Path, text: str, words: str) -> None:
+def test_what_is_no_formula_is_refused_in_a_line(tmp_path: Path, text: str, words: str) -> None:
     with refusal(*words.split(", ")):
         read(table(tmp_path, "t [s];ADC_1;ADC_2;ADC_3"), map={"p_A": text})
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_formula_takes_products_and_functions_with_the_units_of_its_columns(tmp_path: Path, seed: int) -> None:
+    """Drawn values; angles in degrees or rad, a quotient of force and area, a speed times a direction in per cent."""
+    generator = np.random.default_rng(seed)
+    columns = generator.uniform(-60.0, 60.0, (COUNT, 5)) + np.array([0.0, 0.0, 70.0, 0.0, 0.0])
+    force, angle, area, speed, valve = columns.T
+    angle_unit, radians = [("deg", np.pi / 180.0), ("rad", 1.0)][seed % 2]
+    angle *= (np.pi / 180.0) / radians
+    path = table(tmp_path, f"t [s];F [kN];phi [{angle_unit}];A [mm^2];n [1/min];Ventil [%]", columns)
+    length, share = generator.uniform(0.1, 2.0, 2).round(3)
+    for channel, text, expected in (
+        ("p_A", "abs(F)/A", np.abs(force) / area * 1e9),
+        ("p_A", f"sqrt((F/A)*(F/A)*{share})", np.abs(force) / area * np.sqrt(share) * 1e9),
+        ("omega", "n*Ventil/100", speed * valve / 100.0 * np.pi / 30.0),
+        ("omega", f"-{share}*n*sign(Ventil)", -share * speed * np.sign(valve) * np.pi / 30.0),
+        ("x", f"{length}*tan(phi)*cos(phi) m", length * np.sin(radians * angle)),
+        ("theta", f"phi + {share}*phi*sin(0.5)", radians * angle * (1.0 + share * np.sin(0.5))),
+    ):
+        np.testing.assert_allclose(read(path, map={channel: text})[channel], expected, rtol=1e-7, err_msg=text)
+    for channel, text, words in (
+        ("p_A", "F*A", "p_A"),
+        ("p_A", "F/A + n", "state its unit"),
+        ("x", "2*sin(F) m", "angle"),
+        ("omega", "n*F", "omega"),
+    ):
+        with refusal(words):
+            read(path, map={channel: text})
 
 
 def test_a_log_of_converter_counts_is_read_by_one_command(tmp_path: Path) -> None:

@@ -105,3 +105,99 @@ def test_a_meter_whose_flow_has_the_wrong_sense_throughout_is_no_error() -> None
     metered = {**recording.only(["x"]).channels, "u": opposite, "q_pump": np.abs(np.gradient(recording["x"]))}
     meter = Recording(recording.t, metered, {"x": "m", "u": "V", "q_pump": "m^3/s"}, recording.rate)
     assert not _is_in_supply_line(meter, opposite)
+
+
+#: Value of a valve in each direction of the flow into chamber A: +1, 0 and -1.
+VALVES = {
+    "per cent": {1: 100.0, 0: 0.0, -1: -100.0},
+    "reversed": {1: -1.0, 0: 0.0, -1: 1.0},
+    "bit": {1: 1.0, 0: 0.0, -1: 0.0},
+    "codes": {1: 1.0, 0: 0.0, -1: 2.0},
+    "mA": {1: 20.0, 0: 12.0, -1: 4.0},
+    "proportional": {1: 63.0, 0: 0.3, -1: -48.0},
+}
+
+
+def press(
+    seed: int, valve: str = "per cent", directions: tuple[float, float] = (1.0, 1.0)
+) -> tuple[Recording, np.ndarray]:
+    """Make a press of drawn strokes with holds against a workpiece, in which its pump also turns back a little.
+
+    Return the recording, with the speed of the pump behind the valve, which is negative only where the pump turns back,
+    and the signed speed of the flow into A. `directions`: speeds of the strokes out and in [1000 rpm].
+    """
+    random, rate = np.random.default_rng(seed), 50.0
+    pieces = []  # (direction of the valve, speed of the pump [rpm], piston speed per pump speed, seconds)
+    for _ in range(8):
+        speed_out, speed_in = directions * random.uniform(700.0, 1300.0, 2)
+        seconds = random.uniform(1.0, 2.0)
+        pieces += [(0, 0.0, 0.0, 1.0), (1, speed_out, 1.0, seconds), (1, random.uniform(20.0, 60.0), 0.0, 2.0)]
+        pieces += [(1, -30.0, 0.0, 0.3), (-1, speed_in, -1.0, seconds * speed_out / speed_in)]
+    rows = np.concatenate([np.tile([*piece[:3]], (round(piece[3] * rate), 1)) for piece in pieces])
+    side, speed, gain = rows.T
+    t, v = np.arange(len(rows)) / rate, gain * speed * 5e-5
+    x = np.cumsum(v) / rate + 1e-5 * random.standard_normal(t.size)
+    values = np.array([VALVES[valve][int(number)] for number in side])
+    if valve == "proportional":
+        values = values * random.uniform(0.5, 1.0, t.size)
+    omega = RPM * (speed + 0.5 * random.standard_normal(t.size))
+    channels = {
+        "omega": omega,
+        "x": x,
+        "p_A": np.where(side > 0, 8e6, 1e6),
+        "p_B": np.full(t.size, 1e6),
+        "valve": values,
+    }
+    units = {"omega": "rad/s", "x": "m", "p_A": "Pa", "p_B": "Pa", "valve": "count"}
+    return Recording(t, channels, units, rate), omega * side
+
+
+@pytest.mark.parametrize("valve", VALVES)
+def test_a_recorded_valve_gives_the_speed_its_sign(valve: str) -> None:
+    """In any coding, through holds in which nothing moves and the pump turns back a little."""
+    for seed in range(5):
+        recording, signed = press(seed, valve)
+        restored, (finding,) = restore_signs(recording)
+        assert (finding.code, finding.severity) == ("unsigned_speed", "note")
+        assert "never changes its sign and the piston does: its sign is taken from valve" in finding.text
+        assert restored.channels.keys() == {"omega", "x", "p_A", "p_B"}
+        rests = 3.0 * RPM  # what the sensor's noise is at rest
+        np.testing.assert_allclose(restored["omega"], signed, atol=rests if valve in ("bit", "proportional") else 1e-12)
+
+
+def test_without_the_valve_the_position_and_the_pressures_tell() -> None:
+    for seed in range(5):
+        recording, signed = press(seed)
+        restored, (finding,) = restore_signs(recording.only(["omega", "x", "p_A", "p_B"]))
+        assert "record its direction (--map valve=...)" in finding.text
+        assert np.abs(restored["omega"] - signed).sum() < 0.02 * np.abs(signed).sum()
+
+
+def test_a_valve_that_does_not_direct_the_flow_is_none() -> None:
+    """A charge valve switches at random: the position tells; one that never switches tells nothing."""
+    for seed in range(5):
+        recording, signed = press(seed)
+        random = np.random.default_rng(seed)
+        for values in (
+            np.repeat(random.choice([0.0, 1.0], len(recording) // 10 + 1), 10)[: len(recording)],
+            np.ones(len(recording)),
+            np.full(len(recording), np.nan),
+        ):
+            other = replace(recording, channels={**recording.channels, "valve": values})
+            restored, (finding,) = restore_signs(other)
+            assert "taken from the position" in finding.text
+            assert np.abs(restored["omega"] - signed).sum() < 0.02 * np.abs(signed).sum()
+
+
+@pytest.mark.parametrize("valve", ["per cent", "bit"])
+def test_a_speed_with_a_sign_stays_as_it_is(valve: str) -> None:
+    """Also one of a machine whose pump hardly moves the piston back, which falls by its weight."""
+    for seed in range(5):
+        for share in (1.0, 0.05):
+            recording, signed = press(seed, valve)
+            signed = np.where(signed < 0.0, share * signed, signed)
+            plain = replace(recording, channels={**recording.channels, "omega": signed})
+            restored, findings = restore_signs(plain)
+            assert np.array_equal(restored["omega"], signed)
+            assert not findings
+            assert "valve" not in restored

@@ -324,6 +324,7 @@ def inspect(
     """Show the content of a file and its defects; columns without a map are recognised by their names."""
     from sealscope.parameters.load import save_channel_map
     from sealscope.recordings import inspect as find_defects
+    from sealscope.recordings.corrections.unsigned import restore_signs
     from sealscope.reporting.overview import overview_text
 
     _reads_standard_input(files)
@@ -337,7 +338,8 @@ def inspect(
         if recording is None:
             is_complete = False
             continue
-        opt.say(overview_text(str(file), recording, find_defects(recording)))
+        _, unsigned = restore_signs(recording)
+        opt.say(overview_text(str(file), recording, (*find_defects(recording), *unsigned)))
         if columns is None:
             columns = _resolve_map(stated.channel_map, files if join else [file], recording)
     if not is_complete:

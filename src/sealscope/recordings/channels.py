@@ -24,6 +24,7 @@ _CHANNELS = {
     "q_comp": ("m^3/s", "leakage flow that the controller makes good"),
     "q_pump": ("m^3/s", "flow to the cylinder by a meter"),
     "q_supply": ("m^3/s", "flow to the valve by a meter in its supply line"),
+    "valve": ("V", "valve direction"),
     "T_oil": ("K", "oil temperature"),
 }
 CHANNEL_UNITS: Mapping[str, str] = MappingProxyType({name: unit for name, (unit, _) in _CHANNELS.items()})

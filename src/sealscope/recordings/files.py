@@ -118,7 +118,8 @@ def read(
         The file. Its content tells the format.
     map : mapping of str to str or "auto", optional
         Channel (or ``t``) -> column of the file: its name (``{"p_A": "PG_1"}``), its name and unit (``"PG_1[psi]"``),
-        its number (``"#2"``), or a constant plus columns times factors and their unit (``"ch2*0.0625-0.625 bar"``).
+        its number (``"#2"``), or a formula of columns, with its unit unless this follows from the columns'
+        (``"ch2*0.0625-0.625 bar"``, ``"rpm*valve/100"``; ``abs``, ``sign``, ``sqrt``, ``sin``, ``cos``, ``tan``).
         A unit at the end of the column's name is read, as in ``p_bottom_bar``; a column without one is raw counts.
         ``"auto"`` chooses by the columns' names and units, in several languages; the history lists the choice.
         ``{"*": "auto", ...}`` does so for the channels that the mapping does not name.

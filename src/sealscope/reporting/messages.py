@@ -357,6 +357,15 @@ def format_unused_columns(diagnosis: Diagnosis) -> str | None:
     return f"{join_names(diagnosis.unused)}: recorded, and used for no channel; if they are channels: {lines}"
 
 
+def _unsigned_channels(diagnosis: Diagnosis) -> list[str]:
+    """List the findings on speeds without a sign; beside healthy recordings only those whose sign cannot be restored.
+
+    That a sign is restored in each recording of a machine is said once, by `commission`.
+    """
+    findings = [finding for finding in diagnosis.quality if finding.code == "unsigned_speed"]
+    return [finding.text for finding in findings if finding.severity != "note" or not diagnosis.baselines]
+
+
 def short_text(diagnosis: Diagnosis) -> str:
     """Format a short text of a diagnosis: the verdict, its numbers and the next step."""
     odds = odds_or_false_alarms(diagnosis) if diagnosis.odds or diagnosis.score is not None else None
@@ -370,6 +379,7 @@ def short_text(diagnosis: Diagnosis) -> str:
         ("units", raw_counts(diagnosis)),
         ("not used", format_unused_columns(diagnosis)),
         *(("missing", finding.text) for finding in diagnosis.missing_channels),
+        *(("check", text) for text in _unsigned_channels(diagnosis)),
         ("next", next_steps(diagnosis)[0]),
     ]
     return _format_lines(diagnosis, rows)

@@ -5,11 +5,13 @@ Its channel is then `q_supply`, since it sees the fed chamber alone, and while t
 cylinder's but passes the valve (`diagnosis.inference.equations.balances`).
 
 If a speed is never negative while the piston moves both ways, either it has no sign, or the pump turns one way and a
-valve chooses the side. In both cases the flow into chamber A is about a v + c (p_A - p_B), with the piston speed v;
-the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to the signed
-magnitude, in turn with a search for the signs. A sign changes only where the magnitude passes zero: the signs are the
-most likely path of a hidden Markov chain with two states. Without a position the sign is that of the command. At rest
-the magnitude is that of noise, with a positive mean; its signs are drawn at random. Called by the inspection.
+valve chooses the side; a pump that holds a pressure may turn back a little meanwhile. A recorded command or direction
+of this valve tells the side. Without it, in both cases the flow into chamber A is about a v + c (p_A - p_B), with the
+piston speed v; the pressure term is the flow that replaces leakage while the piston stands. The formula is fitted to
+the signed magnitude, in turn with a search for the signs. A sign changes only where the magnitude passes zero: the
+signs are the most likely path of a hidden Markov chain with two states. Without a position the sign is that of the
+command. At rest the magnitude is that of noise, with a positive mean; its signs are drawn at random. Called by the
+inspection.
 
 Source: A. J. Viterbi, IEEE Trans. Inf. Theory 13 (1967) 260 (most likely path).
 """
@@ -22,11 +24,12 @@ import numpy as np
 
 from sealscope.recordings.channels import Array
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import Finding, Severity
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.unsigned
 _MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the previous one
+_MAX_POSITIONS = 8  # most values of a valve that switches; of one with more, the side of its centre counts
 #: Mean of the magnitude of normal noise over its standard deviation; tolerance of that ratio [standard deviations].
 _FOLDED_RATIO, _TOLERANCE = float(np.sqrt(2.0 / (np.pi - 2.0))), 3.0
 #: Channel -> its quantity, for messages.
@@ -36,28 +39,91 @@ UNSIGNED = {"omega": "speed", "q_pump": "flow", "q_supply": "flow"}
 def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     """Restore the sign of a speed or flow that stays on one side of zero while position or command moves both ways.
 
-    The magnitude gets the sign of the flow into chamber A (`_find_sign`), and random signs within the noise
-    (`_draw_noise_signs`). A channel whose sign cannot be found stays as it is. A flow q_pump without a sign that was
-    measured in a valve's supply line (`_is_in_supply_line`) becomes the channel q_supply. Also returns a finding for
-    each channel that was changed.
+    It stays so if its flow to the other side is at most the fraction `unsigned.least` (`priors.toml`), as of a pump
+    that holds a pressure; if it is not only noise, the restored values must follow the motion better. The magnitude
+    gets the sign that the channel `valve` states (`_find_valve_sign`) or else that of the flow into chamber A
+    (`_find_sign`), and random signs within the noise (`_draw_noise_signs`). A channel whose sign cannot be found stays
+    as it is. A flow q_pump without a sign that was measured in a valve's supply line (`_is_in_supply_line`) becomes the
+    channel q_supply. The result lacks the channel `valve`, which serves this only. Also returns a finding for each
+    channel without a sign: a warning if it cannot be restored.
     """
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
+    valve = channels.pop("valve", None)
+    units.pop("valve", None)
+    motion = _motion(recording)
     for name, quantity in UNSIGNED.items():
-        if name not in recording or not _has_one_sign(recording[name]):
+        if name not in recording or motion is None or not _moves_both_ways(motion):
             continue
         values = recording[name]
-        sign, source = _find_sign(recording, np.abs(values))
-        if sign is None:
+        is_one_way = _has_one_sign(values)
+        if not is_one_way and _moves_both_ways(values):
             continue
         # a channel that stays below zero is mirrored, so that all but its noise is positive
-        main_side = 1.0 if np.nanmax(values) >= -np.nanmin(values) else -1.0
-        channels[name] = _draw_noise_signs(main_side * values, recording.rate) * sign
-        text = f"{name}: the {quantity} has no sign while the piston moves both ways: its sign is taken from {source}"
-        if name == "q_pump" and {"x", "u"} <= channels.keys() and _is_in_supply_line(recording, sign):
+        main_side = 1.0 if np.nansum(values) >= 0.0 else -1.0
+        sign = None if valve is None else _find_valve_sign(valve, np.abs(values), motion)
+        source = "valve"
+        if sign is None or _correlation(values * sign, motion) * main_side < _PRIORS.correlation:  # of another machine
+            sign, source = _find_sign(recording, np.abs(values))
+        if sign is not None and not is_one_way:
+            with_sign, without_sign = (_correlation(signed, motion) for signed in (values * sign, values))
+            if abs(with_sign) <= abs(without_sign):  # it has a sign, and hardly moves the piston back
+                continue
+        if sign is None and not is_one_way:
+            continue
+        text = f"{name}: the {quantity} never changes its sign and the piston does"
+        if sign is None:
+            text += ", and nothing recorded tells its direction; map the direction or command of the valve (valve)"
+        else:
+            magnitude = main_side * values
+            is_rectified = not np.nanmin(magnitude) < 0.0  # else the sensor states the sign of its noise
+            channels[name] = (_draw_noise_signs(magnitude, recording.rate) if is_rectified else magnitude) * sign
+            text += f": its sign is taken from {source}"
+            text += "" if valve is not None else "; if a valve directs the flow, record its direction (--map valve=...)"
+        if (
+            sign is not None
+            and name == "q_pump"
+            and {"x", "u"} <= channels.keys()
+            and _is_in_supply_line(recording, sign)
+        ):
             channels["q_supply"], units["q_supply"] = channels.pop(name), units.pop(name)
             text += ", and it counts as the flow in the valve's supply line (q_supply)"
-        findings.append(Finding("unsigned_speed", "note", name, len(recording), float(recording.t[0]), text))
-    return (replace(recording, channels=channels, units=units) if findings else recording), findings
+        severity: Severity = "warning" if sign is None else "note"
+        findings.append(Finding("unsigned_speed", severity, name, len(recording), float(recording.t[0]), text))
+    is_changed = findings or valve is not None
+    return (replace(recording, channels=channels, units=units) if is_changed else recording), findings
+
+
+def _motion(recording: Recording) -> Array | None:
+    """Compute the piston speed (n,) or, without a position, return the command; None if neither is recorded."""
+    if "x" in recording:
+        return _piston_speed(recording["x"], recording.rate)
+    return recording.channels.get("u")
+
+
+def _find_valve_sign(valve: Array, magnitude: Array, motion: Array) -> Array | None:
+    """Find the sign (n,), 1, -1 or 0, of the flow into chamber A that a directional valve states.
+
+    `valve` (n,): its command or position. The samples are grouped by its value, if there are few values, else by the
+    side of its centre, which is 0 or, if it has one sign, the middle of its range. The sign of a group is that of the
+    sum of `magnitude` times `motion` in it, which is 0 where the valve stops the piston. None unless groups move the
+    piston both ways, by more than the fraction `unsigned.least` of one another (`priors.toml`).
+    """
+    known = np.isfinite(valve)
+    if not known.any():
+        return None
+    values, groups = np.unique(valve[known], return_inverse=True)
+    if values.size > _MAX_POSITIONS:
+        centre = 0.0 if values[0] < 0.0 < values[-1] else 0.5 * float(values[0] + values[-1])
+        groups = np.sign(valve[known] - centre).astype(int) + 1
+    moved = np.nan_to_num(magnitude * motion)[known]
+    sums = np.bincount(groups, weights=moved)
+    if not is_two_way(float(sums[sums > 0.0].sum()), float(-sums[sums < 0.0].sum())):
+        return None
+    signs = np.where(np.abs(sums) > _PRIORS.noise * np.abs(sums).max(), np.sign(sums), 0.0)
+    rows, known_rows = np.arange(valve.size), np.flatnonzero(known)
+    # a missing value is that of the last known one
+    last_known = np.maximum(np.searchsorted(known_rows, rows, side="right") - 1, 0)
+    return np.asarray(signs[groups][last_known])
 
 
 def _is_in_supply_line(recording: Recording, sign: Array) -> bool:

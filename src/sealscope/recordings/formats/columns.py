@@ -15,7 +15,7 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.actuators import find_actuators
-from sealscope.recordings.formats.headings.formula import Formula, parse_formula
+from sealscope.recordings.formats.headings.formula import Formula, is_pure_number, parse_formula
 from sealscope.recordings.formats.headings.labels import Label, split_square_brackets
 from sealscope.recordings.formats.headings.proposal import (
     ends_in,
@@ -88,7 +88,12 @@ class ColumnMap:
     @property
     def channel_of(self) -> dict[int, str]:
         """Mapping from each column that a channel uses to this channel, the last one if there are several."""
-        return {column: name for name, formula in self.channels.items() for column in formula.factors}
+        return {column: name for name, formula in self.channels.items() for column in formula.columns}
+
+    @property
+    def wordy(self) -> frozenset[int]:
+        """Columns that may hold words, which are no reason not to read the file: the direction of a valve."""
+        return frozenset(self.channels["valve"].columns if "valve" in self.channels else ())
 
     @property
     def columns(self) -> dict[int, str]:
@@ -224,24 +229,33 @@ def _parse_mapping(labels: Sequence[Label], channel: str, column_text: str) -> F
     for name, unit in ((column_text, None), split_square_brackets(column_text), (name_before_blank, unit_after_blank)):
         column = _find_column(labels, name, description) if name else None
         if column is not None:
-            return Formula({column: 1.0}, 0.0, _find_unit(labels[column], channel) if unit is None else unit)
+            return Formula.of_column(column, _find_unit(labels[column], channel) if unit is None else unit)
     try:
         formula = parse_formula(column_text)
     except InputError:  # without an operator the text is meant as a name, which may contain - and /
         if any(operator in column_text for operator in "*+"):
             raise
-        formula = Formula({column_text: 1.0})
-    factors: dict[int, float] = {}
-    for name, factor in formula.factors.items():
+        formula = Formula.of_column(column_text)
+
+    def find(name: str) -> int:
+        """Find the column with this name in the formula."""
         operand = description if name == column_text else f"{name} of {description}"
         column = _find_column(labels, name, operand, mapped=True)
         if column is None:
             raise _MissingColumnError(f"{operand} must be a column, got columns {_format_columns(labels)}")
-        factors[column] = factors.get(column, 0.0) + factor
-    units = {_find_unit(labels[column], channel) for column in factors}
-    if formula.unit is None and len(units) > 1:
-        raise InputError(f"{description} must state its unit, got columns with different units")
-    return Formula(factors, formula.constant, units.pop() if formula.unit is None else formula.unit)
+        return column
+
+    try:
+        formula_of_columns = formula.with_columns(find, lambda column: _find_unit(labels[column], channel))
+    except _MissingColumnError:
+        raise
+    except InputError as error:
+        raise InputError(f"{description} cannot be computed: {error}") from None
+    column, unit = formula_of_columns.column, formula_of_columns.unit
+    if column is not None:
+        return replace(formula_of_columns, unit=_find_unit(labels[column], channel) if formula.unit is None else unit)
+    # a pure number is no unit of a channel: raw counts
+    return replace(formula_of_columns, unit=None if unit is not None and is_pure_number(unit) else unit)
 
 
 def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str, str | None]:
@@ -254,12 +268,16 @@ def _choose_unit(channel: str, unit: str | None, description: str) -> tuple[str,
     """
     if unit is None and channel == "T_oil":
         return "degC", f"{description} has no unit: taken as °C"
+    if unit is None and channel == "valve":
+        return COUNTS, None
     if unit is None:
         return COUNTS, f"{description} has no unit: taken as raw counts"
     if same_dimension(unit, COUNTS):
         return COUNTS, None
     if channel == "omega" and unit in WORDS["rotation_units"]:
         return "rpm", None
+    if channel == "valve" and is_current_or_fraction(unit):
+        return COUNTS, None  # only its side counts
     if channel == "u" and is_current_or_fraction(unit):
         return COUNTS, f"{description} is a command in {unit}: its scale in V is unknown, so only its changes are used"
     to_si(0.0, unit, CHANNEL_UNITS[channel], name=channel)  # raises InputError for a wrong dimension
@@ -299,7 +317,7 @@ def _apply_names(choice: ColumnMap, labels: Sequence[Label]) -> None:
         if column is not None and column != choice.time and column not in choice.channel_of:
             found_unit = _find_unit(labels[column], channel)
             unit, note = _choose_unit(channel, found_unit, f"column {labels[column].whole}")
-            choice.channels[channel] = Formula({column: 1.0}, 0.0, unit)
+            choice.channels[channel] = Formula.of_column(column, unit)
             if choice.labels[column].name != channel:
                 choice.names[channel] = labels[column].whole
             choice.notes += [note] if note else []
@@ -478,7 +496,7 @@ def _choose_every_column(labels: Sequence[Label], request: Request, stated_rate:
         if column not in {*used, choice.date}:
             name = label.whole or f"column {column + 1}"
             name = f"{name} (column {column + 1})" if name in choice.channels else name
-            choice.channels[name] = Formula({column: 1.0}, 0.0, COUNTS)
+            choice.channels[name] = Formula.of_column(column, COUNTS)
     if not choice.channels:
         raise InputError(f"a table must have a column beside its time, got columns {_format_columns(labels)}")
     return choice
@@ -506,7 +524,7 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
     mapped_columns: dict[int, str] = {}
     for channel, column_text in columns.items():
         with suppress(InputError):  # raised again by `_apply_map`
-            mapped_columns.update(dict.fromkeys(_parse_mapping(labels, channel, column_text).factors, channel))
+            mapped_columns.update(dict.fromkeys(_parse_mapping(labels, channel, column_text).columns, channel))
     named_labels = _select_actuator(choice, request, mapped_columns)
     if uses_names(request.map):
         # no channel is proposed for an empty heading
@@ -545,5 +563,5 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         is_date = labels[choice.time].name.casefold() in WORDS["date"]
         choice.date = choice.time if is_date else choice.date
     # in the order of the first column of each in the file
-    choice.channels = dict(sorted(choice.channels.items(), key=lambda item: next(iter(item[1].factors))))
+    choice.channels = dict(sorted(choice.channels.items(), key=lambda item: item[1].columns[0]))
     return choice

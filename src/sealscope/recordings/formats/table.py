@@ -172,8 +172,7 @@ def build_fields(
                 required = f"{last.path} ({last.count})"
                 raise InputError(f"{member.path} must have as many samples as {required}, got {member.count}")
         columns = {
-            column: _read_samples(members[column], as_time=kinds[column] == "time", any_cell=kinds[column] == "any")
-            for column in kinds
+            column: _read_column(members[column], choice, column, as_time=kinds[column] == "time") for column in kinds
         }
     table = convert_columns(choice, columns, kind, request, notes, remarks=remarks, description=description)
     return table._replace(provenance=table.provenance | clock) if clock else table
@@ -400,6 +399,16 @@ def _make_names_unique(series: Sequence[Series]) -> tuple[list[Series], list[str
     return members, notes
 
 
+def _read_column(series: Series, choice: ColumnMap, column: int, *, as_time: bool = False) -> NDArray[Any]:
+    """Read the samples (n,) of a chosen column as `_read_samples`; NaN if it may hold words, and does."""
+    try:
+        return _read_samples(series, as_time=as_time, any_cell=choice.cells == "any" and not as_time)
+    except InputError:
+        if column not in choice.wordy:
+            raise
+        return np.full(series.count, np.nan)
+
+
 def _read_samples(series: Series, *, as_time: bool = False, any_cell: bool = False) -> NDArray[Any]:
     """Read the samples (n,) of a series as doubles; with `as_time`, read date stamps as datetime64.
 
@@ -458,7 +467,7 @@ def _align_clocks(
     columns: dict[int, NDArray[Any]] = {}
     notes: list[str] = []
     for column, member in used.items():
-        values = _read_samples(member, any_cell=choice.cells == "any")
+        values = _read_column(member, choice, column)
         if member.clock is None and member.count != base.count:
             raise InputError(
                 f"{member.path} must have a clock or as many samples as {base.path} ({base.count}), got {member.count}"

@@ -9,7 +9,7 @@ import csv
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -115,7 +115,7 @@ def read_text_parts(path: Path, request: Request, every: float, rows: float | No
         else:
             yield table
             return
-    log = _Log(path, layout, kinds=choice.columns, date=choice.date)
+    log = _Log(path, layout, kinds=choice.columns, date=choice.date, wordy=choice.wordy)
 
     def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
         """Convert a part of the log to fields; update `state`, that of the time column after the previous part."""
@@ -252,13 +252,16 @@ class _Block:
 class _Log:
     """Reader of the rows of a text log, block by block; a word is a text in place of a number or a time stamp."""
 
-    def __init__(self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None) -> None:
+    def __init__(
+        self, path: Path, layout: Layout, kinds: Mapping[int, str], date: int | None, wordy: Container[int] = ()
+    ) -> None:
         """Prepare to read the log at `path`, and decide if pyarrow can read its layout.
 
         `kinds`: column to read -> kind of its values: "numbers"; "any", i.e. numbers with inf in place of words;
-        "time"; or "texts". `date`: column of the date that belongs to the time, or None.
+        "time"; or "texts". `date`: column of the date that belongs to the time, or None; `wordy`: columns of which any
+        number of cells may be words.
         """
-        self.path, self.layout, self.kinds, self.date = path, layout, kinds, date
+        self.path, self.layout, self.kinds, self.date, self.wordy = path, layout, kinds, date, wordy
         self.min_cells = max(kinds) + 1  # fewest cells that a row must have
         self.n_rows = self.n_repeated = self.n_text_lines = 0  # rows, repeated heading lines, lines of text until now
         self.first_text_line = ""  # the first line of text with its place, for messages
@@ -587,7 +590,7 @@ class _Log:
         for column, indices in word_rows.items():  # frees each column's blocks before the next is joined
             blocks_with_words = (block for block in blocks if len(block.word_rows.get(column, ())))
             first = next((block.first_words.get(column, "") for block in blocks_with_words), "")
-            if indices and self.n_words[column] > MAX_WORD_FRACTION * self.n_rows:
+            if indices and column not in self.wordy and self.n_words[column] > MAX_WORD_FRACTION * self.n_rows:
                 is_stamp_column, first_word = self.has_stamps and self.kinds[column] == "time", self.first_words[column]
                 raise InputError(f"{_STAMP_RULE if is_stamp_column else 'a sample must be a number'}, got {first_word}")
             if indices:

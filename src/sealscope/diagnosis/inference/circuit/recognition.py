@@ -25,6 +25,7 @@ from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters.circuit import ASYMMETRIC_CIRCUIT, OPEN_CIRCUIT
 from sealscope.recordings.channels import flow_source
+from sealscope.recordings.corrections.unsigned import is_two_way
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:
@@ -127,7 +128,8 @@ def asymmetric_pump_log_factor(equation: Equation, signals: Signals) -> float:
 
     a closed circuit has r = log(A_A / A_B), an asymmetric pump r = 0. The variance of r is `feed.scatter`^2, and those
     of a and k. Motion has the weight 1 - exp(-dp^2 / (2 s^2)), with s = `feed.sided`; the rest of it gets an a of its
-    own. The result is 0 unless the piston moves under both loads, or if the displacement is not that of a pump.
+    own. The result is 0 unless the piston moves under both loads and the flow has both signs, or if the displacement is
+    not that of a pump.
     """
     oil, terms, step = INFERENCE.held_oil, {term.name: term for term in equation.terms}, signals.step("x")
     if not ("theta" in signals or "omega" in signals):
@@ -141,6 +143,8 @@ def asymmetric_pump_log_factor(equation: Equation, signals: Signals) -> float:
     rows = weak_form_rows([*motions, *further_columns, *rises, equation.left(signals)], signals.rate)
     values = rows.values[rows.whole]
     columns, (rise_A, rise_B, x, volume) = values[:, :6], values[:, 6:].T
+    if not is_two_way(*(float(np.maximum(signed, 0.0).sum()) for signed in (volume, -volume))):
+        return 0.0  # a pump that turns one way, or whose speed has no sign
     targets = np.column_stack([rise_A, rise_B, volume])
     scale = np.linalg.norm(columns, axis=0)
     if len(values) <= columns.shape[1] or not scale.all():

@@ -33,7 +33,11 @@ _TEMPERATURE_UNITS = {"c": "degC", "f": "degF", "k": "K"}
 #: Measured quantity -> channel, and -> unit; a pressure's channel depends on its side, and a spool may have any unit of
 #: a command (`_is_command_unit`).
 _CHANNELS: dict[str, str] = WORDS["channel"]
-_UNITS = {kind: {**CHANNEL_UNITS, "t": "s"}[channel] for kind, channel in _CHANNELS.items() if kind != "spool"}
+_UNITS = {
+    kind: {**CHANNEL_UNITS, "t": "s"}[channel]
+    for kind, channel in _CHANNELS.items()
+    if kind not in ("spool", "direction")
+}
 _FRACTION_UNITS = frozenset(("%", "percent", "pct", "Prozent", "prozent"))
 #: Kinds of opposite words of sides: that of chamber A, and that of chamber B. A spring is opposite to the pressure.
 _OPPOSITE = (("opening", "closing"), ("opening", "spring"), ("closing", "spring"), ("push", "pull"))
@@ -94,6 +98,8 @@ def proposed_map(labels: Sequence[Label], company: Sequence[Label] = ()) -> dict
         # the command is that of a valve: find the pressures before and behind it
         for channel, kind in (("p_1", "before"), ("p_2", "behind")):
             candidates[channel] = [(label, guess) for label in labels if (guess := _guess_at_valve(label, kind))]
+    if not known & {"omega", "q_pump"}:  # without a flow to direct, a valve's value is none of a direction
+        candidates.pop("valve", None)
     result = {}
     for channel in (*CHANNEL_UNITS, "t"):
         columns = candidates.get(channel, [])
@@ -348,6 +354,12 @@ def _guess_meaning(label: Label, sides: Mapping[str, str] | None = None) -> _Gue
         return _Guess("position", side, unit)
     if unit is not None and words & _MEASURED["command"] and _is_command_unit(unit):
         return _Guess("command", side, unit)
+    if (
+        unit is not None
+        and words & _MEASURED["direction"]
+        and (_is_command_unit(unit) or same_dimension(unit, "count"))
+    ):
+        return _Guess("direction", side, unit)
     for kind, words_of_kind in _MEASURED.items():
         fits_unit = unit is None or (kind in _UNITS and same_dimension(unit, _UNITS[kind]))
         if words & words_of_kind and fits_unit and kind != "flow":  # a flow must have its unit (above)
