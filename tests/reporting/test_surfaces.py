@@ -71,7 +71,7 @@ def test_an_alarm_of_the_monitor_is_in_the_state_of_a_diagnosis(level, name, mak
 def test_both_pages_have_a_colour_for_every_state():
     styles = {
         "state-": resources.files("sealscope.reporting").joinpath("templates/page.css").read_text("utf-8"),
-        "badge.": resources.files("sealscope.monitor").joinpath("page/page.css").read_text("utf-8"),
+        "badge.": resources.files("sealscope.web").joinpath("base.css").read_text("utf-8"),
     }
     conditions = ("watched", "learning", "cannot tell", "leak", "leak over the limit")
     symbols = {state_of(condition).symbol for condition in conditions}
