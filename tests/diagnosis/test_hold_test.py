@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.verdict.machine import unstated_rig
 from sealscope.errors import InputError
 
 AREAS = ("3117 mm^2", "2155 mm^2")
@@ -149,3 +152,35 @@ def test_a_moving_cylinder_is_no_hold():
     counts = ss.Recording(t, {"p_A": 8e6 + t}, {"p_A": "count"}, rate=100.0)
     with pytest.raises(InputError, match="unit"):
         ss.hold_test(counts)
+
+
+RIG = unstated_rig().with_areas(3117e-6, 2155e-6, source="stated by the test")
+
+
+def tank(t):
+    """Pressure of a side that is open to the tank, with the noise of its sensor."""
+    return 1e4 * np.random.default_rng(1).standard_normal(t.size)
+
+
+def test_a_recording_of_a_held_load_is_judged_by_the_hold_test():
+    diagnosis = ss.diagnose(record_hold(0.5, minutes=5.0, p_B=tank, log_T=True), rig=RIG, limit="1 mL/min")
+    (hold,) = diagnosis.holds
+    assert hold.result == "fail" and hold.reason in diagnosis.reason
+    assert diagnosis.total_leakage.lpm == pytest.approx(0.5e-3 * 3.117, rel=0.02)
+    assert diagnosis.as_dict()["holds"] == [hold.as_dict()]
+    moving = ss.simulate(command="3 sin(4t)", duration="20 s", seed=1)
+    assert ss.diagnose(moving).holds == ()
+
+
+def test_tests_in_order_of_time_are_a_trend():
+    recordings = [
+        replace(
+            record_hold(0.3 * (1.0 + 0.15 * k), minutes=3.0, seed=k, p_B=tank, log_T=True),
+            provenance={"start": f"2024-0{1 + k}-01T08:00"},
+        )
+        for k in range(6)
+    ]
+    trend = ss.trend(recordings, rig=RIG, limit="5 mL/min")
+    assert trend.basis == "hold test"
+    assert trend.wear.growth.low <= 0.3e-3 * 0.15 * 3.117 <= trend.wear.growth.high
+    assert trend.wear.reach is not None

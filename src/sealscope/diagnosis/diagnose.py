@@ -23,12 +23,14 @@ from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
+from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
+from sealscope.diagnosis.verdict.held import describe_holds, held_leakage
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
@@ -221,6 +223,9 @@ def diagnose(
             judged_until=inspection.judged_until,
         )
         evidence = examination.decide_by_all()
+        holds = judge_held_recording(recording, machine.areas if machine.area_stated else None, limit)
+    if holds:
+        evidence = replace(evidence, reason=describe_holds(holds), total_leakage=held_leakage(holds))
     missing = [str(finding.channel) for finding in comparable.findings if finding.code == MISSING_CHANNEL]
     if missing and evidence.verdict != LEAK:
         doubt = text_of("remark", "channels missing", names=join_names(missing))
@@ -234,6 +239,7 @@ def diagnose(
         false_alarm_probability=false_alarm_probability,
         baselines=len(comparable.parts),
         limit=repair_limit,
+        holds=holds,
     )
 
 

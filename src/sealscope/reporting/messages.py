@@ -302,6 +302,8 @@ def next_steps(diagnosis: Diagnosis) -> tuple[str, ...]:
     # an unknown level is treated as the middle one, `plan`
     step_once_confirmed = say(f"once_confirmed.{severity_level or 'plan'}", limit=diagnosis.limit)
     has_named_cause = diagnosis.named_cause is not None
+    if diagnosis.holds:
+        return (diagnosis.next_check,)
     if diagnosis.verdict == "leak":
         # `next_check` tests a named cause by the piston's creep, else it repeats the recording: the other comes second
         steps = [diagnosis.next_check, say("next.repeat" if has_named_cause else "next.creep"), step_once_confirmed]

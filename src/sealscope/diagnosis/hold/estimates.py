@@ -164,11 +164,11 @@ class HeldLoad:
         self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
         travel = scale * (course(t) - course(0.0))
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
-        return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel)]
+        return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel, HOLD.cooling.misfit)]
 
-    def _misfit(self, t: Array, travel: Array) -> list[Column]:
-        """Build the bends that a correction by `travel` [mm] leaves, as its law is simplified, at times `t` [s]."""
-        size = INFERENCE.held_oil.misfit * float(np.ptp(travel))
+    def _misfit(self, t: Array, travel: Array, share: float) -> list[Column]:
+        """Build the bends, a `share` of it, that a correction by `travel` [mm] leaves at times `t` [s]."""
+        size = share * float(np.ptp(travel))
         if size == 0.0:
             return []
         z = 2.0 * t / self.duration - 1.0
@@ -297,7 +297,10 @@ class HeldLoad:
             part_t, course = smooth_course(self.t, p)
             for compression, width in zip(relative_compression(np.maximum(course, LOWEST)), widths, strict=True):
                 column = length * (np.interp(readings.t, part_t, compression) - compression[0])
-                base += [Column(column, 1.0, math.hypot(deviation, width)), *self._misfit(readings.t, column)]
+                base += [
+                    Column(column, 1.0, math.hypot(deviation, width)),
+                    *self._misfit(readings.t, column, oil.misfit),
+                ]
         fit = self._fit_laws(readings, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 

@@ -22,7 +22,8 @@ from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.channels import COUNTS
+from sealscope.recordings.channels import COUNTS, FLOW_SOURCES
+from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import inspect
 from sealscope.recordings.recording import Recording
 from sealscope.units import parse_quantity
@@ -106,12 +107,34 @@ def hold_test(
     return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
 
 
-def find_holds_of(recording: Recording) -> list[Recording]:
-    """Find the parts of a recording in which a load is held; empty without such parts or without channels for it."""
+def judge_held_recording(
+    recording: Recording, areas: Sequence[float] | None = None, limit: str | None = None
+) -> tuple[HoldResult, ...]:
+    """Judge a recording of a held load, or return no result if it is none.
+
+    It is one if its pump and command rest and its position is held for the fraction `part.share` (`priors.toml`) of its
+    duration or longer. `areas` [m^2]: of the sides A and B; `limit`: as of `hold_test`.
+    """
+    if "x" not in recording or recording.units["x"] == COUNTS or not _is_pump_at_rest(recording):
+        return ()
     try:
-        return _cut_holds(_select_samples(recording), None, None)
+        results = hold_test(recording, area=areas, limit=limit)
     except InputError:
-        return []
+        return ()
+    held_s = sum((result.end_s or 0.0) - (result.start_s or 0.0) for result in results)
+    return results if held_s >= HOLD.part.share * recording.duration else ()
+
+
+def _is_pump_at_rest(recording: Recording) -> bool:
+    """Test whether no recorded command, flow or speed of the pump changes, except for a motor that hardly turns."""
+    for name in FLOW_SOURCES:
+        values = recording.channels.get(name, np.zeros(1))
+        finite = values[np.isfinite(values)]
+        if not finite.size or is_constant(finite):
+            continue
+        if name != "omega" or float(np.abs(finite).max()) > HOLD.part.motor:
+            return False
+    return True
 
 
 def _select_samples(recording: Recording) -> Recording:

@@ -12,6 +12,8 @@ class HeldPart(PriorTable):
     position: float  # [mm] largest noise of a position
     scatter: float  # [bar] largest noise of a pressure
     shortest: float  # [s] shortest hold
+    share: float  # smallest held share of a recording of a held load
+    motor: float  # [rad/s] largest speed of a motor at rest
     bin: float  # [s] time over which samples are averaged to find holds
 
 
@@ -33,6 +35,7 @@ class CoolingPriors(PriorTable):
     stated: tuple[float, float]  # mean and standard deviation of the change of stated oil, over its excess
     ambient: float  # [degC] temperature that stated oil approaches
     step: float  # [K] step of a constant temperature
+    misfit: float  # share of the effect of a logged temperature that its column leaves
     steady: float  # [K] standard deviation of the change of oil that is stated to be steady
     expansion: float  # [1/K] thermal expansion of oil in a cylinder
     expansion_deviation: float  # relative standard deviation

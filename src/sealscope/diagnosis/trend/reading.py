@@ -16,6 +16,7 @@ from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
@@ -28,6 +29,7 @@ from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.rms_change.blocks import JUDGED, measure_levels
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.diagnosis.trend.wear import ScatterPrior
+from sealscope.diagnosis.verdict.held import held_leakage
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
@@ -39,11 +41,11 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 from sealscope.signals.details import QUANTITIES
 from sealscope.storage.folders import numeric_sort_key
-from sealscope.units import DAY
+from sealscope.units import DAY, LITRE_PER_MINUTE
 
 #: Methods of estimating a leakage level, the most specific first. The level is a conductance; for "ringing" it is the
 #: damping of the pressures' wavelet details.
-Basis = Literal["volume balance", "pressure response", "ringing"]
+Basis = Literal["hold test", "volume balance", "pressure response", "ringing"]
 BASES: tuple[Basis, ...] = get_args(Basis)
 
 
@@ -97,6 +99,8 @@ def estimate_reading(
         digest=inspection.digest,
         problem=inspection.defect or "",
     )
+    if (held := _hold_fields(recording, machine)) is not None:
+        return replace(reading, problem="", **held)
     if reading.problem:
         return reading
     with limit_threads(), np.errstate(all="ignore"):  # numbers of impossible readings may overflow
@@ -139,6 +143,29 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     return {"problem": "no detector states a level: " + "; ".join(reasons or ["the pressures do not ring"])}
 
 
+def _hold_fields(recording: Recording, machine: AssumedMachine) -> dict[str, Any] | None:
+    """Collect the fields of `LeakReading` that follow from a hold test; None if the recording is of no held load.
+
+    The level is the leak of the longest hold over its pressure. Without stated areas the assumed ones give a level that
+    is relative, as those of other methods.
+    """
+    areas = machine.areas if machine.areas is not None else (machine.area,)
+    holds = judge_held_recording(recording, areas)
+    leakage = held_leakage(holds) if holds else None
+    if leakage is None or leakage.lpm is None or leakage.interval_lpm is None or not leakage.pressure > 0.0:
+        return None
+    low, high = leakage.interval_lpm
+    scale = LITRE_PER_MINUTE / leakage.pressure
+    return {
+        "basis": "hold test",
+        "level": leakage.lpm * scale,
+        "error": (high - low) * scale / (2.0 * WITHIN_95),
+        "states_flow": machine.area_stated,
+        "area": areas[0] if machine.area_stated else None,
+        "pressure": leakage.pressure,
+    }
+
+
 def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
     """Collect the fields of `LeakReading` that follow from a solved volume balance, by name.
 
@@ -167,12 +194,13 @@ def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[
 def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     """Make the prior on the standard deviation of a healthy machine's leakage level between recordings.
 
-    For the volume balance its scale is proportional to the typical level `usual`, for other methods constant.
+    For the volume balance and hold tests its scale is proportional to the typical level `usual`, else constant.
     """
     between = TREND.between
     if basis == "pressure response":
         return ScatterPrior(PRESSURE.conductance.level, between.freedom)
-    scale = between.volume_balance * abs(usual) if basis == "volume balance" else between.ringing
+    is_flow = basis in ("volume balance", "hold test")
+    scale = between.volume_balance * abs(usual) if is_flow else between.ringing
     return ScatterPrior(max(scale, float(np.finfo(float).tiny)), between.freedom)  # must be above 0
 
 

@@ -52,7 +52,7 @@ class Trend:
         Verdict, reason, leak, bound and onset, as in a diagnosis. The verdict is `leak` if the level rose more than a
         healthy machine's may, a leak explains the rise, and no repair followed.
     basis : str or None
-        Method by which the levels were estimated: "volume balance", "pressure response" or "ringing".
+        Method by which the levels were estimated: "hold test", "volume balance", "pressure response" or "ringing".
     unit, pressure : str, float or None
         ``L/min`` at this pressure difference [Pa], or ``%`` of the healthy recordings' mean if the sizes are not known;
         for "ringing" ``%`` above this mean. The pressure is None for ``%``.

@@ -30,6 +30,8 @@ from sealscope.units import DAYS_PER_YEAR
 
 #: Smallest number of comparable recordings for a verdict.
 MIN_RECORDINGS = 3
+#: Causes of a leak by the methods that separate less, or more, than the volume balance.
+_CAUSES = {"pressure response": "piston, pump or external leak", "hold test": "piston or external leak"}
 
 
 def decide_trend(
@@ -85,7 +87,7 @@ def _measure_leak(
     rise = _normal_rise(wear, chance)
     return LeakMeasure(
         provider=str(points[0].basis),
-        cause="piston, pump or external leak" if points[0].basis == "pressure response" else "piston or pump leak",
+        cause=_CAUSES.get(str(points[0].basis), "piston or pump leak"),
         rise=rise,
         step_rise=None if rise is None else LeakRise(rise),
         rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),

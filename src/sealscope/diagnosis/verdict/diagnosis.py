@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
@@ -28,6 +29,8 @@ _COLUMNS = (
     *("file", "start", "machine", "verdict", "reason", "onset_s", "leak_lpm", "bound_lpm", "score", "threshold"),
     *("chance", "odds", "false_alarm_probability", "cause", "summary", "next_check"),
 )
+#: Next check of a held load.
+_NEXT_HOLD = "Judge it against a limit, and file the page: sealscope hold FILE --area AREA --limit '24 mm in 3 min'."
 #: First fields of a diagnosis in JSON.
 _FIRST_FIELDS = (
     *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
@@ -70,6 +73,8 @@ class Diagnosis(Evidence):
         Recorded pressures, positions, speeds and flows that were not read as channels.
     pressure_unit : str
         Unit of pressures in texts: the log's unit if it is known, else bar.
+    holds : tuple of HoldResult
+        Results of the hold test, if the recording is one of a held load.
 
     Examples
     --------
@@ -95,6 +100,7 @@ class Diagnosis(Evidence):
     start: str | None = None
     unused: tuple[str, ...] = ()
     pressure_unit: str = "bar"
+    holds: tuple[HoldResult, ...] = ()
 
     @classmethod
     def from_evidence(
@@ -204,6 +210,8 @@ class Diagnosis(Evidence):
     @property
     def next_check(self) -> str:
         """Next check to make on the machine, in one or two sentences."""
+        if self.holds:
+            return self.holds[0].second_test or _NEXT_HOLD
         has_bypass = self.machine is not None and self.machine.bypass
         action = action_of(self._condition, self.named_cause, parts=("bypass",) if has_bypass else ())
         unlike = self.unlike_healthy
@@ -306,6 +314,7 @@ class Diagnosis(Evidence):
                 "evidence": {"detector": self.detector or None, "share": self.share, "baselines": self.baselines}
                 | {"ratio": ratio, "ratio_interval": ratio_interval, "refuses": sorted(self.refuses)},
                 "state": self.state,
+                "holds": [hold.as_dict() for hold in self.holds],
             }
         )
 
