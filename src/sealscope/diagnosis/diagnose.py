@@ -24,13 +24,13 @@ from sealscope.diagnosis.detectors.observation import healthy_null, limit_thread
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
+from sealscope.diagnosis.hold.summary import describe_holds, held_leakage
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
-from sealscope.diagnosis.verdict.held import describe_holds, held_leakage
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names

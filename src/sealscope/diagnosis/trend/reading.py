@@ -17,6 +17,7 @@ from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
+from sealscope.diagnosis.hold.summary import held_leakage
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
@@ -29,7 +30,6 @@ from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.rms_change.blocks import JUDGED, measure_levels
 from sealscope.diagnosis.rms_change.detector import RmsChange
 from sealscope.diagnosis.trend.wear import ScatterPrior
-from sealscope.diagnosis.verdict.held import held_leakage
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names

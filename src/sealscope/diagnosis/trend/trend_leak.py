@@ -25,13 +25,16 @@ from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries, has_same_rate
 from sealscope.diagnosis.trend.reading import TrendPoint
 from sealscope.diagnosis.trend.wear import Episode, Wear
-from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Evidence, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Cause, Evidence, TotalLeakage
 from sealscope.units import DAYS_PER_YEAR
 
 #: Smallest number of comparable recordings for a verdict.
 MIN_RECORDINGS = 3
 #: Causes of a leak by the methods that separate less, or more, than the volume balance.
-_CAUSES = {"pressure response": "piston, pump or external leak", "hold test": "piston or external leak"}
+_CAUSES: dict[str, Cause] = {
+    "pressure response": "piston, pump or external leak",
+    "hold test": "piston or external leak",
+}
 
 
 def decide_trend(

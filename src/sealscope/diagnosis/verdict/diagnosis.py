@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
@@ -100,7 +99,7 @@ class Diagnosis(Evidence):
     start: str | None = None
     unused: tuple[str, ...] = ()
     pressure_unit: str = "bar"
-    holds: tuple[HoldResult, ...] = ()
+    holds: tuple[Any, ...] = ()
 
     @classmethod
     def from_evidence(
