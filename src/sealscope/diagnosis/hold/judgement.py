@@ -42,8 +42,10 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
     result = None
     if bound is not None:
         result = "undecided" if interval is None else decide_result(interval, bound)
-    has_leak = leak.flow is not None and leak.flow.interval[0] > 0.0
-    has_leak |= leak.flow is None and leak.rate is not None and leak.rate.interval[0] > 0.0
+    shown = leak.rate if leak.flow is None else leak.flow
+    has_leak = shown is not None and shown.interval[0] > 0.0
+    if shown is not None and hold.warming > HOLD.cooling.steady:  # the prior of cooling is an assumption
+        has_leak &= shown.below(0.0) < HOLD.other.sure
     sinks = creep is not None and creep.interval[0] > 0.0
     by_cooling = sinks and not has_leak
     causes = _list_causes(hold) if has_leak else (COOLING,) if by_cooling else ()
@@ -130,16 +132,17 @@ def _weigh_piston(hold: HeldLoad) -> int:
     gain, leak = hold.gain, hold.leak
     if gain is None or leak.rate is None:
         return 0
-    if gain.interval[0] > 0.0:
+    prior, is_material = HOLD.other, abs(gain.mean) > HOLD.other.material * abs(leak.rate.mean)
+    if is_material and gain.interval[0] > 0.0:
         return 1
     p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
-    is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > HOLD.other.tank * BAR
+    is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > prior.tank * BAR
     area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
     ratio = 1.0 if area is None or other_area is None else other_area / area
     travel = Mixture(np.ones(1), np.zeros(1), np.zeros(1)) if hold.creep is None else hold.creep.rate
     gained = ratio * (travel.mean + gain.mean)
     error = ratio * math.hypot(travel.deviation, gain.deviation)
-    falls = gain.interval[1] < 0.0
+    falls = is_material and gain.interval[1] < 0.0
     if (is_closed or falls) and gained + WITHIN_95 * error < leak.rate.interval[0]:
         return -1
     return 0

@@ -67,8 +67,10 @@ class NoisePriors(PriorTable):
 
 
 class OtherSide(PriorTable):
-    """Pressure of the side without the load."""
+    """Pressure of the side without the load, and chances from which something is named."""
 
+    sure: float  # largest chance of no leak of one that is named, where the oil is not logged
+    material: float  # least gain of the side over the leak
     tank: float  # [bar] largest pressure of a side that may be open to the tank
 
 

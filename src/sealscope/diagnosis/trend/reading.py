@@ -20,6 +20,7 @@ from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.summary import held_leakage
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
