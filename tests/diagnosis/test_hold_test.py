@@ -93,7 +93,7 @@ def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
 
 
 def test_the_other_side_tells_the_piston_where_it_shows_it():
-    (shut,) = ss.hold_test(record_hold(1.0, p_B=lambda t: 1e6 + 1e3 * t), area=AREAS)
+    (shut,) = ss.hold_test(record_hold(1.0, minutes=3.0, p_B=lambda t: 1e6 + 4e3 * t), area=AREAS)
     assert shut.causes == ("piston",)
     (tank,) = ss.hold_test(record_hold(1.0, p_B=lambda t: 0.0 * t), area=AREAS)
     assert set(tank.causes) == {"piston", "load-holding valve", "line"}
