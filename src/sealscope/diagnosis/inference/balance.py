@@ -46,7 +46,11 @@ from sealscope.diagnosis.inference.equations.signals import (
 )
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS
-from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
+from sealscope.diagnosis.inference.pressure_offset import (
+    area_mismatch,
+    fit_pressure_offset,
+    remove_pressure_offset,
+)
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SD_PER_MEDIAN, SUPPORT
@@ -853,11 +857,16 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
         return apply_regime(blocks, columns, shut, has_holds=has_holds, is_certain=odds > INFERENCE.rest.locked)
 
     delays: dict[str, Any] = {"delay_changes": aligned.changes, "delay_tests": aligned.tests}
-    open_regime = _build_regime(balances, partial(compute_regime_blocks, shut=False))._replace(**delays)
+    # stated areas are exact, to within tolerances
+    ratio_deviation: float = (
+        INFERENCE.size.area if rig.states("cylinder.A_A", "cylinder.A_B") else INFERENCE.held_oil.sides_deviation
+    )
+    open_blocks, shut_blocks = (partial(compute_regime_blocks, shut=shut) for shut in (False, True))
+    open_regime = _build_regime(balances, open_blocks, ratio_deviation)._replace(**delays)
     if not may_shut or not has_rests(recorded, columns):
         return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut_regime = _build_regime(shut_balances, partial(compute_regime_blocks, shut=True))._replace(shut=True, **delays)
+    shut_regime = _build_regime(shut_balances, shut_blocks, ratio_deviation)._replace(shut=True, **delays)
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
 
 
@@ -915,18 +924,27 @@ def find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equatio
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 
 
-def _build_regime(balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks]) -> RegimeBlocks:
+def _build_regime(
+    balances: tuple[Equation, ...], compute_blocks: Callable[[float], Blocks], ratio_deviation: float
+) -> RegimeBlocks:
     """Compute the blocks of the volume balances, both as recorded and without the sensor offset of p_A - p_B.
 
     `compute_blocks(offset)` computes the blocks after subtracting an offset [Pa] from p_A - p_B. The estimated offset
     is removed from the Gram matrices, which assumes terms that are linear in it. If it exceeds `NEGLIGIBLE_OFFSET`
     standard deviations of its prior, the blocks are computed again after subtracting it, and the error that remains
-    is estimated and removed.
+    is estimated and removed. Such an offset is replaced by the best smaller one if the areas of the piston speak
+    against it (`area_mismatch`, with `ratio_deviation`).
     """
     columns = tuple(ColumnRoles(balance) for balance in balances)
     plain = compute_blocks(0.0)  # as recorded
-    blocks = remove_pressure_offset(plain, columns)
-    offset = float(blocks.zero[0])
-    if abs(offset) >= NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure:
+    fit = fit_pressure_offset(plain, columns)
+    blocks, offset, negligible = fit.blocks, float(fit.blocks.zero[0]), NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure
+    if abs(offset) >= negligible:
         blocks = remove_pressure_offset(compute_blocks(offset), columns)
+        small = fit_pressure_offset(plain, columns, max_offset=negligible)
+        mismatch, small_mismatch = (
+            area_mismatch(series, columns, balances[0], ratio_deviation) for series in (blocks, small.blocks)
+        )
+        if fit.log_posterior - 0.5 * mismatch < small.log_posterior - 0.5 * small_mismatch:
+            blocks = small.blocks
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)

@@ -647,6 +647,16 @@ def offset_cost(offset: Any) -> Any:
     return np.minimum((offset / usual) ** 2, (offset / far) ** 2 + 2.0 * np.log(far / usual / odds))
 
 
+def offset_penalty(offset: float) -> float:
+    """Compute how improbable a sensor offset of p_A - p_B [Pa] is: -2 log of its density over the largest one.
+
+    Of a sensor that is far off, the largest density is that of such sensors, times their odds. Penalties of sizes of
+    other changes (`StepSize.penalty`), with which it is compared, are relative to their largest density as well.
+    """
+    usual, far, odds = INFERENCE.zero.pressure, INFERENCE.zero.far, INFERENCE.zero.odds
+    return float(min((offset / usual) ** 2, (offset / far) ** 2 - 2.0 * np.log(odds)))
+
+
 def estimate_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     """Estimate the total sensor offset of p_A - p_B [Pa] in a recording, as the mean of one estimate per equation.
 

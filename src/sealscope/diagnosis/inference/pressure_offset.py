@@ -17,6 +17,10 @@ repeats from cycle to cycle, so no more than `size.readings` residuals count as 
 change, there is no information on z. It then stays near zero, and no result depends on it. Behind a servo valve both
 chambers have the same leak, step and z, so their whitened rows are stacked.
 
+z also decides which side carries the load. A large z therefore has to explain the areas of the piston, too: the blocks
+are computed again with it, and it is kept only if the areas that they then show are no more improbable than z makes the
+course of the leakage more probable (`area_mismatch`).
+
 Source: D. A. Harville, J. Am. Statist. Assoc. 72 (1977) 320 (restricted likelihood).
 """
 
@@ -24,10 +28,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost
+from sealscope.diagnosis.inference.blocks import (
+    Blocks,
+    ColumnRoles,
+    estimate_leak_and_bias,
+    offset_cost,
+    solve,
+    sum_blocks,
+)
+from sealscope.diagnosis.inference.equations.feed import motions_of_side
+from sealscope.diagnosis.inference.equations.terms import Equation
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, WALKS
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.evaluation.scalar_search import find_minimum
@@ -37,14 +51,29 @@ from sealscope.recordings.recording import Array
 N_GRID = 21
 
 
+class OffsetFit(NamedTuple):
+    """Blocks after subtracting the most probable sensor offset of p_A - p_B, and the log posterior density of it.
+
+    The density is relative to that of no offset; it contains the prior (`offset_cost`).
+    """
+
+    blocks: Blocks
+    log_posterior: float
+
+
 def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Blocks:
-    """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it.
+    """Estimate the sensor offset of p_A - p_B in a recording, and return the blocks after subtracting it."""
+    return fit_pressure_offset(blocks, columns).blocks
+
+
+def fit_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles], max_offset: float = np.inf) -> OffsetFit:
+    """Estimate the sensor offset of p_A - p_B in a recording, of a magnitude up to `max_offset` [Pa], and subtract it.
 
     The most probable offset is subtracted in the Gram matrices and added to `Blocks.zero` [Pa]. The blocks are returned
     unchanged if too few of them determine the leak, or if an equation has no column for a constant flow.
     """
     if len(blocks) < MIN_BLOCKS or any(roles.bias is None for roles in columns):
-        return blocks
+        return OffsetFit(blocks, 0.0)
     coarse = blocks.merge(INFERENCE.blocks.coarse)  # fewer blocks: the time of the leak's onset need not be exact
     equations = [
         whitened
@@ -52,22 +81,29 @@ def remove_pressure_offset(blocks: Blocks, columns: Sequence[ColumnRoles]) -> Bl
         if (whitened := _whiten_steps(replace(coarse, gram=coarse.gram[:, k : k + 1]), roles)) is not None
     ]
     if not equations:
-        return blocks
+        return OffsetFit(blocks, 0.0)
     leak_steps, flow_offset_steps, residuals = (np.concatenate(parts) for parts in zip(*equations, strict=True))
     # prior standard deviation of the offset of good sensors [Pa], smaller for pressures in counts
     unit = columns[0].offset_deviation(columns[0].leak, blocks)
-    offset = unit * _find_relative_offset(leak_steps, unit * flow_offset_steps, residuals)
+    relative_offset, log_posterior = _find_relative_offset(
+        leak_steps, unit * flow_offset_steps, residuals, max_offset / INFERENCE.zero.pressure
+    )
+    offset = unit * relative_offset
     gram = blocks.gram.copy()
     for k, roles in enumerate(columns):
         assert roles.bias is not None
         # (p_A - p_B) dt minus offset dt, in the rows and in the columns of the Gram matrices
         gram[:, k, roles.leak] -= offset * gram[:, k, roles.bias]
         gram[:, k, :, roles.leak] -= offset * gram[:, k, :, roles.bias]
-    return replace(blocks, gram=gram, zero=blocks.zero + offset)
+    return OffsetFit(replace(blocks, gram=gram, zero=blocks.zero + offset), log_posterior)
 
 
-def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals: Array) -> float:
+def _find_relative_offset(
+    leak_steps: Array, flow_offset_steps: Array, residuals: Array, max_offset: float
+) -> tuple[float, float]:
     """Find the most probable sensor offset of p_A - p_B, in units of its prior standard deviation.
+
+    The magnitude is at most `max_offset`. Also returns the log posterior density relative to that of no offset.
 
     `residuals` (n,): whitened residuals of leak and constant flow in K blocks. Column k of `leak_steps` (n, K) is their
     change by a unit step of the leak's coefficient from block k on. Such a step also lowers the constant flow, in
@@ -97,15 +133,48 @@ def _find_relative_offset(leak_steps: Array, flow_offset_steps: Array, residuals
         # in the prior, a relative offset of 1 is `usual` [Pa], also for pressures in counts
         return 0.5 * float(offset_cost(usual * float(np.sinh(position)))) - log_likelihood(position)
 
-    positions = np.arcsinh(3.0 * far / usual) * np.linspace(-1.0, 1.0, N_GRID)
+    positions = np.arcsinh(min(3.0 * far / usual, max_offset)) * np.linspace(-1.0, 1.0, N_GRID)
     # search about offset 0, where the prior has its maximum, and about the maximum of the likelihood
     starts = {N_GRID // 2, int(np.argmax([log_likelihood(position) for position in positions]))}
     minima = []
     for start in starts:
         low, high = positions[max(start - 1, 0)], positions[min(start + 1, N_GRID - 1)]  # neighbours on the grid
         minima.append(find_minimum(cost, low, high, tolerance=1e-3))
-    position, _ = min(minima, key=lambda minimum: minimum[1])  # position of the lowest cost
-    return float(np.sinh(position))
+    position, lowest_cost = min(minima, key=lambda minimum: minimum[1])
+    return float(np.sinh(position)), cost(0.0) - lowest_cost
+
+
+def area_mismatch(blocks: Blocks, columns: Sequence[ColumnRoles], equation: Equation, ratio_deviation: float) -> float:
+    """Compute how much the fitted areas of the piston contradict each other: -2 log of their likelihood.
+
+    A wrong offset attributes motion to the wrong side of the load. The coefficients a_j of the motion, in up to two
+    directions for each side, should be the side's area times a common factor, to within `between.motion`
+    (`priors.toml`) and the errors e_j of the fit. These variances are divided by the column's share of the motion, as
+    much of a small share belongs to the other side. The log ratio of the areas of B and A is normal about that of the
+    `equation`, with the standard deviation `ratio_deviation`. The result is the smallest sum of squares over the common
+    factor and the ratio; 0 without a motion of the piston.
+    """
+    roles, total = columns[0], sum_blocks(blocks, columns)[0]
+    if not roles.piston:
+        return 0.0
+    nuisance = list(roles.nuisance)
+    normal, diagonal = total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))
+    coefficients = solve(normal, total[nuisance, roles.left])
+    variances = np.diag(solve(normal, diagonal))
+    places = [nuisance.index(column) for column in roles.piston if total[column, column] > 0.0]
+    areas, names = coefficients[places], [roles.names[nuisance[place]] for place in places]
+    # a coefficient that is not known to its order of magnitude tells nothing
+    relative_errors = np.sqrt(np.maximum(variances[places], 0.0)) / np.maximum(np.abs(areas), np.finfo(float).tiny)
+    is_known = relative_errors < 1.0
+    is_side_B = np.array([name in motions_of_side(equation, "B") for name in names], dtype=float)[is_known]
+    logarithms = np.log(np.abs(areas[is_known])) - is_side_B * np.log(equation.area_ratio)
+    energies = np.diag(total)[[nuisance[place] for place in places]][is_known]
+    shares = energies / max(float(energies.max(initial=0.0)), np.finfo(float).tiny)
+    covariance = np.diag((INFERENCE.between.motion**2 + relative_errors[is_known] ** 2) / shares)
+    covariance += ratio_deviation**2 * np.outer(is_side_B, is_side_B)
+    weights = np.linalg.inv(covariance)
+    deviations = logarithms - weights.sum(axis=0) @ logarithms / max(float(weights.sum()), np.finfo(float).tiny)
+    return float(deviations @ weights @ deviations)
 
 
 def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Array] | None:

@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.blocks import (
     ColumnRoles,
     estimate_offset,
     information,
-    offset_cost,
+    offset_penalty,
     solve,
     sum_blocks,
 )
@@ -68,14 +68,16 @@ def volume_observables(
     charge: ChargeTrend | None = None,
     flow_scale: float = 1.0,
     with_orifice: bool = True,
+    port_offset: Estimate | None = None,
 ) -> tuple[Observable, ...]:
     """Test coefficients of a volume balance for a step (`_step_hypotheses`), and return the results by falling score.
 
-    The piston's leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A -
-    p_B below 1. A scale of both pressures looks like a step of it or of the pump's leak, so that their results state
-    the scale (`_pressure_scale`). A laminar leak has no prior on its size, but pays for an improbable sensor offset.
-    The `advantage` of a result comes from the priors on its size and on the power, from the sensor offset, and from the
-    oil that the accumulator lost or the fall of the charge pressure.
+    The piston's leak is tested for a step up only, as a laminar flow, and as a flow proportional to a power of p_A
+    - p_B below 1, the latter with and without the sensor offset. A scale of both pressures looks like a step of it
+    or of the pump's leak, so that their results state the scale (`_pressure_scale`). A laminar leak has no prior on
+    its size, but pays for an improbable sensor offset. The `advantage` of a result comes from the priors on its
+    size and on the power, from the sensor offset, and from the oil that the accumulator lost or the fall of the
+    charge pressure.
 
     - `blocks`: blocks of the recording after removal of the sensor offset of p_A - p_B, for tests of laminar leaks.
     - `plain`: its blocks with the pressures as recorded, for all other tests.
@@ -86,20 +88,29 @@ def volume_observables(
     - `flow_scale`: true flow over the flow that the balance gives with the assumed sizes.
     - `with_orifice`: also test the coefficient of an orifice's flow; false with few blocks, in which this flow looks
       like a change of the motion's scale.
+    - `port_offset`: offset of p_A - p_B minus that of p_1 - p_2 [Pa], None if unknown.
     """
     # these steps need be dated only to a fraction 1 / `blocks.coarse` of the recording
     centred, recorded = (series.merge(max_blocks=INFERENCE.blocks.coarse) for series in (blocks, plain))
     # a laminar leak is tested without the sensor offset, so an improbable offset counts against the leak
-    leak_disadvantage = float(offset_cost(estimate_offset(blocks, columns)))
+    offset = estimate_offset(blocks, columns)
+    leak_disadvantage = offset_penalty(offset)
+    if port_offset is not None:
+        # of two far sensors of the cylinder, or of the ports, either explains the difference of the offsets
+        leak_disadvantage = max(
+            leak_disadvantage + _port_penalty(offset, port_offset) - _port_penalty(0.0, port_offset), 0.0
+        )
     law_prior_of = dict(zip(EXPONENTS, law_priors(), strict=True))
-    observables = []
+    observables = dict[str, Observable]()
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
-    for name, signs, coefficient, shape in _step_hypotheses(centred, recorded, terms, columns, bool(oil_loss)):
+    for name, signs, coefficient, shape, is_centred in _step_hypotheses(
+        centred, recorded, terms, columns, bool(oil_loss)
+    ):
         step = step_test(coefficient, signs, shape)
         if step is None:
             continue
         pressure_scale = _pressure_scale(coefficient, step) if name in (PUMP, *_LEAK_EXPONENTS) else None
-        if name in (LEAK, PUMP):
+        if is_centred:
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
@@ -113,12 +124,14 @@ def volume_observables(
             unit_flow = 1.0 if name == OUTSIDE else recorded.driving_pressure(columns[0].names, term)
             flow = step.fitted.value * unit_flow * flow_scale
             advantage += charge.loss_support(flow, float(step.onsets[step.best]))
-        observables.append(
-            Observable.from_test(
-                name, VOLUMES, step, n_tests=len(signs), advantage=advantage, pressure_scale=pressure_scale
-            )
+        observable = Observable.from_test(
+            name, VOLUMES, step, n_tests=len(signs), advantage=advantage, pressure_scale=pressure_scale
         )
-    return tuple(sorted(observables, key=lambda observable: -observable.score))
+        # a leak that is not laminar is tested with and without the sensor offset
+        observables[name] = max(
+            observables.get(name, observable), observable, key=lambda test: test.score + test.advantage
+        )
+    return tuple(sorted(observables.values(), key=lambda observable: -observable.score))
 
 
 def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]) -> tuple[Observable, ...]:
@@ -136,6 +149,12 @@ def delay_observables(tests: Sequence[DelayTest], changes: Sequence[DelayChange]
         observable = Observable.from_test(delay_name(name), DELAYS, test, n_tests=2.0, advantage=advantage)
         observables.append(replace(observable, size=change.value, onset=onset))
     return tuple(observables)
+
+
+def _port_penalty(offset: float, port_offset: Estimate) -> float:
+    """Compute how improbable the offset of p_1 - p_2 is for an `offset` of p_A - p_B [Pa] (`offset_penalty`)."""
+    usual: float = INFERENCE.zero.pressure
+    return offset_penalty((offset - port_offset.value) * usual / float(np.hypot(usual, port_offset.deviation)))
 
 
 def _pressure_scale(conductance: Information, step: StepTest) -> Estimate | None:
@@ -180,33 +199,35 @@ def _size_penalty(
 
 def _step_hypotheses(
     centred: Blocks, recorded: Blocks, terms: Sequence[Term], columns: Sequence[ColumnRoles], has_accumulator: bool
-) -> Iterator[tuple[str, Sequence[float], Information, Array | None]]:
+) -> Iterator[tuple[str, Sequence[float], Information, Array | None, bool]]:
     """Yield the steps to test: of each term's coefficient, of leaks that are not laminar, and of the motion's scale.
 
     `centred`, `recorded`: the blocks `blocks` and `plain` of `volume_observables`; `terms`: terms of the first
     equation; `has_accumulator`: true if the recording shows the volume of an accumulator. Yields for each step its
-    name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, and the change (K,) of the
-    coefficient by a unit step, None if it is 1 in every block.
+    name, the signs to test (1 up, -1 down), the likelihood of the coefficient in K blocks, the change (K,) of the
+    coefficient by a unit step, None if it is 1 in every block, and true if the blocks are `centred`.
     """
     first = columns[0]
     for term in terms:
         if _is_tested(term, first, has_accumulator):
             index = first.names.index(term.name)
-            blocks = centred if term.name in (LEAK, PUMP) else recorded
+            is_centred = term.name in (LEAK, PUMP)
+            blocks = centred if is_centred else recorded
             # a leak only grows, but a constant flow is positive for a loss from side A and negative for one from side B
             signs = (1.0,) if term.cause in _ONE_WAY and term.name != BIAS else (1.0, -1.0)
             name = term.name
             if name == BIAS:  # the cause of a constant flow: an external leak, or an offset of the flow's sensor
                 name = OUTSIDE if term.cause == "external leak" else FLOW_ZERO
-            yield name, signs, information(blocks, columns, index), None
-    # pressures as recorded: the removed offset was estimated for a laminar leak, and may be the effect of another law
-    leak = information(recorded, columns, first.leak)
-    for exponent, shape in apparent_conductances(recorded, columns).items():
-        if exponent < 1.0:  # 1 is the laminar leak, tested above
-            yield f"leak of exponent {exponent:g}", (1.0,), leak, shape
+            yield name, signs, information(blocks, columns, index), None, is_centred
+    # the removed offset was estimated for a laminar leak, and may be the effect of another law
+    for blocks in (recorded, centred):
+        leak = information(blocks, columns, first.leak)
+        for exponent, shape in apparent_conductances(blocks, columns).items():
+            if exponent < 1.0:  # 1 is the laminar leak, tested above
+                yield f"leak of exponent {exponent:g}", (1.0,), leak, shape, blocks is centred
     scale = first.names.index(ORIFICE)  # the column of the orifice, no longer needed, takes the motion's volume
     motion = information(_insert_fitted_motion(recorded, columns, scale), columns, scale)
-    yield SCALE, (1.0, -1.0), motion._replace(level=np.inf), None  # without the prior on the orifice's leak
+    yield SCALE, (1.0, -1.0), motion._replace(level=np.inf), None, False  # without the prior on the orifice's leak
 
 
 def _is_tested(term: Term, roles: ColumnRoles, has_accumulator: bool) -> bool:

@@ -125,6 +125,8 @@ LEAK, ORIFICE = "leak through a gap", "leak through an orifice"
 AIR = "free air"
 #: The pump's leakage, driven by the pressures at its ports.
 PUMP = "pump leak"
+#: The same driven by the pressure drop of the lines between the pump's ports and the chambers.
+LINES = "pump leak by the lines"
 #: The pump's leakage driven by p_A - p_B, if a valve cuts the pump off at rest: while the pump moves the piston, and
 #: while it turns only to hold the load.
 TURNING, HOLDING = "pump leak while it turns", "pump leak while it holds"
@@ -282,7 +284,7 @@ PUMP_TERM = conductance_term(PUMP, lambda s: s.port_difference * s.dt, "pump lea
 #: The pressure drop of the lines acts on the pump's leakage only. With this term the leak's coefficient remains the
 #: conductance of pump and piston together.
 LINES_TERM = conductance_term(
-    "pump leak by the lines",
+    LINES,
     lambda s: (s.port_difference - s.pressure_difference) * s.dt,
     "pump leak",
     needs=("p_1", "p_2", *PRESSURES),

@@ -41,8 +41,13 @@ from sealscope.diagnosis.inference.comparison.coefficients import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
-from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, find_rests
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LOCKED, Equation
+from sealscope.diagnosis.inference.equations.signals import (
+    MIN_ABSOLUTE_PRESSURE,
+    Signals,
+    find_rests,
+    interval_means,
+)
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, LOCKED, Equation
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import (
@@ -77,6 +82,8 @@ if TYPE_CHECKING:
 END_QUANTILE = 0.02
 #: Number of ratios of the two piston areas, and of shares of a side's motion, that are compared; the smallest share.
 N_RATIOS, N_SHARES, MIN_SHARE = 801, 51, 1e-3
+#: Smallest number that is divided by.
+TINY = float(np.finfo(float).tiny)
 #: Time over which the flow that does not move the piston is averaged [s].
 LOST_FLOW_TIME = 0.05
 
@@ -201,9 +208,26 @@ class RecordedBalance:
         charge = estimate_charge_trend(self.recording) if self.size.stated else None
         volume_tests = volume_observables(
             self.running_blocks, plain, self.equations, self.columns, self.oil_loss,
-            volume_ratio=self.volume_ratio, charge=charge, flow_scale=self.size.scale,
+            volume_ratio=self.volume_ratio, charge=charge, flow_scale=self.size.scale, port_offset=self._port_offset,
         )  # fmt: skip
         return volume_tests + delay_observables(self.delay_tests, self.delay_changes)
+
+    @cached_property
+    def _port_offset(self) -> Estimate | None:
+        """Sensor offset of p_A - p_B minus that of p_1 - p_2 [Pa], from the lines' pressure drop; None if unknown.
+
+        The drop is fitted by terms that are odd in the pump's flow q: sign(q), q and q abs(q). The standard deviation
+        is that of the residuals, since valves in the lines may drop pressure in one direction only.
+        """
+        if LINES not in self.columns[0].names:
+            return None
+        ports, chambers = (self.recording[a] - self.recording[b] for a, b in (("p_1", "p_2"), ("p_A", "p_B")))
+        flow, drop = self._pumped, interval_means(chambers - ports)
+        is_known = np.isfinite(flow) & np.isfinite(drop)
+        flow, drop = flow[is_known] / max(float(np.abs(flow[is_known]).max(initial=0.0)), TINY), drop[is_known]
+        design = np.column_stack([np.ones_like(flow), np.sign(flow), flow, flow * np.abs(flow)])
+        coefficients, *_ = np.linalg.lstsq(design, drop, rcond=None)
+        return Estimate(float(coefficients[0]), float(np.std(drop - design @ coefficients)))
 
     @property
     def volume_ratio(self) -> float:
