@@ -74,7 +74,8 @@ def plc_rows(generator: np.random.Generator) -> dict[str, list[str]]:
         "registers": [f"DT{registers + 2 * k}" for k in range(n)],
         "modes": ["INST"] * n,
         "types": list(generator.choice(["REAL", "FLT", "DINT"], n)),
-        "formats": ["%8.3f"] * n,
+        "formats": [str(generator.choice(["%8.3f", "0.000"]))] * n,
+        "empty": [""] * n,
         "units": [unit for _, unit, _, _ in CHANNELS.values()],
     }
 
@@ -84,8 +85,12 @@ def test_names_and_units_are_found_among_the_rows_of_a_plc(seed: int, tmp_path: 
     """Some rows lack, and those between names and units are in any order."""
     generator = np.random.default_rng(seed)
     samples, rows = draw(generator), plc_rows(generator)
-    between = [name for name in ("comments", "registers", "modes", "types", "formats") if generator.random() < 0.7]
+    between = [
+        name for name in ("comments", "registers", "modes", "types", "formats", "empty") if generator.random() < 0.7
+    ]
     order = [*(["numbers"] if generator.random() < 0.7 else []), "names", *generator.permutation(between), "units"]
+    if "types" in between and generator.random() < 0.3:  # types below the units
+        order = [*(name for name in order if name != "types"), "types"]
     first = ["Date", "Time"]
     lines = [",".join([*(first if k == 0 else ["", ""]), *rows[name]]) for k, name in enumerate(order)]
     stamps = [(np.datetime64("2026-03-01T10:00:00", "ms") + np.timedelta64(100 * k, "ms")).item() for k in range(N)]

@@ -118,8 +118,26 @@ def test_an_angle_that_does_not_wrap_stays(name: str, seed: int) -> None:
     recording = machine()
     values = SOUND[name](recording.t, np.random.default_rng([seed, list(SOUND).index(name)]))
     corrected = correct_samples(with_angle(recording, values, "rad"))
-    assert not {"angle_unwrapped", "angle_ambiguous"} & {finding.code for finding in corrected.findings}
+    assert not {"angle_unwrapped", "angle_ambiguous", "angle_reset"} & {finding.code for finding in corrected.findings}
     assert "theta" in corrected.recording
+
+
+@pytest.mark.parametrize("seed", few(range(6), 2, SLOW))
+def test_an_encoder_that_begins_again_from_zero_goes_on(seed: int) -> None:
+    """Its supply is lost some times; the angle is that of the shaft but for a step or two at each."""
+    generator = np.random.default_rng(seed)
+    truth = np.array(machine(f"{generator.uniform(2, 5):.2f} sin({generator.uniform(1, 4):.2f}t)")["theta"])
+    resets = np.sort(generator.choice(np.arange(100, truth.size - 100), generator.integers(1, 4), replace=False))
+    values = truth - truth[0]
+    for row in resets:
+        values[row:] -= values[row]
+    steps = np.abs(np.diff(truth))
+    if (np.abs(np.diff(values))[resets - 1] < 11 * np.quantile(steps, 0.9)).any():
+        pytest.skip("a reset near zero is no leap")
+    corrected = correct_samples(with_angle(machine(), values, "rad"))
+    finding = next(finding for finding in corrected.findings if finding.code == "angle_reset")
+    assert finding.count == resets.size
+    assert np.ptp(corrected.recording["theta"] - truth) <= 2.0 * resets.size * steps.max()
 
 
 @pytest.mark.parametrize(("every", "code"), [(1, "angle_unwrapped"), (20, "angle_unwrapped"), (100, "angle_ambiguous")])

@@ -28,6 +28,7 @@ class AnglePriors(PriorTable):
     slow: float  # largest step that shows that an angle wraps, whatever its period, over the period
     fast: float  # step, over the period, from which its direction must be told by another channel
     most: float  # quantile of the steps that stands for the largest
+    reset: float  # smallest ratio of a step back to the first value to the usual largest step
 
 
 class StalePriors(PriorTable):

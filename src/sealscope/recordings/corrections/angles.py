@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import COUNTS
-from sealscope.recordings.formats.wrapped_angle import unwrap_angle
+from sealscope.recordings.formats.wrapped_angle import continue_resets, unwrap_angle
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
 
@@ -28,7 +28,7 @@ def unwrap_angles(recording: Recording) -> tuple[Recording, list[Finding]]:
     }
     angle = unwrap_angle(recording["theta"], recording.units["theta"], recording.t, signals)
     if angle is None:
-        return recording, []
+        return _continue_resets(recording)
     period = recording.format_value("theta", angle.period, is_span=True)
     leaps, first = format_count(angle.n_leaps, "time"), float(recording.t[angle.first])
     if angle.values is None:
@@ -39,3 +39,13 @@ def unwrap_angles(recording: Recording) -> tuple[Recording, list[Finding]]:
     text = f"theta: begins anew after {period}, {leaps}: unwrapped"
     finding = Finding("angle_unwrapped", "note", "theta", angle.n_leaps, first, text)
     return replace(recording, channels={**recording.channels, "theta": angle.values}), [finding]
+
+
+def _continue_resets(recording: Recording) -> tuple[Recording, list[Finding]]:
+    """Let theta continue where the encoder begins again from its first value; also return a finding."""
+    values, resets = continue_resets(recording["theta"], recording.channels.get("x"))
+    if not resets.size:
+        return recording, []
+    text = f"theta: begins again from its first value, {format_count(resets.size, 'time')}: taken as continuing"
+    finding = Finding("angle_reset", "note", "theta", int(resets.size), float(recording.t[resets[0]]), text)
+    return replace(recording, channels={**recording.channels, "theta": values}), [finding]

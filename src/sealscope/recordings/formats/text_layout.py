@@ -8,7 +8,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import accumulate, chain, compress, pairwise, product, repeat
+from itertools import accumulate, chain, compress, islice, pairwise, product, repeat
 
 from sealscope.errors import InputError
 from sealscope.paragraphs import format_count
@@ -188,7 +188,10 @@ def _parse_heading(
         # rows may end in a separator, or leave out the last columns; above a single column, more cells are a title's
         fits_width = abs(len(cells) - width) <= 1 or (len(cells) >= width > 1)
         names = [cell for cell in cells if cell]
-        return cells if fits_width and names and not all(is_value(name, decimal) for name in names) else None
+        is_text = not all(is_value(name, decimal) for name in names)
+        # an empty row between others, or formats of numbers such as 0.000
+        is_ruler = len(cells) > 1 and (not names or len({*names}) == 1 < len(names))
+        return cells if fits_width and ((names and is_text) or is_ruler) else None
 
     # from the lowest line up
     lines_above = [line.strip("\r\n ") for line in lines[first_row - 1 :: -1] if line.strip()] if first_row else []
@@ -238,7 +241,7 @@ def _parse_stacked_rows(rows: Sequence[Sequence[str]]) -> tuple[list[Label], int
     Rulers such as `----` may stand below the names, units below or above them, and names of groups of columns on top;
     the name of a group is put before the names of its columns. Returns (labels of the columns, number of rows).
     """
-    n_rulers = next((i for i, row in enumerate(rows[:-1]) if not _is_ruler(row)), len(rows) - 1)
+    n_rulers = next((i for i, row in enumerate(rows[:-1]) if not (_is_ruler(row) or _is_type_row(row))), len(rows) - 1)
     row, *rows_above = rows[n_rulers:]
     names = list(row)
     n_rows = n_rulers + 1
@@ -304,9 +307,9 @@ def _fill_names(names: Sequence[str], rows_above: Sequence[Sequence[str]]) -> li
 def _prefix_groups(names: Sequence[str], row: Sequence[str]) -> list[str] | None:
     """Put the names of groups of columns, in the row above their names, before these; None if the row has no groups.
 
-    A group is named above its first column only, or above each of its columns. The row has groups if one of its cells
-    is a quantity, and no column is called as a channel; or if it tells columns of the same name apart; or if it names
-    several groups, or one beside columns without any, each above each of its columns.
+    A group is named above its first column only, or above each of its columns. The row has groups if it tells columns
+    of the same name apart. It also has groups if no column is called as a channel, and either one of its cells is a
+    quantity, or groups are named above each of their columns, but not above the first one, the time.
     """
     cells = [cell.strip() for cell in row]
     filled = [cell for cell in cells if cell]
@@ -318,11 +321,10 @@ def _prefix_groups(names: Sequence[str], row: Sequence[str]) -> list[str] | None
         groups = [*cells, *[""] * (len(names) - len(cells))]
     pairs = [(group, name) for group, name in zip(groups, names, strict=False) if name]
     n_pairs, n_names = len({*pairs}), len({name for _, name in pairs})
-    has_quantity = any(map(is_quantity, cells)) and not any(
-        Label.parse(text).name.casefold() in channel_names for text in names
-    )
+    has_channels = any(Label.parse(text).name.casefold() in channel_names for text in names)
+    has_quantity = any(map(is_quantity, cells)) and not has_channels
     tells_apart = n_pairs == len(pairs) > n_names
-    is_above_each = bool(repeated) and (len({*filled}) > 1 or len(filled) < len(pairs))
+    is_above_each = bool(repeated) and not has_channels and cells[0] in ("", names[0])  # the time is in no group
     if not filled or not (has_quantity or tells_apart or is_above_each):
         return None
     return [
@@ -439,14 +441,23 @@ def _find_first_row(lines: Sequence[str], body: Sequence[str], delimiter: str, d
         not flags[0] and not is_missing(row[0]) for row, flags in zip(rows, is_value_cell, strict=True)
     )
     min_cells = max(1, min(width, (numeric_columns or [0])[-1] + 1))  # up to the last numeric column
-    for index, line in enumerate(lines):
-        cells = split_cells(line, delimiter) if _is_content(line) else []
+
+    def is_sample(cells: Sequence[str]) -> bool:
+        """Test whether the cells of a line are those of samples."""
         if len(cells) < min_cells or not (may_begin_with_word or is_value(cells[0], decimal) or is_missing(cells[0])):
-            continue  # such as a row `SampleRate,500,500` above the samples
+            return False  # such as a row `SampleRate,500,500` above the samples
         n_values = sum(i < len(cells) and is_value(cells[i], decimal) for i in numeric_columns)
         n_missing = sum(i < len(cells) and is_missing(cells[i]) for i in numeric_columns)
-        if n_values and 2 * (n_values + n_missing) > len(numeric_columns):
-            return index
+        return bool(n_values) and 2 * (n_values + n_missing) > len(numeric_columns)
+
+    for index, line in enumerate(lines):
+        cells = split_cells(line, delimiter) if _is_content(line) else []
+        if is_sample(cells):
+            texts = [cell for cell in cells if cell.strip()]
+            next_line = next(filter(_is_content, islice(lines, index + 1, None)), None)
+            is_format = len({*texts}) == 1 < len(texts) and next_line is not None
+            if not is_format or is_sample(split_cells(next_line or "", delimiter)):
+                return index  # not a row of formats, such as 0.000, above that of units
     return None
 
 

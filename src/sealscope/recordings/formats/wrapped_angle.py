@@ -29,6 +29,7 @@ _COUNTS = np.unique(
     [2.0**bits for bits in range(6, 33)]
     + [lines * 10.0**power for lines in (1.0, 2.0, 2.5, 3.6, 4.0, 5.0, 7.2, 8.0) for power in range(2, 7)]
 )
+_MAX_RESETS = 100  # most resets of an encoder in a recording
 _MAX_PERIODS = 20.0  # most periods from sample to sample that are looked for
 _MAX_STEPS = 4_000  # most steps to which the gain of a signal is fitted, or up to twice as many
 
@@ -76,6 +77,35 @@ def unwrap_angle(values: Array, unit: str, t: Array, signals: Mapping[str, Array
     result[rows[1:]] += period.value * np.cumsum(turns)
     first = int(rows[np.flatnonzero(turns)[0] + 1])
     return Unwrapped(None if is_fast else result, period.value, int(np.count_nonzero(turns)), first)
+
+
+def continue_resets(values: Array, position: Array | None) -> tuple[Array, NDArray[np.intp]]:
+    """Let an angle (n,) continue where its encoder begins again from its first value, as after a loss of its supply.
+
+    All steps over `angle.reset` times the usual largest step (`priors.toml`) must be such resets. The angle then goes
+    on by as much as the `position` (n,) tells, if there is one. Also return the rows of these; empty, and the same
+    values, without any.
+    """
+    rows = np.flatnonzero(np.isfinite(values) if position is None else np.isfinite(values) & np.isfinite(position))
+    known = values[rows]
+    steps = np.diff(known)
+    if rows.size < _MIN_SAMPLES:
+        return values, rows[:0]
+    usual = float(np.quantile(np.abs(steps), 1.0 - _PRIORS.spoilt))
+    leaps = np.flatnonzero(np.abs(steps) > _PRIORS.reset * usual)
+    is_reset = np.abs(known[leaps + 1] - known[0]) <= 2.0 * usual
+    if not (usual > 0.0 and leaps.size and is_reset.all()) or leaps.size > _MAX_RESETS:
+        return values, rows[:0]
+    shifts = np.zeros(known.size)
+    shifts[leaps + 1] = -steps[leaps]
+    if position is not None:
+        strokes = np.diff(position[rows])
+        turning = np.delete(steps, leaps)
+        moves = np.delete(strokes, leaps)
+        energy = float(moves @ moves)
+        shifts[leaps + 1] += strokes[leaps] * (float(turning @ moves) / energy if energy > 0.0 else 0.0)
+    place = np.clip(np.searchsorted(rows, np.arange(values.size), side="right") - 1, 0, None)
+    return values + np.cumsum(shifts)[place], rows[leaps + 1]
 
 
 def _find_period(values: Array, steps: Array, leaps: NDArray[np.intp], unit: str) -> _Period | None:
