@@ -26,7 +26,7 @@ _VALVE = "Sides with a load-holding valve: A, B, 'A,B' or none. [default: not kn
 _CAPPED = "Sides whose port is capped at the cylinder: A, B, 'A,B' or none."
 
 
-@opt.with_machine_options("maps", "rate")
+@opt.with_machine_options("maps", "group", "rate")
 def hold(
     stated: opt.StatedMachine,  # built from the options that the decorator adds
     files: Annotated[list[Path] | None, Argument(metavar="FILE...", help=_FILES)] = None,
