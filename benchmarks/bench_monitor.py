@@ -34,6 +34,7 @@ from sqlalchemy import func, select
 
 import sealscope as ss
 from sealscope.monitor.actuators import WatchedActuators
+from sealscope.monitor.database import tables
 from sealscope.monitor.database.store import MonitorStore
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import ActuatorSettings, MonitorSettings
@@ -150,7 +151,7 @@ def by_mqtt(payloads: list[bytes], leaking: list[bytes], count: int) -> tuple[fl
             each.wait_for_publish(60.0)
         service = Service(settings, stdout=io.StringIO())
         thread = threading.Thread(target=service.run)
-        stored = select(func.count()).select_from(service.store.tables.blocks)
+        stored = select(func.count()).select_from(tables.blocks)
         thread.start()
         while not (before := service.store._value(stored)):
             time.sleep(0.01)
@@ -202,16 +203,16 @@ def learn(settings: MonitorSettings, payloads: list[bytes], learned: int, phases
     watched = WatchedActuators(teachers, store)
     for k, teacher in enumerate(teachers):
         for payload in payloads[k:learned]:
-            watched.store_blocks([decode_message(payload, teacher.name)])
+            watched.process_blocks([decode_message(payload, teacher.name)])
     with store.writing() as connection:
-        for table in (store.tables.actuators, store.tables.pending):
+        for table in (tables.actuators, tables.pending):
             rows = [dict(row._mapping) for row in connection.execute(select(table))]
             connection.execute(table.delete())
             for n, actuator in enumerate(settings.actuator):
                 of = [row for row in rows if row["actuator"] == teachers[n % phases].name]
                 if of:
                     connection.execute(table.insert(), [{**row, "actuator": actuator.name} for row in of])
-        for table in (store.tables.blocks, store.tables.estimates):
+        for table in (tables.blocks, tables.estimates):
             connection.execute(table.delete())
     store.engine.dispose()
 
