@@ -206,7 +206,7 @@ MISCHIEF = {
     "generator exit": ("raise GeneratorExit", "must raise an Exception, got GeneratorExit"),
     "sleep": ("import time; time.sleep(3600)", "must end within"),
     "loop": ("while True: pass", "must end within"),
-    "loop that catches": ("exec(\"while True:\\n try: pass\\n except Exception: pass\")", "must end within"),
+    "loop that catches": ('exec("while True:\\n try: pass\\n except Exception: pass")', "must end within"),
     "wait": ("import threading; threading.Event().wait()", "must end within"),
     "long text": ("raise ValueError('x' * 10**6)", "ValueError: xxx"),
     "no text": ("raise type('E', (Exception,), {'__str__': lambda self: 1 / 0})()", "has no text"),

@@ -264,3 +264,63 @@ def test_a_boom_without_a_pump_is_watched_by_its_recordings(commissioned, tmp_pa
         settings_of(tmp_path, commissioned, f"rate = 100.0\nnodes = {{ {nodes} }}\n{opcua}", recording_s=0.0)
     block = decode_message(b'{"t": 0.0, "rate": 10.0, "p_A": [1, 2], "p_B": [1, 2], "q_pump": [0, 0]}', "press")
     assert block.samples is not None and "q_pump" in block.samples
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_and_metrics_state_one_leak(seed: int, commissioned, tmp_path):
+    """A leak from the first sample on that grows: the open alarm has the leak of the summary after each message.
+
+    The last event states it, too, within the 95 % intervals.
+    """
+    random = np.random.default_rng(seed)
+    conductance, growth, start = (
+        10.0 ** random.uniform(-11.8, -11.0),
+        random.uniform(4.0, 6.0),
+        random.uniform(100, 160),
+    )
+
+    def leak(t: np.ndarray) -> np.ndarray:
+        return conductance * (1.0 + growth * (t > start))
+
+    samples = moved(machine(20 + seed, rate=100.0, duration=240.0, G=leak).only(CHANNELS), APRIL)
+    service = Service(settings_of(tmp_path, commissioned), once=True)
+    n_alarms, n_updates, announced = 0, 0, None
+    for line in lines_in([samples]).splitlines():
+        service.actuators.process_blocks([decode_message(line)])
+        summary = service.summaries()["press"]
+        events = service.store.last_events("press")
+        n_updates = sum(event["event"] == "updated" for event in events)
+        for alarm in service.store.alarms(open_only=True):
+            n_alarms += 1
+            if summary["leak_lpm"] is not None and alarm["updated_s"] == summary["t"]:
+                assert alarm["leak_lpm"] == pytest.approx(summary["leak_lpm"])
+            announced = events[0]["alarm"]
+            low, high = announced["leak_interval_lpm"]
+            assert low <= alarm["leak_lpm"] <= high
+            assert alarm["leak_interval_lpm"][0] <= announced["leak_lpm"] <= alarm["leak_interval_lpm"][1]
+    assert n_alarms > 50
+    assert n_updates <= 0.2 * n_alarms
+    service.close()
+
+
+def test_a_leak_that_leaves_its_stated_interval_is_stated_anew():
+    """For any course of leaks and intervals, what was announced and what is known lie within each other's interval."""
+    random = np.random.default_rng(5)
+    for _ in range(50):
+        judge, kinds = AlarmJudge("press"), []
+        judge.update_from_verdict(verdict("leak", chance=None), None, 1, WatchSettings())
+        event = "raised"
+        for _ in range(30):
+            leak = float(10.0 ** random.uniform(-2.0, 0.0))
+            interval = (leak * random.uniform(0.3, 1.0), leak * random.uniform(1.0, 3.0))
+            alarm, event = judge.restate_leak(judge.alarm, event, leak, interval)
+            kinds.append(event)
+            assert (alarm.leak_lpm, alarm.leak_interval_lpm) == (leak, interval) == (judge.alarm.leak_lpm, interval)
+            low, high = judge.announced_interval_lpm
+            assert low <= leak <= high
+            assert interval[0] <= judge.announced_lpm <= interval[1]
+            event = ""
+        assert {"raised", "updated", ""} >= {*kinds} and "updated" in kinds
+        alarm, event = judge.restate_leak(judge.alarm, "", None, None)  # no other leak is known
+        assert (alarm.leak_lpm, event) == (leak, "")

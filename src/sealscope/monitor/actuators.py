@@ -65,6 +65,8 @@ _VERDICT_TEXTS = ("file", "verdict", "summary", "size", "odds", "reason")
 _BASELINE_VALUES = ("version", "hours", "lpm")
 #: Last results of an actuator that a checkpoint stores: type of each by attribute, which may also be None.
 _RESULT_TYPES = {"last": BlockEstimate, "oil_celsius": float, "judged_s": float, "verdict": RecordingVerdict}
+#: Status of an actuator before its first block.
+_WAITS = "waits for samples"
 #: Length of the last samples that are kept during an alarm [s].
 _ALARM_SAMPLES_S = 120.0
 #: A change of an alarm: the changed alarm, name of the event, such as "raised" or "returned" (the leak has ended), and
@@ -128,8 +130,20 @@ class _Actuator:
         elif self.verdict is not None and len(samples):
             age_s = float(samples.t[-1]) - self.verdict.end_s
             self.verdict = None if age_s > settings.not_comparable_s else self.verdict
+        if events:  # the last one has the present alarm: it states the leak that the summary states
+            alarm, event, t = events[-1]
+            result = self._result
+            restated = self.judge.restate_leak(alarm, event, result.leak_lpm, result.leak_interval_lpm)
+            events[-1] = (*restated, t)
         self._update_alarm_samples(samples, follows=follows)
         return estimates, events
+
+    @property
+    def _result(self) -> RecordingVerdict | BlockEstimate:
+        """The result whose flows are stated: the verdict on the last recording, if it decides, else the last block."""
+        if self.verdict is not None and self.verdict.decides:
+            return self.verdict
+        return self.last or BlockEstimate(0, math.nan, _WAITS)
 
     def _apply_verdict(self, verdict: RecordingVerdict | None, settings: WatchSettings) -> list[_AlarmEvent]:
         """Keep the verdict on a recording and, if it decides, update the alarm; return the changes of the alarm.
@@ -219,22 +233,19 @@ class _Actuator:
         - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
           found; `recording`: texts of the last verdict; `alarm`: id of the open alarm; `status_word`: 0 without one.
         """
-        baseline, alarm, verdict = self.watch.baseline, self.judge.alarm, self.verdict
-        last = self.last or BlockEstimate(0, math.nan, "waits for samples")
-        deciding_verdict = verdict if verdict is not None and verdict.decides else None
-        result = deciding_verdict or last
-        t = None if self.last is None else last.t
+        baseline, alarm, verdict, result = self.watch.baseline, self.judge.alarm, self.verdict, self._result
+        t = None if self.last is None else self.last.t
         return {
             "blocks": self.watch.blocks,
             "t": t if verdict is None else max(verdict.end_s, t or -math.inf),
-            "status": last.status if verdict is None else verdict.summary,
+            "status": (_WAITS if self.last is None else self.last.status) if verdict is None else verdict.summary,
             "state": self._machine_state().as_dict(),
             "by": self.watch.method,
             "total_lpm": result.total_lpm,
             "total_interval_lpm": result.total_interval_lpm,
             "leak_lpm": result.leak_lpm,
             "leak_interval_lpm": result.leak_interval_lpm,
-            "bound_lpm": None if deciding_verdict is None else deciding_verdict.bound_lpm,
+            "bound_lpm": result.bound_lpm if isinstance(result, RecordingVerdict) else None,
             "recording": None if verdict is None else {name: getattr(verdict, name) for name in _VERDICT_TEXTS},
             "why_no_litres": self.watch.why_no_litres if verdict is None else "",
             "oil_celsius": self.oil_celsius,

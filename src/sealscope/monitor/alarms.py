@@ -121,6 +121,8 @@ class AlarmJudge:
     over_s: float | None = None  # time at which the last alarm ended, or was last changed after its end [s]
     evidence: float = 0.0  # of a leak, from the recordings of a stream (`add_evidence`)
     cause: str = ""  # of the leak that the detector has found, "" without one
+    announced_lpm: float | None = None  # leak of the open alarm at its last event, None if unknown
+    announced_interval_lpm: Interval | None = None
 
     def update(
         self,
@@ -193,6 +195,28 @@ class AlarmJudge:
                 action = state_of(_CONDITIONS[updated.level], leak.cause).action
                 updated = replace(updated, cause=leak.cause, evidence=leak.reason, next_check=action)
         return self._set_alarm(updated), event
+
+    def restate_leak(
+        self, alarm: Alarm, event: str, leak_lpm: float | None, interval_lpm: Interval | None
+    ) -> tuple[Alarm, str]:
+        """State another leak [L/min] for a changed alarm, None for the same; return the alarm and its event.
+
+        The `event` of the change is "updated" instead of "" if the leak lies outside the 95 % interval of the last
+        event, or the leak of that event outside the present interval: all outputs then state the same leak, within its
+        interval.
+        """
+        if not alarm.active:
+            return alarm, event
+        if leak_lpm is None:
+            leak_lpm, interval_lpm = alarm.leak_lpm, alarm.leak_interval_lpm
+        alarm = self._set_alarm(replace(alarm, leak_lpm=leak_lpm, leak_interval_lpm=interval_lpm))
+        if not event and leak_lpm is not None:
+            is_unknown = self.announced_lpm is None
+            is_outside = _lies_outside(leak_lpm, self.announced_interval_lpm)
+            event = "updated" if is_unknown or is_outside or _lies_outside(self.announced_lpm, interval_lpm) else ""
+        if event:
+            self.announced_lpm, self.announced_interval_lpm = leak_lpm, interval_lpm
+        return alarm, event
 
     def _raise_alarm(self, **findings: Any) -> Alarm:
         """Raise a new alarm, or raise the open alarm, whose leak has ended, again; return the raised alarm.
@@ -322,6 +346,11 @@ class AlarmJudge:
         if mark in ("invalid", "repaired"):
             self.evidence = 0.0
         return self._set_alarm(replace(alarm, updated_s=t, **changes[mark]))
+
+
+def _lies_outside(leak_lpm: float | None, interval_lpm: Interval | None) -> bool:
+    """Return True if a leak lies outside an interval; False if one of them is unknown."""
+    return leak_lpm is not None and interval_lpm is not None and not interval_lpm[0] <= leak_lpm <= interval_lpm[1]
 
 
 def latest_alarms(alarms: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:

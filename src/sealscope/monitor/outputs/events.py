@@ -20,7 +20,7 @@ from sealscope.monitor.supervisor import PartAway
 
 logging.getLogger("httpx").setLevel(logging.WARNING)  # it logs every request
 #: Events that the detector causes; they are not announced while an alarm is shelved.
-_DETECTOR_EVENTS = ("raised", "error", "warning", "returned")
+_DETECTOR_EVENTS = ("raised", "error", "warning", "updated", "returned")
 
 
 def _deliver(store: MonitorStore, output: str, send: Callable[[dict[str, Any]], None]) -> None:
