@@ -417,12 +417,13 @@ class MonitorStore:
         """Read up to 1000 events with a running number above `number`, as pairs (number, event) in order."""
         columns = tables.events.c
         query = select(tables.events).where(columns.number > number).order_by(columns.number).limit(1000)
-        return self._parse_events(self._rows(query))
+        return self._parse_events(self._rows(query), (*_ALARM_KEYS, "shelved"))
 
-    def _parse_events(self, rows: Iterable[sa.Row[Any]]) -> list[tuple[int, dict[str, Any]]]:
-        """Convert rows of `events` to pairs (number, event); leave out damaged ones."""
+    def _parse_events(self, rows: Iterable[sa.Row[Any]], keys: Iterable[str] = ()) -> list[tuple[int, dict[str, Any]]]:
+        """Convert rows of `events` to pairs (number, event); leave out damaged ones, or without `keys` of the alarm."""
         parsed = (
-            (row.number, self._parse_row(tables.events, row.number, partial(_event_from_row, row))) for row in rows
+            (row.number, self._parse_row(tables.events, row.number, partial(_event_from_row, row, keys)))
+            for row in rows
         )
         return [(number, event) for number, event in parsed if event is not None]
 
@@ -555,11 +556,11 @@ def _unpack_samples(number: int, data: bytes) -> StoredSamples:
     return StoredSamples(number, samples, header["follows"], stored_verdict)
 
 
-def _event_from_row(row: Any) -> dict[str, Any]:
-    """Convert a row of `events` to the plain values that outputs send: the event, and the alarm after this event."""
+def _event_from_row(row: Any, keys: Iterable[str]) -> dict[str, Any]:
+    """Convert a row of `events` to plain values: the event, and the alarm after it, which must have the `keys`."""
     # `row.t` would be a method of SQLAlchemy's rows
     values = {"number": row.number, "event": row.kind, "t": row._mapping["t"], "by": row.by_whom, "text": row.text}
-    return {**values, "alarm": _parse_table(row.alarm, _ALARM_KEYS)}
+    return {**values, "alarm": _parse_table(row.alarm, keys)}
 
 
 def _prepare_sqlite(connection: Any, record: object) -> None:
