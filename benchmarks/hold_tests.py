@@ -160,7 +160,7 @@ def run_test(seed, first):
     random = np.random.default_rng([first, seed])
     plant, logger = draw_plant(random), draw_logger(random)
     while plant["stop"] and simulate(plant, logger["seconds"])[2][-1] < 0.3 * plant["p"]:
-        plant["creep"] *= 0.3  # else the chamber is empty before the hold ends
+        plant["creep"], plant["swing"] = 0.3 * plant["creep"], 0.5 * plant["swing"]  # else the chamber empties
     recording, flow, speed = record(random, plant, logger)
     area = plant[plant["loaded"]]
     limit = (flow if flow > 0.0 else log_uniform(random, 0.05, 2.0) * MM_MIN * area) * log_uniform(random, 0.25, 4.0)

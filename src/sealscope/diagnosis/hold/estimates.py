@@ -167,12 +167,13 @@ class HeldLoad:
         return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel, HOLD.cooling.misfit)]
 
     def _misfit(self, t: Array, travel: Array, share: float) -> list[Column]:
-        """Build the bends, a `share` of it, that a correction by `travel` [mm] leaves at times `t` [s]."""
+        """Build the slope and bends, a `share` of it, that a correction by `travel` [mm] leaves at times `t` [s]."""
         size = share * float(np.ptp(travel))
         if size == 0.0:
             return []
         z = 2.0 * t / self.duration - 1.0
-        return [Column(1.5 * z**2 - 0.5, 0.0, size), Column(2.5 * z**3 - 1.5 * z, 0.0, size)]
+        courses = z, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # slope and bends (Legendre polynomials)
+        return [Column(course, 0.0, size) for course in courses]
 
     def _cooling(self, t: Array) -> list[Alternative]:
         """List the alternatives for the travel [mm] due to oil that nobody logs, at times `t`."""
