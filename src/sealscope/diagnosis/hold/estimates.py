@@ -128,7 +128,9 @@ class HeldLoad:
     def column(self) -> tuple[float, float]:
         """Length of the loaded side's oil column [mm], and the standard deviation of its logarithm."""
         x = self._channel("x")
-        length, deviation = self.set_up.column(self.loaded, None if x is None else float(np.mean(x)))
+        # without a pressure the side is a guess, and the position tells nothing of its column
+        is_known = x is not None and self.mean_pressure is not None
+        length, deviation = self.set_up.column(self.loaded, float(np.mean(x)) if is_known and x is not None else None)
         return _MM * length, deviation
 
     def _pressure(self, side: str) -> Array | None:
