@@ -23,6 +23,8 @@ from urllib.parse import urlencode
 
 import numpy as np
 
+from sealscope.app.tables import cache_folder
+
 SERVING = """
 import sys
 from sealscope.app.server import AppServer
@@ -94,6 +96,7 @@ def measure(folder: Path, files: int, rows: int) -> None:
             write_rows(logs / f"day_{k:03d}.csv", 240_000, list(CHANNELS), k)
     size = (logs / "day_000.csv").stat().st_size / 1e6
     shutil.rmtree(folder / "session", ignore_errors=True)
+    shutil.rmtree(cache_folder(), ignore_errors=True)
     client = Client(folder / "session")
     start = time.perf_counter()
     client.tell("open", path=str(logs))

@@ -356,9 +356,10 @@ class Workbench:
             return session.with_machine(machine, name)
 
         session = self.folder.update(apply)
-        with self._lock:
-            self._machines.pop(name, None)
-            self._results = {place: result for place, result in self._results.items() if place[0] != name}
+        if set(changed) - {"hold", "repairs"}:  # the others change what is read and how it is judged
+            with self._lock:
+                self._machines.pop(name, None)
+                self._results = {place: result for place, result in self._results.items() if place[0] != name}
         self.note_change()
         return session.find_machine(changed.get("name") or name)
 

@@ -26,6 +26,7 @@ export async function update() {
   const answer = verdicts.has(key) ? await ask("verdict", { machine: machine.name, file: key }).catch((error) => say(error.message)) : { verdict: null };
   if (!answer || key !== app.file) return;
   result = answer.verdict;
+  if (result) renewed = "";
   limit = (await ask("limit", { text: machine.limit || "", machine: machine.name }).catch(() => ({ lpm: null }))).lpm;
   showDates(machine, verdicts, rows);
   showHead(machine, verdicts.get(key), key);
@@ -56,7 +57,6 @@ function showHead(machine, kept, key) {
   const row = app.rows.get(key);
   const judge = make("button", { type: "button", text: kept ? "Judge again" : "Judge this log", onclick: () => attempt(() => tell("judge", { machine: machine.name, files: [key] })) });
   if (kept && !result && renewed !== `${machine.name}|${key}`) {
-    // of an earlier day: its figures are judged again
     renewed = `${machine.name}|${key}`;
     tell("judge", { machine: machine.name, files: [key] }).catch((error) => say(error.message));
   }
