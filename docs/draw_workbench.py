@@ -113,6 +113,9 @@ def show(view: Page, screen: str) -> None:
         view.select_option("#verdict-file", value=option)
         until(view, "document.getElementById('verdict-head').textContent.includes('Confirm')")
         until(view, "document.querySelectorAll('#evidence-charts canvas').length >= 5")
+    if screen == "trend" and not view.locator("#trend-charts .dot").count():
+        view.click("#trend-form button")
+        until(view, "document.querySelectorAll('#trend-charts .dot').length >= 7")
     if screen == "hold":
         view.select_option("#hold-file", label="hold 2026-06-01.csv")
         view.click("#hold-form button[type=submit]")

@@ -65,7 +65,7 @@ _LIST_S = 2.0
 #: Time for which a request waits for the first rows of a table [s].
 _WAIT_S = 2.0
 #: Shortest time over which the flows of the balance are averaged [s].
-_FLOW_S = 0.05
+_FLOW_S = 0.2
 #: Most pauses of the reading of all logs for the one that somebody looks at, and their length [s].
 _MAX_PAUSES, _PAUSE_S = 200, 0.05
 #: A decimal comma, as in `5,2 mL/min`.

@@ -1,7 +1,7 @@
 // The screen of the verdicts: by date, and for one recording the signals, the evidence and the balance of its flows.
 import { app, ask, attempt, dateOf, ensureMachine, fillSelect, go, machineNow, make, rowsRead, say, tell } from "./main.mjs";
 import { Linked, Trace, dotPlot } from "./charts.mjs";
-const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--ink", piston: "--total", creep: "--ink", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
+const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--steel", piston: "--total", creep: "--steel", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
 let link = new Linked();
 let result = null, limit = null, renewed = "", pages = new Map();
 let drawnFor = "";
@@ -118,7 +118,7 @@ async function draw(machine, key) {
   const columnOf = (name) => head.names.findIndex((text) => text.startsWith(`${name} [`));
   const unitOf = (name) => /\[(.*)\]$/.exec(head.names[columnOf(name)] || "")?.[1] || "";
   const add = (title, names, table, unit, columns, options = {}) => {
-    const lines = names.map((name, k) => ({ name, colour: TONES[name] || "--d3", column: k, width: ["leakage", "pump"].includes(name) ? 2 : 1.2, dash: name === "piston" ? [7, 4] : undefined }));
+    const lines = names.map((name, k) => ({ name, colour: TONES[name] || "--d3", column: k, width: { leakage: 2, pump: 5, creep: 5 }[name] || 1.3 }));
     if (!overlay) return new Trace(place, link, { title, unit, lines, marks, shades: blocks, fetch: window(table, columns), ...options });
     const other = app.rows.get(overlay).name;
     const both = [...lines, ...lines.map((line) => ({ ...line, name: `${line.name} of ${other}`, dash: [4, 4], column: line.column + lines.length }))];
