@@ -82,7 +82,7 @@ MAX_BLOCK_TIME: float = _BLOCKS.longest
 MIN_BLOCK_TIME: float = _BLOCKS.shortest
 #: Sensor offset of p_A - p_B [standard deviations of its prior] from which the terms are computed again without it,
 #: since the root of p_A - p_B and the side that carries the load do not depend on the offset linearly.
-NEGLIGIBLE_OFFSET = 3.0
+NEGLIGIBLE_OFFSET = 1.0
 #: Channels that balances read.
 READ = ("u", "theta", "omega", *METERS, "x", "p_1", "p_2", "p_A", "p_B")
 #: Name of a signal that is 1 in holes (long gaps of missing samples that were filled in), else 0; absent without holes.
@@ -941,10 +941,9 @@ def _build_regime(
     blocks, offset, negligible = fit.blocks, float(fit.blocks.zero[0]), NEGLIGIBLE_OFFSET * INFERENCE.zero.pressure
     if abs(offset) >= negligible:
         blocks = remove_pressure_offset(compute_blocks(offset), columns)
-        small = fit_pressure_offset(plain, columns, max_offset=negligible)
-        mismatch, small_mismatch = (
-            area_mismatch(series, columns, balances[0], ratio_deviation) for series in (blocks, small.blocks)
+        mismatch, plain_mismatch = (
+            area_mismatch(series, columns, balances[0], ratio_deviation) for series in (blocks, plain)
         )
-        if fit.log_posterior - 0.5 * mismatch < small.log_posterior - 0.5 * small_mismatch:
-            blocks = small.blocks
+        if fit.log_posterior < 0.5 * (mismatch - plain_mismatch):
+            blocks = fit_pressure_offset(plain, columns, max_offset=negligible).blocks
     return RegimeBlocks(blocks.merge(), plain.merge(), balances, columns)
