@@ -32,7 +32,7 @@ from sealscope.diagnosis.inference.equations.balances import (
     with_delays,
     with_rests,
 )
-from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, flag_circulation
+from sealscope.diagnosis.inference.equations.feed import FeedSums, HoldCounts, feed_one_chamber, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import (
     AVERAGING_TIME,
     HALF_DIFFERENCE,
@@ -622,16 +622,20 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
 
     A valve then lowers a load past the pump, or connects the chambers of an actuator that is moved from outside. A leak
     is slower: it passes little of the pump's flow, and less at a smaller load. The piston must therefore be faster than
-    the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, reduced in the ratio of abs(p_A - p_B) to
-    its median while the pump turns, on average over `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The
-    flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end. `pump_volume` (n,): increments of
-    the pump's volume [m^3], NaN where missing. `limits`: by default those of the same samples.
+    the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, on average over `MIN_REST`. The fraction is
+    reduced by the root, as the flow of an orifice, of abs(p_A - p_B) over its median while the pump turns; abs(p_A -
+    p_B) is the largest of the last `MIN_REST`.
+    Pauses shorter than `rest.lasting` count as motion. The flags reach `AVERAGING_TIME`, over which speeds are
+    averaged, beyond either end. `pump_volume` (n,): increments of the pump's volume [m^3], NaN where missing. `limits`:
+    by default those of the same samples.
     """
     limits = limits or find_lowering_limits(pump_volume, signals)
     rate, x_step, load = signals.rate, signals.step("x"), np.abs(signals.pressure_difference)
     rests = find_rests(pump_volume, rate, limits.pump)
     usual_load = max(limits.load, np.finfo(float).tiny)
     relative_load = np.where(np.isfinite(load), np.minimum(load, usual_load) / usual_load, 1.0)
+    # a leak may equalise the pressures: the piston that it moves is as fast as the load was just before
+    relative_load = np.sqrt(largest_before(relative_load, max(1, round(MIN_REST * rate))))
     limit = np.maximum(limits.creep * relative_load, limits.noise)
     excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
     margin = math.ceil(AVERAGING_TIME * rate)
@@ -649,6 +653,13 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
         if length < INFERENCE.rest.lasting * rate and not is_turning[first : first + length].any():
             is_lowering[first : first + length] = True
     return extend_both_ways(is_lowering)
+
+
+def largest_before(values: Array, length: int) -> Array:
+    """Find the largest of each value (n,) and the `length` - 1 values before it."""
+    from scipy.ndimage import maximum_filter1d
+
+    return np.asarray(maximum_filter1d(values, length, mode="nearest", origin=(length - 1) // 2))
 
 
 def absolute_offset(pressure: Array) -> float:
@@ -766,12 +777,14 @@ class RecordedBlocks(NamedTuple):
     `open`: the pump stays connected to the cylinder; `shut`: valves cut it off, None if the machine never rests or the
     balance does not allow this case; `odds`: log odds that valves cut it off, 0 if `shut` is None. `sign_log_odds`
     (E,): log odds of each balance that the recorded flow has the right sign; the blocks have the more probable sign.
+    `holds`: holds of an open circuit.
     """
 
     open: RegimeBlocks
     shut: RegimeBlocks | None
     odds: float
     sign_log_odds: tuple[float, ...]
+    holds: HoldCounts = HoldCounts()
 
     def with_sign_prior(self, log_odds: Array) -> RecordedBlocks:
         """Reverse the flows whose more probable sign changes when the evidence of other recordings is added.
@@ -791,8 +804,10 @@ class RecordedBlocks(NamedTuple):
         return self.shut if self.shut is not None and odds > 0.0 else self.open
 
 
-def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
+def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | None = None) -> RecordedBlocks | None:
     """Compute the blocks of a recording for the volume balances of the machine, for open and for shut valves.
+
+    `healthy_holds`: holds of the healthy recordings of an open circuit.
 
     Shut valves are considered only if a channel gives the pump's flow and the machine rests at times. Return None if
     the channels of the recording allow no balance, or if the recording is too short.
@@ -809,6 +824,7 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     samples = bridged_samples(recording, channels)
     if balances[0].by_command:
         samples = derive_drive_signals(samples, rig, recording.rate)
+    holds = HoldCounts()
     if may_shut:
         samples = _without_lowering(samples, recording.rate, balances[0])
         if rig.circuit.feeds_one_chamber:
@@ -816,7 +832,9 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
             signals = Signals(samples, recording.rate, rest_limits=limits)
             sums = FeedSums.measure(balances[0], signals)
             balances = (feed_one_chamber(balances[0], sums.find_feed(balances[0].area_ratio)),)
-            samples = _without_flow(samples, flag_circulation(balances[0], signals, sums.mean_flow))
+            circulates = flag_circulation(balances[0], signals, sums.mean_flow, healthy_holds)
+            holds = HoldCounts.measure(signals.holding(balances[0].left) > 0.0, circulates)
+            samples = _without_flow(samples, circulates)
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])
     block_s = min(MAX_BLOCK_TIME, max(MIN_BLOCK_TIME, recording.duration / _BLOCKS.blocks))  # length of a block
@@ -864,10 +882,10 @@ def recorded_blocks(recording: Recording, rig: Rig) -> RecordedBlocks | None:
     open_blocks, shut_blocks = (partial(compute_regime_blocks, shut=shut) for shut in (False, True))
     open_regime = _build_regime(balances, open_blocks, ratio_deviation)._replace(**delays)
     if not may_shut or not has_rests(recorded, columns):
-        return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds)
+        return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds, holds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
     shut_regime = _build_regime(shut_balances, shut_blocks, ratio_deviation)._replace(shut=True, **delays)
-    return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds)
+    return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds, holds)
 
 
 def _without_lowering(

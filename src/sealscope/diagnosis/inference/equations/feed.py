@@ -159,17 +159,41 @@ def motions_of_side(equation: Equation, side: str) -> list[str]:
     return [name for name, (outward, _) in MOTIONS.items() if outward == (equation.fed_outward == side)]
 
 
-def flag_circulation(equation: Equation, signals: Signals, mean_flow: float | None) -> NDArray[np.bool_]:
+class HoldCounts(NamedTuple):
+    """Numbers of holds of an open circuit: with a pump `connected` to the cylinder, and with a flow `circulating`."""
+
+    connected: int = 0
+    circulating: int = 0
+
+    @classmethod
+    def measure(cls, is_held: NDArray[np.bool_], circulates: NDArray[np.bool_]) -> HoldCounts:
+        """Count the holds by flags of the sampling intervals (n - 1,), the second of which is `flag_circulation`."""
+        states = [bool(circulates[first]) for first, _ in find_runs(is_held).tolist()]
+        return cls(connected=states.count(False), circulating=states.count(True))
+
+    @property
+    def log_odds(self) -> float:
+        """Log odds that the flow circulates in a further hold; those of `feed.circulates` count as one hold."""
+        share = 1.0 / (1.0 + np.exp(-INFERENCE.feed.circulates))
+        return float(np.log((self.circulating + share) / (self.connected + 1.0 - share)))
+
+
+def flag_circulation(
+    equation: Equation, signals: Signals, mean_flow: float | None, healthy_holds: HoldCounts | None = None
+) -> NDArray[np.bool_]:
     """Flag the sampling intervals (n - 1,) in which the pump's flow probably circulates to the tank, past the cylinder.
 
     Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
     load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as a
-    fraction f of that in motion: a flow that circulates has any fraction up to 1, that of a pump that holds the load a
-    log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`). `feed.circulates`: log
-    odds, before any recording, of a flow that circulates. Nothing is flagged if f is unknown. Each block of a stream
-    judges a hold by the part of it that the block's samples contain. `mean_flow`: `FeedSums.mean_flow`.
+    fraction f of that in motion. A flow that circulates has any fraction up to 1. That of a pump that holds the load is
+    a log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`); or, with the probability
+    `size.present`, it has any fraction up to 1 as well, since a leak stalls the piston. The log odds of a flow that
+    circulates are those of `healthy_holds`, the holds of the healthy recordings. Nothing is flagged if f is unknown.
+    Each block of a stream judges a hold by the part of it that the block's samples contain. `mean_flow`:
+    `FeedSums.mean_flow`.
     """
-    prior = INFERENCE.feed
+    prior, leaks = INFERENCE.feed, INFERENCE.size.present
+    log_odds = (healthy_holds or HoldCounts()).log_odds
     flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
     circulates = np.zeros(len(flow), dtype=bool)
     if not (mean_flow and is_held.any()):
@@ -181,9 +205,9 @@ def flag_circulation(equation: Equation, signals: Signals, mean_flow: float | No
             continue
         fraction = float(flow_held.mean()) / mean_flow
         deviation = np.log(fraction / prior.held) / prior.spread
-        log_density_if_held = -0.5 * deviation**2 - np.log(fraction * prior.spread * np.sqrt(2.0 * np.pi))
-        # the density of f is 1 if the flow circulates, also for a few f above 1
-        circulates[hold] = prior.circulates - log_density_if_held > 0.0
+        density = np.exp(-0.5 * deviation**2) / (fraction * prior.spread * np.sqrt(2.0 * np.pi))
+        # the density of f is 1 if the flow circulates or leaks, also for a few f above 1
+        circulates[hold] = log_odds - np.log((1.0 - leaks) * density + leaks) > 0.0
     return circulates
 
 

@@ -23,6 +23,7 @@ from sealscope.diagnosis.inference.onset import (
     Estimate,
     Interval,
     StepTest,
+    bound_steps,
     fit_history,
 )
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
@@ -306,7 +307,7 @@ class BalanceLeak(LeakMeasure):
         if test is None:
             return np.inf
         if self._hold_rise is not None:
-            bound = self._hold_bound()
+            bound = max(self._hold_bound(), self._bound_after_holds())
         else:
             bound = test.bound() * self.balance.mean_pressure()
             if self._motion_rise is not None:
@@ -349,6 +350,21 @@ class BalanceLeak(LeakMeasure):
         )
         parts = by_motion, past_piston, to_outside
         return Mixture(*(np.concatenate(values) for values in zip(*parts, strict=True))).quantile(BOUND_PROBABILITY)
+
+    def _bound_after_holds(self) -> float:
+        """Compute the 95 % upper bound of the mean flow [m^3/s] of a leak that begins after the last hold.
+
+        No hold shows it, and the rise over the healthy recordings is mostly that of the holds: its step within the
+        recording is what bounds it. The result is 0 if a leak hardly begins so late, by the likelihood of its onset.
+        """
+        test, chambers = self.step, self.balance.chambers
+        if test is None or chambers is None:
+            return 0.0
+        is_later = test.onsets > chambers.holds[-1].t[0]
+        if not test.weights[is_later].sum() > 1.0 - BOUND_PROBABILITY:
+            return 0.0
+        weights, size, deviation = (values[is_later] for values in (test.weights, test.size, test.deviation))
+        return bound_steps(weights, size, deviation, BOUND_PROBABILITY) * self.balance.mean_pressure()
 
     @property
     def pump_flow(self) -> tuple[float, float]:

@@ -26,6 +26,7 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
+from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.onset import Estimate
@@ -109,16 +110,17 @@ class VolumeBalance:
         *,
         is_locked: bool = False,
         sign_log_odds: Array | float = 0.0,
+        healthy_holds: HoldCounts | None = None,
     ) -> RecordedBalance | None:
         """Set up the volume balance of a recording; return None if its channels or its length allow no balance.
 
         `odds`: log odds, before this recording, that valves cut a resting pump off from the cylinder; `is_locked`: true
         if healthy recordings show that they do; `sign_log_odds` (E,): log odds from healthy recordings that the
-        recorded flow has the right sign, for each of E balance equations.
+        recorded flow has the right sign, for each of E balance equations; `healthy_holds`: as in `_compute_blocks`.
         """
         if not equations(self.rig, frozenset(recording.channels)):
             return self._balance_without_position(recording)
-        recorded = self._compute_blocks(recording)
+        recorded = self._compute_blocks(recording, healthy_holds)
         if recorded is None:
             return None
         recorded = recorded.with_sign_prior(np.asarray(sign_log_odds))
@@ -143,11 +145,17 @@ class VolumeBalance:
         usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
         return min(usable, key=lambda candidate: BalanceLeak(candidate).bound_flow, default=None)
 
-    def _compute_blocks(self, recording: Recording) -> RecordedBlocks | None:
-        """Compute the blocks for a volume balance with a position, once for each recording; None if it allows none."""
+    def _compute_blocks(self, recording: Recording, healthy_holds: HoldCounts | None = None) -> RecordedBlocks | None:
+        """Compute the blocks for a volume balance with a position, once for each recording; None if it allows none.
+
+        `healthy_holds`: holds of the healthy recordings, which count in an open circuit.
+        """
         if not equations(self.rig, frozenset(recording.channels)):
             return None
-        return compute_once(recording, (self.name, self.rig), lambda samples: recorded_blocks(samples, self.rig), READ)
+        holds = healthy_holds if self.rig.circuit.feeds_one_chamber else None
+        return compute_once(
+            recording, (self.name, self.rig, holds), lambda samples: recorded_blocks(samples, self.rig, holds), READ
+        )
 
     def _build_balance(
         self, recording: Recording, regime: RegimeBlocks, by_state: RegimeBlocks | None = None
@@ -183,6 +191,7 @@ class VolumeBalance:
           log odds of this case, from the leakage at rest;
         - `held`, `held_odds`, if it holds a load at rest: leaks while shut valves hold the load, and log odds that the
           valves are shut, from these leaks; `held_pump`, if known: leakage of the pump just before the valves shut;
+        - `holds`, with a position: numbers of holds (`HoldCounts`);
         - `sign_log_odds`, with a position: log odds that the recorded flow has the right sign, for each balance;
         - `delivered`: mean flow of the pump in motion [m^3/s], as computed with the assumed sizes;
         - `stroke`, with a position: ends of the recorded motion [m];
@@ -206,6 +215,7 @@ class VolumeBalance:
         }
         if recorded is not None:
             summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
+            summary["holds"] = np.array(recorded.holds)
         if recorded is not None and recorded.shut is not None:
             shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
@@ -268,7 +278,10 @@ class VolumeBalance:
         channels = frozenset(recording.channels)
         odds = self._shut_log_odds(summaries, channels)
         sign_log_odds = _healthy_sign_log_odds(summaries, len(equations(self.rig, channels)))
-        balance = self.balance(recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds)
+        healthy_holds = _count_holds(summaries)
+        balance = self.balance(
+            recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds, healthy_holds=healthy_holds
+        )
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
             if equations(self.rig, channels):
@@ -371,6 +384,12 @@ def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Arr
     rewired: float = INFERENCE.sense.rewired
     limit = float(np.log((1.0 - rewired) / rewired))
     return np.clip(total, -limit, limit)
+
+
+def _count_holds(summaries: Sequence[Summary]) -> HoldCounts | None:
+    """Add the holds of all healthy recordings; None if none is known."""
+    counts = np.sum([np.zeros(2), *(summary["holds"] for summary in summaries if "holds" in summary)], axis=0)
+    return HoldCounts(*map(int, counts)) if counts.any() else None
 
 
 def _joint_stroke(summaries: Sequence[Summary]) -> tuple[float, float] | None:
