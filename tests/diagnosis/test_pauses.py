@@ -46,9 +46,10 @@ def test_a_press_that_a_leak_stalls_holds_its_load_where_healthy_holds_do(seed: 
     assert not flag_circulation(EQUATION, signals, mean_flow, connected).any()
     neutral = HoldCounts(connected=int(rng.integers(0, 4)), circulating=int(rng.integers(8, 40)))
     assert flag_circulation(EQUATION, signals, mean_flow, neutral)[is_held].all()
-    assert HoldCounts.measure(is_held, alone).circulating == 2
+    assert HoldCounts.measure(is_held, alone, RATE).circulating == 2
     healthy, _ = press(0.02, seed)
-    assert HoldCounts.measure(is_held, flag_circulation(EQUATION, healthy, mean_flow)) == HoldCounts(connected=2)
+    connections = flag_circulation(EQUATION, healthy, mean_flow)
+    assert HoldCounts.measure(is_held, connections, RATE) == HoldCounts(connected=2)
 
 
 def test_healthy_holds_change_the_odds_of_a_valve_in_neutral_in_their_sense() -> None:

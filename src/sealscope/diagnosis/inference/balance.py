@@ -833,7 +833,7 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
             sums = FeedSums.measure(balances[0], signals)
             balances = (feed_one_chamber(balances[0], sums.find_feed(balances[0].area_ratio)),)
             circulates = flag_circulation(balances[0], signals, sums.mean_flow, healthy_holds)
-            holds = HoldCounts.measure(signals.holding(balances[0].left) > 0.0, circulates)
+            holds = HoldCounts.measure(signals.holding(balances[0].left) > 0.0, circulates, recording.rate)
             samples = _without_flow(samples, circulates)
     stream_balances = tuple(with_rests(balance) for balance in balances) if may_shut else balances
     start = float(recording.t[0])

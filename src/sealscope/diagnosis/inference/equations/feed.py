@@ -166,9 +166,15 @@ class HoldCounts(NamedTuple):
     circulating: int = 0
 
     @classmethod
-    def measure(cls, is_held: NDArray[np.bool_], circulates: NDArray[np.bool_]) -> HoldCounts:
-        """Count the holds by flags of the sampling intervals (n - 1,), the second of which is `flag_circulation`."""
-        states = [bool(circulates[first]) for first, _ in find_runs(is_held).tolist()]
+    def measure(cls, is_held: NDArray[np.bool_], circulates: NDArray[np.bool_], rate: float) -> HoldCounts:
+        """Count the holds that last for `rest.lasting` (`priors.toml`) or longer.
+
+        `is_held`, `circulates` (n - 1,): flags of the sampling intervals, the latter by `flag_circulation`; `rate`:
+        sampling rate [Hz].
+        """
+        min_length = INFERENCE.rest.lasting * rate
+        runs = find_runs(is_held).tolist()
+        states = [bool(circulates[first]) for first, length in runs if length >= min_length]
         return cls(connected=states.count(False), circulating=states.count(True))
 
     @property
@@ -188,12 +194,13 @@ def flag_circulation(
     fraction f of that in motion. A flow that circulates has any fraction up to 1. That of a pump that holds the load is
     a log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`); or, with the probability
     `size.present`, it has any fraction up to 1 as well, since a leak stalls the piston. The log odds of a flow that
-    circulates are those of `healthy_holds`, the holds of the healthy recordings. Nothing is flagged if f is unknown.
+    circulates are those of `healthy_holds`, the holds of the healthy recordings. Holds that are shorter than
+    `rest.lasting`, in which a pump builds up a pressure, have no leak and the prior odds. Nothing is flagged if f is
+    unknown.
     Each block of a stream judges a hold by the part of it that the block's samples contain. `mean_flow`:
     `FeedSums.mean_flow`.
     """
-    prior, leaks = INFERENCE.feed, INFERENCE.size.present
-    log_odds = (healthy_holds or HoldCounts()).log_odds
+    prior, healthy_log_odds = INFERENCE.feed, (healthy_holds or HoldCounts()).log_odds
     flow, is_held = np.abs(equation.left(signals)), signals.holding(equation.left) > 0.0
     circulates = np.zeros(len(flow), dtype=bool)
     if not (mean_flow and is_held.any()):
@@ -206,8 +213,10 @@ def flag_circulation(
         fraction = float(flow_held.mean()) / mean_flow
         deviation = np.log(fraction / prior.held) / prior.spread
         density = np.exp(-0.5 * deviation**2) / (fraction * prior.spread * np.sqrt(2.0 * np.pi))
+        is_lasting = length >= INFERENCE.rest.lasting * signals.rate
+        leaks, log_odds = (INFERENCE.size.present, healthy_log_odds) if is_lasting else (0.0, prior.circulates)
         # the density of f is 1 if the flow circulates or leaks, also for a few f above 1
-        circulates[hold] = log_odds - np.log((1.0 - leaks) * density + leaks) > 0.0
+        circulates[hold] = log_odds - np.log(max((1.0 - leaks) * density + leaks, np.finfo(float).tiny)) > 0.0
     return circulates
 
 
