@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from time import process_time
 
 import numpy as np
 import pytest
@@ -128,3 +129,17 @@ def test_names_within_paths_are_of_one_machine_without_a_map_too(tmp_path: Path)
     recording = read(file, group="cyl 1")
     assert recording.channels.keys() == {"p_A", "x"}
     assert recording.unused == ()
+
+
+@pytest.mark.parametrize(
+    "heading", ["w{k}x pressure A [bar]", "cyl {k} p_A [bar]", "p_A_{k} [bar]", "boom {k} head [bar]"]
+)
+def test_many_columns_take_no_quadratic_time(heading: str) -> None:
+    """The time of four times as many columns is far from sixteen times as long; number 0 is one, too."""
+    seconds = []
+    for count in (150, 600):
+        labels = [Label.parse(heading.format(k=k)) for k in range(count)]
+        begin = process_time()
+        find_actuators(labels)
+        seconds.append(process_time() - begin)
+    assert seconds[1] < 12.0 * seconds[0] + 0.2

@@ -36,6 +36,8 @@ _QUANTITIES = frozenset(
 ) | frozenset(WORDS["generic"])
 #: Channels of the cylinder, of which each actuator has its own.
 _CYLINDER = ("p_A", "p_B", "x")
+#: Most actuators that are told apart in a table; more are no machine's, and would take quadratic time.
+_MAX_ACTUATORS = 64
 _SEPARATORS = re.compile(r"([ _.:/\\<>-])[ _.:/\\<>-]+")
 
 
@@ -141,10 +143,12 @@ def find_actuators(labels: Sequence[Label]) -> Actuators:
     channels = [
         inner if key else channel for key, channel, inner in zip(keys, channels, _guess_channels(cleaned), strict=True)
     ]
-    known = {key for key, channel in zip(keys, channels, strict=True) if channel in _CYLINDER and key}
-    groups = [key for key in dict.fromkeys(keys) if key in known and not any(key < other for other in known)]
+    known = dict.fromkeys(key for key, channel in zip(keys, channels, strict=True) if channel in _CYLINDER and key)
+    candidates = [*known][:_MAX_ACTUATORS]
+    groups = [key for key in candidates if not any(key < other for other in candidates)]
     if not groups:
         return Actuators()
+    is_clock = [is_time(label) for label in labels]
     shown = {word.text: word.shown for column in reversed(columns) for word in reversed(column.words)}
     words_of = {key: [word.text for word in column.words] for key, column in zip(keys, columns, strict=True)}
 
@@ -167,8 +171,8 @@ def find_actuators(labels: Sequence[Label]) -> Actuators:
         ),
         tuple(
             tuple(
-                (clean if len(groups) > 1 else label) if key <= group or is_time(label) else Label("", "")
-                for key, clean, label in zip(keys, cleaned, labels, strict=True)
+                (clean if len(groups) > 1 else label) if key <= group or clock else Label("", "")
+                for key, clean, label, clock in zip(keys, cleaned, labels, is_clock, strict=True)
             )
             for group in groups
         ),
@@ -189,7 +193,7 @@ def _read_words(label: Label) -> _Column:
         before = tokens[position - 1][0] if position else ""
         after = tokens[position + 1][0] if position + 1 < len(tokens) else ""
         if token in _MACHINE["noun"] and _is_mark(after):  # `cylinder 1`, `Achse A`
-            mark = after.lstrip("0") if after.isdigit() else f"{token} {after}"
+            mark = (after.lstrip("0") or "0") if after.isdigit() else f"{token} {after}"
             words.append(_Word(mark, "noun", (span[0], tokens[position + 1][1][1]), f"{token} {after}", True))
             position += 2
             continue
@@ -304,8 +308,9 @@ def _find_splitting(words: set[str], columns: Sequence[_Column], channels: Seque
             keys[channel].append(column.key(words))
     pairs = defaultdict[tuple[str, str], set[str]](set)  # words that tell two columns of a channel apart -> channels
     for channel, found in keys.items():
-        for first in found:
-            for second in found:
+        distinct = [*dict.fromkeys(found)][:_MAX_ACTUATORS]
+        for first in distinct:
+            for second in distinct:
                 pairs_of_words = ((a, b) for a in first - second for b in second - first)
                 for pair in pairs_of_words:
                     pairs[pair].add(channel)
