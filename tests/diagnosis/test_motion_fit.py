@@ -108,3 +108,15 @@ def test_strokes_that_pass_the_same_places_tell_a_drift() -> None:
     assert learnt is not None
     assert learnt["drift_A"] == pytest.approx(4e5, abs=3.0 * learnt["drift_A_error"])
     assert learnt["drift_A_error"] < 2e4
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_weighted_least_squares_are_those_of_a_general_solver(seed: int) -> None:
+    """With columns that depend on each other the shortest solution counts, as that of the pseudo-inverse."""
+    random = np.random.default_rng(seed)
+    design = random.standard_normal((300, 12)) * 10.0 ** random.uniform(-2.0, 2.0, 12)
+    values, weight = design @ random.standard_normal(12) + random.standard_normal(300), random.random(300)
+    for matrix in (design, np.column_stack([design, design[:, 0] + design[:, 1]]), np.pad(design, ((0, 0), (0, 1)))):
+        expected = np.linalg.lstsq(matrix * weight[:, None], values * weight, rcond=1e-12)[0]
+        found = solve_weighted(stack_equations(matrix, values), weight)
+        assert found == pytest.approx(expected, rel=1e-7, abs=1e-9 * np.abs(expected).max())

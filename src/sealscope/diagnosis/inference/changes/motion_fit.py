@@ -22,6 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
+from scipy.linalg.lapack import dpotrf, dpotrs
 
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.levels import find_motion_channel
@@ -45,6 +46,8 @@ MIN_RESIDUAL = 1.0
 GROUPS = 20
 #: Eigenvalue of a normalised normal matrix, over the largest one, below which a combination of coefficients is free.
 FREE = 1e-10
+#: Smallest diagonal element of the Cholesky factor of normalised normal equations that are solved directly.
+MIN_PIVOT = 1e-3
 #: Index of the column t/T in the design matrix of a motion, and of sign(v) and v in that without t/T.
 TIME, DIRECTION, SPEED = 1, 0, 1
 
@@ -125,12 +128,22 @@ def stack_equations(design: Array, values: Array) -> Array:
 
 
 def solve_weighted(equations: Array, weight: Array) -> Array:
-    """Solve a weighted least-squares problem by a QR decomposition; return the coefficients c (m,).
+    """Solve a weighted least-squares problem; return the coefficients c (m,).
 
     They minimise sum((weight (values - design c))^2); if several do, c is the shortest of them. `equations` (m + 1, n):
-    columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows.
+    columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows. The normal
+    equations, with columns of unit length, give c unless the design is nearly singular (`MIN_PIVOT`); then a QR
+    decomposition does.
     """
-    _, triangle = qr((equations * weight).T, mode="raw", overwrite_a=True, check_finite=False)
+    weighted = equations * weight
+    products = weighted @ weighted.T
+    length = np.sqrt(np.diag(products)[:-1])
+    if (length > 0.0).all():
+        normal = products[:-1, :-1] / np.outer(length, length)
+        factor, info = dpotrf(normal, lower=True)
+        if info == 0 and np.diag(factor).min() > MIN_PIVOT:
+            return np.asarray(dpotrs(factor, products[:-1, -1] / length, lower=True)[0] / length)
+    _, triangle = qr(weighted.T, mode="raw", overwrite_a=True, check_finite=False)
     # R of the design and, in the last column, the values multiplied by Q^T
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=np.finfo(float).eps * len(weight))
     return np.asarray(solution[0])

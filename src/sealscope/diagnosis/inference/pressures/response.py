@@ -115,7 +115,8 @@ class Segment:
     - `dp` (n,): recorded p_A - p_B [Pa], with the sign reversed if it falls with the command;
     - `states` (8, 12): states at the sample before the first, as simulated with the parameters (column 0), and with
       each parameter up to `SPRING` increased in turn;
-    - `waves` (m, n): waves of the mains hum, which are projected out;
+    - `waves` (m, n): waves of the mains hum, which are projected out; `wave_gram_inverse` (m, m): pseudo-inverse of
+      their Gram matrix;
     - `sample_weights` (n,): 0 for samples that are missing or recorded while the drive settles, otherwise 1;
     - `smooth`: width [samples] of a Gaussian that smooths the residual.
     """
@@ -126,6 +127,7 @@ class Segment:
     dp: Array
     states: Array
     waves: Array
+    wave_gram_inverse: Array
     sample_weights: Array
     smooth: float = 0.0
 
@@ -133,11 +135,6 @@ class Segment:
     def n_samples(self) -> float:
         """Number of samples with a weight above zero."""
         return float(np.count_nonzero(self.sample_weights))
-
-    @cached_property
-    def _wave_gram_inverse(self) -> Array:
-        """Pseudo-inverse of the Gram matrix of the m waves that are fitted to the mains hum, (m, m)."""
-        return np.asarray(np.linalg.pinv(self.waves @ self.waves.T, hermitian=True))
 
     def _project_on_waves(self, rows: Array) -> tuple[Array, Array, Array]:
         """Smooth rows (m, n), set samples without a weight to 0, and fit k waves of mains hum to each row.
@@ -149,7 +146,7 @@ class Segment:
         if self.n_samples < rows.shape[1]:
             rows *= self.sample_weights
         products = rows @ self.waves.T
-        return rows, products, products @ self._wave_gram_inverse
+        return rows, products, products @ self.wave_gram_inverse
 
     def residual_squares(self, sets: Array) -> Array:
         """Compute the residual sums of squares (m,) of p_A - p_B [Pa^2] for each of up to 16 parameter sets (m, p).
@@ -239,10 +236,20 @@ class Segment:
 
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to sums of products; the scores are those of G for each second."""
-        rows = fit.rows - (fit.rows @ self.waves.T) @ self._wave_gram_inverse @ self.waves
+        rows = fit.rows - (fit.rows @ self.waves.T) @ self.wave_gram_inverse @ self.waves
         first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
         scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
         return Block(fit.theta, fit.gram, self.n_samples, scores)
+
+
+def _prepare_hum(block: Recording, n_settling: int) -> dict[str, Array]:
+    """Compute weights, waves and their Gram matrix for a `Segment`; the first `n_settling` samples have no weight."""
+    sample_weights = np.ones(len(block)) if block.bridged is None else (~block.bridged).astype(float)
+    sample_weights[:n_settling] = 0.0
+    # hum has the same sign in both pressures, so that its frequencies show best in their sum
+    waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
+    gram_inverse = np.linalg.pinv(waves @ waves.T, hermitian=True)
+    return {"waves": waves, "wave_gram_inverse": np.asarray(gram_inverse), "sample_weights": sample_weights}
 
 
 def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisation:
@@ -410,14 +417,13 @@ class Follower:
 
         The stroke is then centred, and samples have no weight until the drive has settled.
         """
-        u, n = block["u"], len(block)
-        sample_weights = np.ones(n) if block.bridged is None else (~block.bridged).astype(float)
+        u, n_settling = block["u"], 0
         if math.isnan(self.last):
             self.last, self.states = float(u[0]), self.states.copy()
             self.states[POSITION] = self.machine.centred_start(u * self.theta[GAIN])
-            sample_weights[: round(_FOLLOW.settling * block.rate)] = 0.0
-        # hum has the same sign in both pressures, so that its frequencies show best in their sum
-        waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
+            n_settling = round(_FOLLOW.settling * block.rate)
+        # a fit simulates each block many times
+        hum = compute_once(block, ("mains hum", n_settling), lambda samples: _prepare_hum(samples, n_settling))
         dp = self.sense * (block["p_A"] - block["p_B"])
         return Segment(
             self.machine,
@@ -425,8 +431,7 @@ class Follower:
             command=np.append(self.last, u),
             dp=dp,
             states=self.states,
-            waves=waves,
-            sample_weights=sample_weights,
+            **hum,
         )
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
