@@ -30,7 +30,7 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.details import min_samples
 
 #: Kind of data (`Observable.data`) of the judged details d2 to d4.
@@ -56,6 +56,11 @@ class RmsChange:
 
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings."""
+        return compute_once(recording, (self.name, "summary"), self._summarise)
+
+    @staticmethod
+    def _summarise(recording: Recording) -> Summary:
+        """Compute the summary of a healthy recording (`learn`)."""
         levels, duty = measure_levels(recording)
         return {
             "chambers": list(judged_chambers(recording)),  # those of `levels`
