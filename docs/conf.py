@@ -157,10 +157,13 @@ def parameters() -> str:
 
 
 def speed() -> str:
-    """Return the times of the simulator beside programs in C++, from what `benchmarks/run.py` measured last."""
+    """Return the times of the simulator beside programs in C++, and those of verdicts, as last measured.
+
+    They are from `benchmarks/run.py` and `benchmarks/speed.py`.
+    """
     results = Path(__file__).parents[1] / "benchmarks" / "results"
-    solvers, batch = (
-        json.loads((results / f"{name}.json").read_text(encoding="utf-8")) for name in ("solvers", "batch")
+    solvers, batch, verdicts = (
+        json.loads((results / f"{name}.json").read_text(encoding="utf-8")) for name in ("solvers", "batch", "speed")
     )
     lines = ["| 180 s of | milliseconds a run | of the time of C++ |", "| --- | --- | --- |"]
     for case, figures in solvers["figures"].items():
@@ -170,7 +173,14 @@ def speed() -> str:
     for case, figures in batch["figures"]["cases"].items():
         ours, ratio = figures["ours"][0], figures["ratio"][0]
         lines.append(f"| 256 runs, {case} | {1e3 * ours:.1f} of a core | {100 * ratio:.0f} % |")
-    return "\n".join([*lines, "", f"Measured {solvers['measured']} on {solvers['machine']}."]) + "\n"
+    lines += ["", f"Measured {solvers['measured']} on {solvers['machine']}.", ""]
+    lines += ["| verdicts | seconds of processor | peak MiB |", "| --- | --- | --- |"]
+    lines += [f"| {work} | {row['seconds']:.2g} | {row['MiB']:.0f} |" for work, row in verdicts["rows"].items()]
+    if verdicts["growth"]:
+        growth = ", ".join(f"{power:.1f} of the {name}" for name, power in verdicts["growth"].items())
+        lines += ["", f"The time grows as the power {growth}."]
+    lines += ["", f"Measured {verdicts['measured']} on {verdicts['machine']}, busy with other work."]
+    return "\n".join(lines) + "\n"
 
 
 def _write(_app: object) -> None:

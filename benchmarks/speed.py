@@ -1,0 +1,218 @@
+"""What a verdict costs: each row by this version, beside a pinned one in turns, and how time and memory grow.
+
+    python benchmarks/speed.py [--beside PYTHON] [--quick] [--rounds 3] [--only TEXT ...] [--json FILE]
+
+`--beside`: the Python of an environment with another version; both versions run on the same files, one after the other
+in each round, and the ratio of the medians of their processor times is printed. `--quick`: sizes of seconds, to see
+that all works. `--json`: the figures for the page of speed, which the documentation writes from
+`benchmarks/results/speed.json`. All recordings are simulated or computed by this version.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from datetime import date
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+import sealscope as ss
+
+#: Program of a row in a process of its own: it reads its files, works once before the clock starts, and prints seconds.
+_ROW = """
+import json, sys, time
+import sealscope as ss
+kind, names, channels = json.loads(sys.argv[1])
+def read():
+    recordings = [ss.read(name) for name in names]
+    return [recording.only(channels) for recording in recordings] if channels else recordings
+def diagnose(recordings):
+    return ss.diagnose(recordings[0], baseline=recordings[1:])
+if kind == "commission":
+    ss.commission(names[:1])
+    start = time.process_time()
+    ss.commission(names)
+else:
+    diagnose(read())
+    recordings = read()
+    if kind == "next":
+        diagnose([recordings[1], *recordings[2:]])
+    start = time.process_time()
+    diagnose(recordings)
+print(json.dumps(time.process_time() - start))
+"""
+#: Program that runs a command of `sealscope`, or after the word `-` another program, and then prints the processor's
+#: seconds of the process and its peak memory [kB], which Linux knows.
+_COMMAND = """
+import runpy, sys, time
+first, sys.argv = sys.argv[1], ["sealscope", *sys.argv[1:]]
+try:
+    if first == "-":
+        code, sys.argv = sys.argv[2], ["row", *sys.argv[3:]]
+        exec(compile(code, "row", "exec"), {"__name__": "__main__"})
+    else:
+        runpy.run_module("sealscope", run_name="__main__")
+except SystemExit as end:
+    if end.code:
+        raise
+peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
+print(f"\\n{time.process_time()} {peak.split()[1]}", file=sys.stderr)
+"""
+
+
+#: Measurement: runs by a Python and returns seconds and peak MiB.
+Row = Callable[[str], tuple[float, float]]
+
+
+def spent(python: str, *words: str) -> tuple[float, float, str]:
+    """Run `_COMMAND` with words by a Python; return its seconds of processor, its peak memory [MiB] and its output."""
+    process = subprocess.run([python, "-c", _COMMAND, *words], capture_output=True, text=True, check=False)
+    if process.returncode:
+        raise SystemExit(f"{' '.join(words[:2])[:80]} ended with {process.returncode}: {process.stderr[-500:]}")
+    seconds, peak = process.stderr.splitlines()[-1].split()
+    return float(seconds), float(peak) / 1024.0, process.stdout
+
+
+def of_library(kind: str, files: Sequence[Path], channels: Sequence[str] = ()) -> Row:
+    """Make a row that calls the library; its time is that of the call alone."""
+    job = json.dumps([kind, [str(file) for file in files], list(channels)])
+
+    def run(python: str) -> tuple[float, float]:
+        """Return the seconds of the call and the peak memory of its process."""
+        _, memory, output = spent(python, "-", _ROW, job)
+        return float(output), memory
+
+    return run
+
+
+def of_command(*words: str) -> Row:
+    """Make a row that runs a command of the program; its time is that of the whole process."""
+    return lambda python: spent(python, *words)[:2]
+
+
+def over_libraries(file: Path) -> Row:
+    """Make a row of `sealscope diagnose` of a file, less the import of the libraries that it uses."""
+    libraries = "import numpy, scipy.linalg, scipy.special, scipy.ndimage, numba, typer, rich, pydantic, h5netcdf, pywt"
+
+    def run(python: str) -> tuple[float, float]:
+        """Return the difference of the seconds, and the peak memory of the command."""
+        bare, (whole, memory) = spent(python, "-", libraries)[0], of_command("diagnose", str(file))(python)
+        return whole - bare, memory
+
+    return run
+
+
+def record(folder: Path, count: int, seconds: float) -> list[Path]:
+    """Write healthy recordings, the first one with a leak from half on."""
+    files = []
+    for seed in range(count):
+        leak = {"leak": f"0.02 L/min from {0.5 * seconds:g} s"} if not seed else {}
+        recording = ss.simulate(command="3 sin(4t)", duration=f"{seconds:g} s", seed=seed, **leak)
+        files.append(folder / f"rig-{seconds:g}-{seed}.nc")
+        ss.write(recording, files[-1])
+    return files
+
+
+def press(folder: Path, count: int, minutes: float, rate: float) -> list[Path]:
+    """Write logs of a press that holds its load between strokes: samples of the balance with noise, no simulation."""
+    files = []
+    for seed in range(count):
+        random, n = np.random.default_rng(seed), round(60.0 * minutes * rate)
+        t = np.arange(n) / rate
+        phase = t % 20.0
+        omega = np.where(phase < 8.0, 150.0, np.where((phase >= 10.0) & (phase < 18.0), -150.0, 0.0))
+        load = 4e6 + 5e5 * np.sin(t / 100.0)
+        x = np.cumsum((1.6e-5 / (2.0 * np.pi) * omega - 2e-13 * load) / 9e-3) / rate
+        p_B = 5e5 + 2e4 * random.standard_normal(n)
+        p_A = p_B + load + 3e5 * np.sign(omega) + 2e4 * random.standard_normal(n)
+        channels = {"p_A": p_A, "p_B": p_B, "x": x + 2e-5 * random.standard_normal(n)}
+        channels |= {"omega": omega + 0.5 * random.standard_normal(n), "T_oil": 313.0 + 0.1 * random.standard_normal(n)}
+        units = {"p_A": "Pa", "p_B": "Pa", "x": "m", "omega": "rad/s", "T_oil": "K"}
+        files.append(folder / f"press-{minutes:g}-{rate:g}-{seed}.nc")
+        ss.write(ss.Recording(t, channels, units, rate), files[-1])
+    return files
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--beside", metavar="PYTHON", help="Python of an environment with another version")
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--only", nargs="+", default=[], metavar="TEXT", help="rows whose names hold one of these")
+    parser.add_argument("--json", type=Path, help="file of the figures")
+    chosen = parser.parse_args()
+    share = 0.1 if chosen.quick else 1.0
+    rounds = 1 if chosen.quick else chosen.rounds
+    pythons = [sys.executable, *([chosen.beside] if chosen.beside else [])]
+    figures: dict[str, dict[str, float]] = {}
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        length = 60.0 if chosen.quick else 180.0
+        minute, three = record(folder, 4 if chosen.quick else 7, 60.0), record(folder, 1, length)
+        n_beside = 2 if chosen.quick else 5
+        hour = press(folder, 1, 60.0 * share, 1000.0)[0]
+        table = folder / "hour.csv"
+        ss.write(ss.read(hour), table)
+        days = press(folder, 3, 90.0 * share, 10.0)
+        rows = {
+            f"{length:g} s at 500 Hz, all channels": of_library("first", three),
+            f"{length:g} s at 500 Hz, pressures and command": of_library("first", three, channels=("u", "p_A", "p_B")),
+            f"60 s beside {n_beside}, first": of_library("first", minute[: 1 + n_beside]),
+            f"60 s beside {n_beside}, next": of_library("next", minute[: 2 + n_beside]),
+            f"commissioning, {3 * 1.5 * share:g} h at 10 Hz": of_library("commission", days),
+            f"commissioning, {share:g} h at 1 kHz": of_library("commission", [hour]),
+            f"`diagnose` of {share:g} h at 1 kHz, a text of 6 columns": of_command("diagnose", str(table)),
+            f"`inspect` of {share:g} h at 1 kHz, a text of 6 columns": of_command("inspect", str(table)),
+            "`demo`": of_command("demo", "-o", str(folder / "demo.html")),
+            "`diagnose` of 60 s, over its libraries": over_libraries(minute[0]),
+        }
+        print(
+            "| work | seconds of processor | over the other version | peak MiB |\n| --- | --- | --- | --- |", flush=True
+        )
+        for title, row in rows.items():
+            if chosen.only and not any(text in title for text in chosen.only):
+                continue
+            runs = [[row(python) for python in pythons] for _ in range(rounds)]  # in turns
+            medians = np.median(np.array(runs), axis=0)
+            figures[title] = {"seconds": medians[0][0], "MiB": medians[0][1]}
+            if chosen.beside:
+                figures[title]["ratio"] = medians[0][0] / medians[1][0]
+            ratio = f"{figures[title]['ratio']:.2f}" if chosen.beside else ""
+            print(f"| {title} | {medians[0][0]:.3g} | {ratio} | {medians[0][1]:.0f} |", flush=True)
+        exponents = growth(folder, share) if not chosen.only or "growth" in chosen.only else {}
+    if chosen.json:
+        machine = f"{os.cpu_count()} cores, {platform.machine()}"
+        measured = {"measured": f"{date.today()}", "machine": machine, "rows": figures, "growth": exponents}
+        if chosen.only and chosen.json.exists():  # the rows that were not chosen stay
+            earlier = json.loads(chosen.json.read_text(encoding="utf-8"))
+            measured |= {"rows": earlier["rows"] | figures, "growth": earlier["growth"] | exponents}
+        chosen.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+
+
+def growth(folder: Path, share: float) -> dict[str, float]:
+    """Measure the exponents by which the time of a verdict grows with samples, channels and healthy recordings."""
+    names = ["p_A", "p_B", "x", "omega", "T_oil"]
+    minutes, counts, widths = (15.0 * share, 30.0 * share, 60.0 * share), (2, 4, 8), (2, 4, 5)
+    files, long = press(folder, 9, 10.0 * share, 50.0), press(folder, 1, 20.0 * share, 200.0)
+    rows = {
+        "samples": (minutes, [of_library("first", press(folder, 1, length, 200.0)) for length in minutes]),
+        "healthy recordings": (counts, [of_library("first", files[: 1 + count]) for count in counts]),
+        "channels": (widths, [of_library("first", long, channels=names[:count]) for count in widths]),
+    }
+    exponents = {}
+    for title, (sizes, calls) in rows.items():
+        seconds = [call(sys.executable)[0] for call in calls]
+        exponents[title] = float(np.polyfit(np.log(sizes), np.log(np.maximum(seconds, 1e-9)), 1)[0])
+        print(f"the time grows with the {title} as their power {exponents[title]:.2f}", flush=True)
+    return exponents
+
+
+if __name__ == "__main__":
+    main()
