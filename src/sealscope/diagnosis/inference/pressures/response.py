@@ -242,14 +242,17 @@ class Segment:
         return Block(fit.theta, fit.gram, self.n_samples, scores)
 
 
-def _prepare_hum(block: Recording, n_settling: int) -> dict[str, Array]:
-    """Compute weights, waves and their Gram matrix for a `Segment`; the first `n_settling` samples have no weight."""
+def _prepare_hum(block: Recording, n_settling: int) -> tuple[Array, Array, Array]:
+    """Compute waves, the inverse of their Gram matrix, and the samples' weights for a `Segment`.
+
+    The first `n_settling` samples have no weight.
+    """
     sample_weights = np.ones(len(block)) if block.bridged is None else (~block.bridged).astype(float)
     sample_weights[:n_settling] = 0.0
     # hum has the same sign in both pressures, so that its frequencies show best in their sum
     waves = mains_waves(block["p_A"] + block["p_B"], block.rate) * sample_weights
     gram_inverse = np.linalg.pinv(waves @ waves.T, hermitian=True)
-    return {"waves": waves, "wave_gram_inverse": np.asarray(gram_inverse), "sample_weights": sample_weights}
+    return waves, np.asarray(gram_inverse), sample_weights
 
 
 def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisation:
@@ -423,7 +426,9 @@ class Follower:
             self.states[POSITION] = self.machine.centred_start(u * self.theta[GAIN])
             n_settling = round(_FOLLOW.settling * block.rate)
         # a fit simulates each block many times
-        hum = compute_once(block, ("mains hum", n_settling), lambda samples: _prepare_hum(samples, n_settling))
+        waves, gram_inverse, sample_weights = compute_once(
+            block, ("mains hum", n_settling), lambda samples: _prepare_hum(samples, n_settling)
+        )
         dp = self.sense * (block["p_A"] - block["p_B"])
         return Segment(
             self.machine,
@@ -431,7 +436,9 @@ class Follower:
             command=np.append(self.last, u),
             dp=dp,
             states=self.states,
-            **hum,
+            waves=waves,
+            wave_gram_inverse=gram_inverse,
+            sample_weights=sample_weights,
         )
 
     def _prior(self, block_s: float, jumped: int | None = None) -> Normal:
