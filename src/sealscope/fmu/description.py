@@ -61,5 +61,8 @@ def format_description(fmi: int, identifier: str, token: str, summary: str, vari
         variables=variables,
         outputs=outputs,
         index={variable.name: k for k, variable in enumerate(variables, 1)},  # by which FMI 2 names variables
-        dependencies={output.name: [by_name[name] for name in DIRECT.get(output.name, ())] for output in outputs},
+        dependencies={
+            output.name: [by_name[name] for name in DIRECT.get(output.name, ()) if name in by_name]
+            for output in outputs
+        },
     )
