@@ -10,7 +10,7 @@ from importlib import resources
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.verdict.evidence import Evidence, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN, Evidence, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine import AssumedMachine
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.monitor.alarms import Alarm
@@ -157,3 +157,26 @@ def test_the_repair_limit_counts_from_the_healthy_level(make_diagnosis):
 def test_where_the_sum_alone_is_known_the_outside_is_looked_at_first(make_diagnosis):
     action = make_diagnosis(cause="piston, pump or external leak", machine=MACHINE, quality=()).next_check
     assert action.index("outside") < action.index("piston seal") < action.index("pump's case drain")
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_advice_names_each_respect_in_which_a_recording_is_not_like_the_healthy_ones(make_diagnosis, seed):
+    """It read "not in all respects shown to be like the healthy ones", and did not say in which."""
+    rng = np.random.default_rng(seed)
+    is_rare = rng.random(3) < 0.5
+    is_rare[rng.integers(3)] = True
+    against, within, rarest = np.where(is_rare, rng.uniform(0.0, 0.04, 3), rng.uniform(0.06, 1.0, 3)).tolist()
+    tests = (
+        Evidence("no leak", "", detector=AGAINST, chance=against),
+        Evidence("no leak", "", detector=WITHIN, chance=within),
+    )
+    diagnosis = make_diagnosis(
+        verdict="no leak", leak_lpm=None, leak_interval_lpm=None, onset_s=None, onset_interval_s=None, cause=None,
+        bound_lpm=0.01, total_leakage=None, parts=(Evidence("no leak", "", parts=tests),), baselines=5,
+        rarest_chance=rarest, rarest_change="the free air in the oil",
+    )  # fmt: skip
+    words = ("the leakage above theirs", "the leakage rises within", "the free air in the oil")
+    for is_named, text in zip(is_rare, words, strict=True):
+        assert (text in diagnosis.next_check) == is_named
+    assert len(diagnosis.unlike_healthy) == is_rare.sum()
+    assert not diagnosis.is_baseline
