@@ -1,11 +1,12 @@
 """What else than a leak: the cause that a diagnosis names for each fault, on machines of four rigs.
 
-    python benchmarks/causes.py [--count 4] [--skip 0] [--plans NAME ...] [--views all command] [--records FOLDER]
+    python benchmarks/causes.py [--count 4] [--seed 1] [--plans NAME ...] [--views all command] [--records FOLDER]
 
-Machines are those of the packaged plans of each rig (180 s, the fault from half on); a diagnosis knows the rig as
-designed, neither machine nor onset, and has no baseline. Each row: verdicts, causes, and how many name the one that was
-put in. A fault that a set of channels cannot show counts as missed. `--skip`: machines that are passed over, so that
-rows can be judged on others than those that they were developed on. `--records` keeps the simulated records.
+Machines are drawn from the packaged plans of each rig, with their duties; each recording has a duration of 60 to 180 s
+and an onset of its own. A diagnosis knows the rig as designed, neither machine nor onset, and has no baseline. Each
+row: verdicts, causes, and how many name the one that was put in. A fault that a set of channels cannot show counts as
+missed. `--seed` draws, so that rows can be judged on others than those that they were developed on. `--records` keeps
+the simulated records.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 import sealscope as ss
 from sealscope.campaigns.cases.case import CampaignCase, interleave_cases, list_cases
@@ -44,18 +47,20 @@ FAULTS: dict[str, tuple[str | None, ...]] = {
 LEAK = 0.05
 
 
-def machines(name: str, count: int, skip: int) -> Iterator[tuple[SimulatedPlan, CampaignCase]]:
-    """Yield machines of a plan, healthy as they are."""
-    plan = load_plan(name)
+def machines(name: str, count: int, seed: int) -> Iterator[tuple[SimulatedPlan, CampaignCase]]:
+    """Draw machines of a plan, healthy as they are, each with a duration and an onset of its own."""
+    plan, random = load_plan(name), np.random.default_rng(seed)
     assert isinstance(plan, SimulatedPlan)
     cases = [case for case in interleave_cases(list_cases(plan)) if not case.leak_lpm and not case.fault]
-    for case in cases[skip : skip + count]:
-        yield plan, case
+    for k in random.permutation(len(cases))[:count]:
+        duration = float(random.integers(60, 181))
+        onset = round(float(random.uniform(0.3, 0.7)) * duration, 1)
+        yield replace(plan, duration_s=duration, onset_s=onset), cases[k]
 
 
 def recording_of(plan: SimulatedPlan, case: CampaignCase, fault: str, folder: Path | None) -> ss.Recording:
     """Return a machine's record with a fault, kept in a folder."""
-    name = f"{plan.name}-{case.id}-{fault}.nc".replace(" ", "_").replace("/", "-")
+    name = f"{plan.name}-{case.id}-{plan.duration_s:g}-{plan.onset_s:g}-{fault}.nc".replace(" ", "_").replace("/", "-")
     path = None if folder is None else folder / name
     if path is not None and path.exists():
         return ss.read(path)
@@ -70,7 +75,7 @@ def recording_of(plan: SimulatedPlan, case: CampaignCase, fault: str, folder: Pa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=4)
-    parser.add_argument("--skip", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--plans", nargs="+", default=PLANS)
     parser.add_argument("--views", nargs="+", choices=VIEWS, default=list(VIEWS))
     parser.add_argument("--faults", nargs="+", default=list(FAULTS))
@@ -80,7 +85,7 @@ def main() -> None:
         for fault in given.faults:
             records = [
                 (plan, recording_of(plan, case, fault, given.records))
-                for plan, case in machines(name, given.count, given.skip)
+                for plan, case in machines(name, given.count, given.seed)
             ]
             for view in given.views:
                 channels = VIEWS[view]
