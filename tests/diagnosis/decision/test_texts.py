@@ -49,4 +49,5 @@ def test_every_remark_has_a_text_and_is_made() -> None:
     made = {arguments[0] for arguments in calls("Remark") if isinstance(arguments[0], str)}
     conditional = {"zero too high", "zero too low", "x late", "x early"}
     conditional |= {key for key in TEXTS["remark"] if key.startswith("delay ")}
+    conditional.add("channels missing")  # a doubt of the comparison, not of a detector
     assert made | conditional == set(TEXTS["remark"])
