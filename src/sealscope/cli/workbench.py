@@ -14,7 +14,7 @@ _FOLDER = "Folder of the session, made if it is new; a folder of logs opens thes
 
 
 def app(
-    folder: Annotated[Path, Argument(metavar="[FOLDER]", help=_FOLDER)] = Path("sealscope-session"),
+    folder: Annotated[Path, Argument(metavar="FOLDER", help=_FOLDER)] = Path("sealscope-session"),
     port: Annotated[int, Option(min=0, max=65535, help="Port of the page; 0: a free one.")] = 0,
     no_browser: Annotated[bool, Option("--no-browser", help="Print the address, open nothing.")] = False,
     replay: Annotated[
