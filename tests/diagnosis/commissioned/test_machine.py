@@ -102,7 +102,7 @@ def test_what_is_learnt_is_the_machine(machine):
     summary = machine.summary
     assert summary.noise["p_A"] == pytest.approx(1.25 * 6894.76, rel=0.2)
     assert summary.problems == []
-    assert str(machine).count("\n") < 15
+    assert str(machine).count("\n") < 18  # the limit that it proposes takes three lines
 
 
 @pytest.mark.slow
