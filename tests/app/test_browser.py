@@ -183,7 +183,7 @@ def test_from_an_empty_folder_to_the_verdict(browser, material: Path, tmp_path: 
         view.select_option("#hold-file", label="hold.csv")
         view.fill("#hold-form [name=limit]", "24 mm in 3 min")
         view.get_by_role("button", name="Judge the hold").click()
-        page.until("document.getElementById('hold-results').textContent.includes('passes: 24 mm in 3 min')")
+        page.until("document.getElementById('hold-results').textContent.includes('passes, limit 24 mm in 3 min')")
         assert page.errors == [], page.errors
         page.context.close()
         check_screens(browser, server)

@@ -228,3 +228,14 @@ def test_a_long_table_of_a_logger_that_restarted_is_refused(tmp_path: Path) -> N
     (tmp_path / "log.csv").write_text("\n".join(["time,channel,value", *rows]) + "\n")
     with pytest.raises(UnreadableFile, match="step back"):
         ss.read(tmp_path / "log.csv", map="auto")
+
+
+@pytest.mark.parametrize("start", ["2026-06-01T10:00:00", "01.06.2026 10:00", "17.5", "2026/06/01"])
+def test_a_value_in_the_preamble_is_no_group_of_columns(start, tmp_path):
+    """A date was put before the names of all columns: its T was taken for a temperature."""
+    path = tmp_path / "log.csv"
+    rows = "\n".join(f"{k / 10:.1f};{200 - k / 1e4:.4f};{96 + k % 7:.1f}" for k in range(400))
+    path.write_text(f"Start;{start}\nZeit [s];Weg [mm];Druck Kolbenseite [bar]\n{rows}\n", encoding="utf-8")
+    recording = ss.read(path, map="auto")
+    assert {"x", "p_A"} <= set(recording.channels)
+    assert not any(start in str(note) for note in recording.history)

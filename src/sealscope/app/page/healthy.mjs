@@ -83,12 +83,12 @@ async function showLearnt(machine) {
   const smallest = learnt.smallest;
   const share = smallest ? `${Number((100 * smallest.share).toPrecision(2))} % of the pump’s flow` : "";
   const size = !smallest ? "not known" : smallest.lpm === null ? share : `${Number((1000 * smallest.lpm).toPrecision(2))} mL/min`;
-  const half = !smallest ? "" : smallest.halved_by === null ? "More days alone do not halve it: twice the load does." : `${smallest.halved_by * learnt.count} healthy days instead of ${learnt.count} halve it.`;
+  const half = !smallest ? "" : smallest.halved_by === null ? "More healthy days alone do not halve this: twice the load does." : `${smallest.halved_by * learnt.count} healthy days instead of ${learnt.count} would halve this.`;
   const keyOf = (file) => app.keys.find((key) => key === file || key.endsWith(`/${file}`) || app.rows.get(key)?.name === file);
   const outliers = [...learnt.left_out.map((text) => [text.split(":")[0], text, true]), ...Object.entries(learnt.problems).flatMap(([file, texts]) => texts.map((text) => [file, `${file}: ${text}`, false]))];
   place.replaceChildren(
     make("h3", { text: `${machine.name} is commissioned from ${learnt.count} days` }),
-    make("div", { class: "figures" }, make("span", {}, make("span", { class: "quiet", text: "The next recording shows a leak of " }), make("span", { class: "big", text: size }), make("span", { class: "quiet", text: smallest && smallest.lpm !== null ? ` (${share})` : "" })), make("span", { text: half })),
+    make("div", { class: "figures" }, make("span", {}, make("span", { class: "quiet", text: "Smallest leak that the next recording will show: " }), make("span", { class: "big", text: size }), make("span", { class: "quiet", text: smallest && smallest.lpm !== null ? ` (${share})` : "" })), make("span", { text: half })),
     outliers.length ? make("h4", { text: "Days that stand out" }) : make("p", { class: "fine", text: "No day stands out of the others." }),
     make("ul", {}, ...outliers.map(([file, text, out]) => make("li", { class: out ? "bad" : "warning" }, make("span", { text: `${text} ` }), keyOf(file) ? make("button", { type: "button", class: "small", text: "see where", "aria-label": `see where ${file} stands out`, onclick: () => judgeAndGo(keyOf(file)) }) : null))),
     make("p", {}, make("span", { text: `Saved as ${learnt.file} beside the session. Save a copy: ` }), make("a", { href: `/machine/${encodeURIComponent(learnt.file)}`, download: learnt.file, text: learnt.file }), make("span", { text: ", " }), make("a", { href: `/machine/${encodeURIComponent(learnt.file.replace(/toml$/, "healthy"))}`, download: "", text: "its summaries" })),

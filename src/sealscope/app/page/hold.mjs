@@ -27,7 +27,7 @@ async function judge(again) {
       page.replaceChildren(make("a", { href: written.address, target: "_blank", rel: "noopener", text: `reports/${written.page}` }));
     });
     const tone = { pass: "fine", fail: "bad", undecided: "warning" }[result.result] || "";
-    place.append(make("div", { class: "panel" }, make("p", { class: `verdict-line ${tone}`, text: `${words}${result.limit ? `: ${result.limit}` : ""}` }), make("p", { text: result.reason }), make("pre", { text: result.text, tabindex: "0", "aria-label": "Result" }), make("button", { type: "button", text: "Write the page", onclick: write }), page));
+    place.append(make("div", { class: "panel" }, make("p", { class: `verdict-line ${tone}`, text: `${words}${result.limit ? `, limit ${result.limit}` : ""}` }), make("p", { text: result.reason }), make("pre", { text: result.text, tabindex: "0", "aria-label": "Result" }), make("button", { type: "button", text: "Write the page", onclick: write }), page));
     if (!result.curve) continue;
     const { t, values, fit, low, high, channel, unit } = result.curve;
     const held = new Linked();

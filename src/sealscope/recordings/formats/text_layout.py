@@ -38,6 +38,8 @@ _N_ROWS = 100  # rows from which the dialect is detected
 _DIALECTS = (*product("\t;", ".,"), (",", "."), *product("|", ".,"), (",", ","), *product(" ", ".,"))
 #: A digit and a letter after it, which may begin a unit or be an SI prefix, but not the exponent of the number.
 _QUANTITY = re.compile(r"\d[ \u00a0\u202f]{0,2}(?![eEdDT][+-]?\d)(?:[^\W\d_]|[%\u00b0])")
+#: A number, date or time, which names nothing, such as the start in a preamble.
+_VALUE = re.compile(r"[+-]?\d[-+\d.,:/TZ ]*")
 _RULER = re.compile(r"[-=_:+]{1,80}")
 _MAX_HEADING = 12  # most lines of a heading
 _SPACED_LABEL = re.compile(r"\S+(?:\s{0,20}(?:\[[^\]]{0,40}\]|\([^)]{0,40}\)))?")
@@ -322,7 +324,7 @@ def _prefix_groups(names: Sequence[str], row: Sequence[str]) -> list[str] | None
     pairs = [(group, name) for group, name in zip(groups, names, strict=False) if name]
     n_pairs, n_names = len({*pairs}), len({name for _, name in pairs})
     has_channels = any(Label.parse(text).name.casefold() in channel_names for text in names)
-    has_quantity = any(map(is_quantity, cells)) and not has_channels
+    has_quantity = any(is_quantity(cell) and not _VALUE.fullmatch(cell) for cell in cells) and not has_channels
     tells_apart = n_pairs == len(pairs) > n_names
     is_above_each = bool(repeated) and not has_channels and cells[0] in ("", names[0])  # the time is in no group
     if not filled or not (has_quantity or tells_apart or is_above_each):
