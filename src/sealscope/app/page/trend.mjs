@@ -26,7 +26,7 @@ export async function update() {
       ? trend.recorded.map((point) => ({ t: point.start, value: point.leak, bound: point.bound, leak: point.verdict === "leak", label: `${point.file}: ${point.leak === null ? (point.bound === null ? point.verdict : `below ${litres(point.bound)} L/min`) : `${litres(point.leak)} L/min`}` }))
       : (trend.points || []).filter((point) => point.value !== null).map((point) => ({ t: point.start, value: point.value, low: point.low, high: point.high, leak: trend.verdict === "leak" && trend.limit !== null && point.low > trend.limit, label: `${point.file}: ${litres(point.value)} ${trend.unit}` }));
     const unit = recorded || !trend.known ? "L/min" : `${trend.unit}${trend.pressure ? ` at ${litres(trend.pressure / 1e5)} bar` : ""}`;
-    const leaking = trend.recorded.filter((point) => point.verdict === "leak").map((point) => point.file), single = leaking.length ? `Judged a leak by itself: ${leaking.join(", ")}; see Verdict. The trend compares means of whole recordings. ` : "";
+    const leaking = trend.recorded.filter((point) => point.verdict === "leak").map((point) => point.file.split("/").pop()), single = leaking.length ? `Judged a leak by itself: ${leaking.join(", ")}; see Verdict. The trend compares means of whole recordings. ` : "";
     const words = single + (trend.known ? `${trend.verdict}: ${trend.reason}. ${leaking.length ? "" : trend.next}` : recorded ? "" : "Not estimated yet.");
     const page = make("p", { role: "status" }), left = (trend.points || []).filter((point) => point.note);
     return [
