@@ -42,6 +42,7 @@ KEYS = {
     "limit": dict,
     "evidence": dict,
     "state": dict,
+    "holds": list,
 }
 VERDICTS = {"leak", "no leak", "cannot tell"}
 FOREIGN = ("--map", "p_A=PG_1", "--map", "p_B=PG_2", "--rate", "1000")

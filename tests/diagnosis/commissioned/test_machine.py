@@ -231,8 +231,8 @@ def test_a_map_that_no_recording_fits_is_refused(healthy, tmp_path):
     columns = [healthy[0].t, *(healthy[0][name] for name in ("p_A", "p_B", "x"))]
     head = "t [s],p_A [Pa],p_B [Pa],Weg [m]"
     np.savetxt(tmp_path / "day.csv", np.column_stack(columns), delimiter=",", header=head, comments="")
-    for wrong in ("Weg*p_A m", "Lage"):
-        with refusal(wrong):
+    for wrong, word in (("Weg*p_A", "unit of length"), ("Lage", "Lage")):
+        with refusal(word):
             ss.commission(tmp_path, map={"p_A": "p_A", "p_B": "p_B", "x": wrong})
     assert "x" in ss.commission(tmp_path, map={"p_A": "p_A", "p_B": "p_B", "x": "Weg"}).healthy[0].units
 

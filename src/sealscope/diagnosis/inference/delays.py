@@ -4,16 +4,16 @@ A channel c that arrives later by tau from some time on reads c(t - tau). To the
 then misses the term tau dV/dt, where V is what the channel contributes: A dx for the position, C dp for a pressure. The
 columns of these terms are the second differences of the channels (`equations.balances.with_delays`, `terms.LAG`).
 
-The coefficient of such a column is tested for a step while the leakage, the constant flow and the chambers' compliances
-are free in each block. A leak, air or another zero of a sensor thus never counts as a delay, however they change. The
-posterior odds that the delay has changed are
+The coefficient of such a column is tested for a step while the leakage by either law, the constant flow and the
+chambers' compliances are free in each block. A leak, air or another zero of a sensor thus never counts as a delay,
+however they change. The posterior odds that the delay has changed are
 
     odds = r mean(L(onset)) / L_0 * sqrt(2 pi) s f(tau),
 
 with the likelihoods L and L_0 with a step and without (`onset`), their mean being over all onsets, the fitted change
 tau with its standard error s, the prior density f of its size, and the prior odds r (`delay` in `priors.toml`). If they
-exceed 1, the channel is shifted back by tau, and its samples about the onset count as missing. The search is repeated
-until no further change is found.
+exceed 1, and the shifted channel leaves a smaller residual, the channel is shifted back by tau, and its samples about
+the onset count as missing. The search is repeated until no further change is found.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information, solve
-from sealscope.diagnosis.inference.equations.terms import LAG, delay_name
+from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -116,7 +116,8 @@ def align_samples(
         if best is None or best.log_odds <= 0.0 or len(changes) == MAX_CHANGES:
             break
         shift = _find_shift(samples, best, compute_blocks, columns, clock)
-        if shift is None:
+        # the test is of the first order in the delay: the shifted channel itself must describe the flow better
+        if shift is None or not shift.residual < _residual_square(blocks, columns):
             break
         samples, blocks = shift.samples, shift.blocks
         found.setdefault(best.channel, best)
@@ -131,8 +132,11 @@ def score_delays(blocks: Blocks, columns: Sequence[ColumnRoles], clock: SampleCl
     onset is widened by half a test function, since a row shows a part of a change within it.
     """
     coarse = blocks.merge(INFERENCE.blocks.coarse)  # a delay need be dated to a fraction of the recording only
-    leak_free = _free_in_blocks(coarse, columns, [[roles.leak, roles.bias] for roles in columns])
-    all_free = _free_in_blocks(coarse, columns, [[roles.leak, roles.bias, *roles.compliance] for roles in columns])
+    leakage = [_leakage_columns(roles) for roles in columns]
+    leak_free = _free_in_blocks(coarse, columns, leakage)
+    all_free = _free_in_blocks(
+        coarse, columns, [[*free, *roles.compliance] for free, roles in zip(leakage, columns, strict=True)]
+    )
     total = coarse.gram.sum(axis=0)
     tests = []
     for channel in DELAYED:
@@ -147,6 +151,11 @@ def score_delays(blocks: Blocks, columns: Sequence[ColumnRoles], clock: SampleCl
         onset = Interval(value, low - margin, high + margin)
         tests.append(DelayTest(channel, test, change, _change_log_odds(test, change), onset))
     return tests
+
+
+def _leakage_columns(roles: ColumnRoles) -> list[int | None]:
+    """Return the indices of leakage by either law, laminar or through an orifice, and of the constant flow."""
+    return [roles.leak, roles.names.index(ORIFICE) if ORIFICE in roles.names else None, roles.bias]
 
 
 def _delay_column(roles: ColumnRoles, channel: str) -> int | None:
@@ -306,10 +315,15 @@ def _remaining_change(blocks: Blocks, columns: Sequence[ColumnRoles], found: Del
 
 
 def _residual_square(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
-    """Compute the mean square of the rows' residuals, after a fit of all coefficients that any machine has."""
-    total, square = blocks.gram.sum(axis=0), 0.0
+    """Compute the mean square of the rows' residuals, after a fit of all coefficients that any machine has.
+
+    Leakage and constant flow are free in each block.
+    """
+    free = [_leakage_columns(roles) for roles in columns]
+    total = _free_in_blocks(blocks.merge(INFERENCE.blocks.coarse), columns, free).gram.sum(axis=0)
+    square = 0.0
     for equation, roles in zip(total, columns, strict=True):
-        nuisance = list(roles.nuisance)
+        nuisance = [k for k in roles.nuisance if k not in (roles.leak, roles.bias)]
         fitted = solve(equation[np.ix_(nuisance, nuisance)], equation[nuisance, roles.left])
         square += float(equation[roles.left, roles.left] - fitted @ equation[nuisance, roles.left])
     return max(square, 0.0) / max(float(blocks.rows.sum()), 1.0)
