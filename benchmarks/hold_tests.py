@@ -6,7 +6,7 @@ Bores of 25 to 250 mm, loads on either side, laminar and turbulent leaks past pi
 warm, steady, cooling or warming, with and without a thermometer, valves that settle, seals that stick and slip, and
 loggers of 0.1 to 1000 Hz with encoder steps, correlated noise and drift. The plant is integrated here, second by
 second, and shares no code with the estimator. Truth of the creep is the leak's flow over the area; where oil cools
-unlogged it is the mean speed of the piston.
+unlogged it is the mean speed of the piston over the hold, without what settles.
 """
 
 from __future__ import annotations
@@ -148,10 +148,8 @@ def record(random, plant, logger):
     if plant["thermal"] != "unlogged" and random.random() < (1.0 if plant["thermal"] == "logged" else 0.7):
         values["T_oil"] = np.round(10.0 * (320.0 + np.interp(t, t_plant, T))) / 10.0
     units = {name: "m" if name == "x" else "K" if name == "T_oil" else "Pa" for name in values}
-    speed = (
-        float(s[-1] - s[min(len(s) - 1, int(5 * plant["settle_time"] / (t_plant[1])))]) if not plant["stop"] else 0.0
-    )
-    speed /= max(float(t_plant[-1] - t_plant[min(len(s) - 1, int(5 * plant["settle_time"] / t_plant[1]))]), 1e-9)
+    settled = plant["settle"] * -np.expm1(-t_plant[-1] / plant["settle_time"])
+    speed = 0.0 if plant["stop"] else float(s[-1] - s[0] - settled) / float(t_plant[-1])
     return ss.Recording(t, values, units, rate=logger["rate"]), float(np.mean(flow)), speed
 
 

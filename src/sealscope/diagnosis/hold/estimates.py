@@ -6,7 +6,8 @@ chamber, the oil's relative compression c(p) and its thermal expansion a,
     s(t) - (V/A) (c(p(t)) - c(p(0))) = (Q/A) I(t) - a (V/A) (T(t) - T(0)) + what settles + noise,
 
 where I(t) is the time, weighted by the leak's law |p_A - p_B|^e. `regression` estimates Q/A, with an interval. The
-creep is the slope of s alone; the temperature enters it only if it was logged or stated.
+creep is the mean speed of s; its bends, by compression, the leak's law and oil that cools unlogged, are fitted without
+the chords between their ends. A temperature that was logged or stated is a term of it.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 """
@@ -14,7 +15,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -44,15 +45,20 @@ from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
 #: Lowest absolute pressure [Pa] of oil with free air.
 LOWEST = 2e4
 #: Ratio of the highest to the lowest pressure difference of a hold, above which the law of the leak counts.
-STEADY_PRESSURE = 1.1
+STEADY_PRESSURE = 1.02
 #: Degree of the polynomial that smooths a logged temperature.
 SMOOTH_DEGREE = 3
+#: Time constants [durations of the hold] of the exponentials that such a smooth course has as well, and the number of
+#: its passages from step to step, or of its means, that are needed for them.
+COURSE_TIMES, MIN_PASSAGES = (0.2,), 24
 #: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
 AT_STOP = 3.0
 #: Error of the change of a rounded temperature over a hold, in steps.
 ROUNDED = 0.15
 #: Standard deviation of the logarithm of a time constant within a step of its grid.
 GRID_DEVIATION = 0.3
+#: Least bend of a travel [mm] that is fitted.
+LEAST_BEND = 1e-6
 #: Millimetres of a metre.
 _MM = 1e3
 
@@ -74,6 +80,25 @@ def _exponential(t: Array, time: float, size: float, mean: float = 0.0) -> tuple
     course = np.expm1(-t / time)
     slope = (t / time) * np.exp(-t / time)
     return Column(course, mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
+
+
+def _fit_course(
+    z: Array, values: Array, weights: Array, degree: int, times: Sequence[float]
+) -> Callable[[Array], Array]:
+    """Fit a polynomial of a `degree` and exponentials of `times` to values at z, with `weights` (m,); return it."""
+
+    def basis(z: Array) -> Array:
+        powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, degree)
+        return np.column_stack([powers, *(np.exp(-z / time) for time in times)])
+
+    coefficients = np.linalg.lstsq(weights[:, None] * basis(z), weights * values, rcond=None)[0]
+    return lambda z: np.asarray(basis(z) @ coefficients)
+
+
+def _bend(t: Array, course: Array) -> Array:
+    """Subtract from a `course` at times `t` the chord between its ends: what is left has no mean speed."""
+    chord = course[0] + float(course[-1] - course[0]) * (t - t[0]) / float(t[-1] - t[0])
+    return np.asarray(course - chord)
 
 
 class HeldLoad:
@@ -159,19 +184,21 @@ class HeldLoad:
             return []
         logged = read_channel(self.t[np.isfinite(T)], T[np.isfinite(T)], HOLD.cooling.step)
         weights = 1.0 / np.hypot(logged.loose, max(logged.quantum, 1e-3))
-        degree = max(min(SMOOTH_DEGREE, int(np.count_nonzero(logged.loose == 0.0)) - 1), 1)
-        course = np.polynomial.Polynomial.fit(logged.t, logged.values, degree, w=weights)
+        n_exact = int(np.count_nonzero(logged.loose == 0.0))
+        degree = max(min(SMOOTH_DEGREE, n_exact - 1), 1)
+        times = COURSE_TIMES if n_exact >= MIN_PASSAGES else ()
+        course = _fit_course(logged.t / self.duration, logged.values, weights, degree, times)
         length, deviation = self.column
         scale = -HOLD.cooling.expansion * length
         self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
-        travel = scale * (course(t) - course(0.0))
+        travel = scale * (course(t / self.duration) - course(np.zeros(1)))
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
         return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel, HOLD.cooling.misfit)]
 
     def _misfit(self, t: Array, travel: Array, share: float) -> list[Column]:
         """Build the slope and bends, a `share` of it, that a correction by `travel` [mm] leaves at times `t` [s]."""
         size = share * float(np.ptp(travel))
-        if size == 0.0:
+        if size < share * LEAST_BEND:
             return []
         z = 2.0 * t / self.duration - 1.0
         courses = z, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # slope and bends (Legendre polynomials)
@@ -206,29 +233,59 @@ class HeldLoad:
     def _clocks(self, t: Array) -> list[tuple[float, Array]]:
         """List the time [min] weighted by the laws of a leak, at times `t` [s]: (prior probability, clock)."""
         p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
-        if p is not None:
-            part_t, difference = smooth_course(self.t, p - (P_ATM if other is None else other))
-            difference = np.maximum(difference, 1e-3 * float(np.abs(difference).max()))
-            if difference.max() > STEADY_PRESSURE * difference.min():
-                clocks = []
-                for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
-                    flow = difference**exponent / float(np.mean(difference**exponent))
-                    steps = np.diff(part_t, prepend=0.0)
-                    clocks.append((weight, np.interp(t, part_t, np.cumsum(flow * steps)) / 60.0))
-                return clocks
-        return [(1.0, t / 60.0)]
+        if p is None:
+            return [(1.0, t / 60.0)]
+        clocks = []
+        differences = (
+            [p - P_ATM] if other is None else [p - other, p - P_ATM]
+        )  # past the piston, or out of the cylinder
+        courses = [smooth_course(self.t, difference) for difference in differences]
+        courses = [(part_t, np.maximum(course, 1e-3 * float(np.abs(course).max()))) for part_t, course in courses]
+        if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
+            return [(1.0, t / 60.0)]
+        for part_t, course in courses:
+            for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
+                flow = course**exponent / float(np.mean(course**exponent))
+                steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(part_t)
+                weighted = flow[0] * part_t[0] + np.concatenate([[0.0], np.cumsum(steps)])
+                clocks.append((weight / len(courses), np.interp(t, part_t, weighted) / 60.0))
+        return clocks
 
     @cached_property
     def creep(self) -> RateFit | None:
         """Speed at which the piston sinks [mm/min], with what settles fitted; None without a position."""
         if self.travel is None:
             return None
-        t = self._travel_readings.t
-        cooling = self._cooling(t) if self.set_up.oil_course else [Alternative(1.0)]
-        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._thermal_columns(t)]
-        alternatives = [self._settling(t, HOLD.settling.travel), cooling]
+        t, stopped = self._travel_readings.t, HOLD.settling.stopped
+        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._pressure_bends(t)]
+        if logged := self._thermal_columns(t):
+            thermal = [Alternative(stopped), Alternative(1.0 - stopped, tuple(logged))]
+        elif self.set_up.oil_course:
+            thermal = self._cooling(t)
+        else:
+            thermal = [Alternative(stopped)]
+            for weight, columns in self._cooling(t):
+                bends = tuple(column._replace(values=_bend(t, column.values)) for column in columns)
+                thermal.append(Alternative((1.0 - stopped) * weight, bends))
+        alternatives = [self._settling(t, HOLD.settling.travel), thermal]
         fit = fit_rate(self._travel_readings, base, alternatives, self.duration)
-        return fit._replace(rate=fit.rate.add_error(self.rounding))
+        bent = HOLD.cooling.misfit * float(np.ptp(_bend(t, fit.fit))) / (self.duration / 60.0)
+        return fit._replace(rate=fit.rate.add_error(math.hypot(self.rounding, bent)))
+
+    def _pressure_bends(self, t: Array) -> list[Column]:
+        """Build the bends [mm] of the travel by pressures that change, compression and laws of a leak, at times `t`."""
+        bends, clocks = [], self._clocks(t)
+        if len(clocks) == 1:
+            return []
+        for side in (self.loaded, self.unloaded):
+            if (p := self._pressure(side)) is None:
+                continue
+            part_t, course = smooth_course(self.t, p)
+            compression = relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
+            bends.append(_bend(t, self.column[0] * np.interp(t, part_t, compression)))
+        speed = float(np.ptp(self._travel_readings.values)) / (self.duration / 60.0)
+        bends += [_bend(t, speed * clock) for _, clock in clocks[:: len(EXPONENTS)]]
+        return [Column(bend, 0.0, 1.0) for bend in bends if np.ptp(bend) > LEAST_BEND]
 
     @cached_property
     def _travel_readings(self) -> Readings:
@@ -342,8 +399,10 @@ class HeldLoad:
         base = [*base, *self._thermal_columns(t)]
         alternatives = [self._settling(t, sizes), self._cooling(t)]
         fits, logs = [], []
+        speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
         for weight, clock in self._clocks(t):
-            fits.append(fit_rate(readings, [Column(clock), *base], alternatives, self.duration))
+            law = self._misfit(t, _bend(t, speed * clock), INFERENCE.held_oil.misfit)
+            fits.append(fit_rate(readings, [Column(clock), *base, *law], alternatives, self.duration))
             logs.append(math.log(weight) + fits[-1].log_evidence)
         weights = np.exp(np.array(logs) - max(logs))
         weights /= weights.sum()

@@ -23,6 +23,7 @@ class SettlingPriors(PriorTable):
     present: float  # probability that something settles within the hold
     times: tuple[float, ...]  # [s] time constants
     longest: float  # [durations of the hold] longest of them
+    stopped: float  # probability that oil that cools does not bend the travel, as of a piston at its stop
     travel: tuple[float, ...]  # [mm] standard deviations of the amplitude of a position
     strain: tuple[float, ...]  # standard deviations of the amplitude of the oil's relative compression
 
