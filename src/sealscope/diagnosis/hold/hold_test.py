@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.hold.estimates import HeldLoad
@@ -104,7 +105,8 @@ def hold_test(
     findings, moment = inspect(recording), recording.provenance.get("start")
     date = None if moment is None else str(moment)
     parts = _cut_holds(samples, start, end)
-    return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
+    with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
+        return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
 
 
 def judge_held_recording(
@@ -144,7 +146,7 @@ def _select_samples(recording: Recording) -> Recording:
         if recording.units[name] == COUNTS:
             raise InputError(f"{name} must have a unit, got raw counts: state it, as in --map '{name}=COLUMN[bar]'")
     values = {name: recording[name] for name in names}
-    names = [name for name in names if np.isfinite(values[name]).mean() > 0.5]
+    names = [name for name in names if np.count_nonzero(np.isfinite(values[name])) > 0.5 * len(recording)]
     if not names:
         unused = f"; unused: {join_names(recording.unused)}" if recording.unused else ""
         raise InputError(f"a hold test needs a position, a chamber pressure or a leakage flow, got none{unused}")
