@@ -16,6 +16,7 @@ from pathlib import Path
 import pytest
 
 from sealscope.diagnosis.detectors import detector, registry
+from sealscope.diagnosis.detectors.isolation import call_plug_in
 from sealscope.diagnosis.detectors.registry import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.recordings import write
@@ -289,3 +290,22 @@ def test_what_a_plug_in_prints_is_no_result(tmp_path: Path, short: Recording) ->
     assert [row["file"] for row in rows] == ["log.nc", "log.nc"]
     assert "assumed" in done.stdout  # it was heard
     assert all(done.stderr.count(f"{letter}\n") >= 3 for letter in "ABCD")
+
+
+def test_a_thread_that_waits_forever_leaves_no_signal_behind(monkeypatch):
+    """The flag of an exception for it stayed set, and CPython 3.11 hung in the next function that was profiled."""
+    import sys
+    import threading
+
+    monkeypatch.setattr("sealscope.diagnosis.detectors.isolation.LIMIT_S", 0.1)
+    released = threading.Event()
+    with pytest.raises(TimeoutError):
+        call_plug_in(released.wait)
+    calls = []
+    sys.setprofile(lambda frame, event, argument: calls.append(event))
+    try:
+        sum(len(str(k)) for k in range(100))
+    finally:
+        sys.setprofile(None)
+    released.set()
+    assert len(calls) > 100
