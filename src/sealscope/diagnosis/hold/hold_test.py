@@ -52,9 +52,9 @@ def hold_test(
     ----------
     recording : Recording, optional
         Log of the position, of one or both chamber pressures, or of a flow meter; may be absent with `collected`.
-    area : str, float or sequence of two, optional
+    area : str, float or sequence, optional
         Piston area (``"3117 mm^2"``, or m^2), or those of the sides A and B. Without it no flow is stated.
-    volume : str, float or sequence of two, optional
+    volume : str, float or sequence, optional
         Volume of the held oil, line included (``"1.2 L"``, or m^3); by default it is assumed, with a wide prior.
     limit : str, optional
         Largest creep or leak that passes, such as ``"24 mm in 3 min"``, ``"15 mL/min"`` or
