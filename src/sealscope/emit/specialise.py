@@ -299,7 +299,6 @@ class _Body:
     def _reset(self) -> None:
         """Begin to write anew, with the kinds of variables that are known so far."""
         self._values: dict[str, Value] = {}
-        self._copied: list[Statement] = []
         for name, value in self._arguments.items():
             self._values[name] = value
         self._statements: list[Statement] = []
