@@ -1,10 +1,9 @@
-"""What a run, a run among others and a first run cost for each variant of the rig, beside the thesis's.
+"""What a run and a first run cost for each variant of the rig, beside the thesis's.
 
-    python benchmarks/bench_variants.py [--duration 60] [--runs 32] [--rounds 5] [--variant NAME] [--against FOLDER]
+    python benchmarks/bench_variants.py [--duration 60] [--rounds 5] [--variant NAME] [--against FOLDER]
         [--json FILE]
 
-For each variant, in processor seconds: a run with instruments at the step that is chosen, compiled before; a run of a
-batch, eight to a register on one thread, with the details' RMS; a run's time over that of a run in the batch; and a
+For each variant, in processor seconds: a run with instruments at the step that is chosen, compiled before; and a
 first run with nothing cached, imports not counted. `--against` names a folder with another state of the package (its
 `src`): runs of variants that it knows are timed in turn with this one's, and the ratio is printed.
 """
@@ -12,11 +11,9 @@ first run with nothing cached, imports not counted. `--against` names a folder w
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -93,24 +90,6 @@ class Child:
         self._process.wait()
 
 
-def in_batch(words: tuple[Any, ...], runs: int, rounds: int) -> float:
-    """Processor seconds a run of a batch takes, the least of some rounds."""
-    from sealscope.simulation.batch.batch import simulate_batch
-    from sealscope.simulation.experiment import Experiment
-
-    rig, values, command, duration = words
-    experiments = [Experiment.of(rig=rig, set=values, command=command, duration=duration, seed=k) for k in range(runs)]
-    if experiments[0].target is not None:
-        return math.nan  # batches have no controllers
-    simulate_batch(experiments[:8], threads=1)
-    seconds = []
-    for _ in range(rounds):
-        begun = time.process_time()
-        simulate_batch(experiments, threads=1)
-        seconds.append(time.process_time() - begun)
-    return min(seconds) / runs
-
-
 def measured(words: tuple[Any, ...], options: argparse.Namespace) -> dict[str, Any]:
     """Times of one variant."""
     here = Path(__file__).parents[1] / "src"
@@ -129,7 +108,6 @@ def measured(words: tuple[Any, ...], options: argparse.Namespace) -> dict[str, A
         pairs = np.array([[child.run(), np.nan] for _ in range(options.rounds)])
     child.end()
     figures["run"] = quartiles(pairs[:, 0])
-    figures["in a batch"] = in_batch(words, options.runs, options.rounds)
     return figures
 
 
@@ -137,21 +115,18 @@ def main() -> None:
     """Print a row for each variant."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--duration", type=float, default=60.0)
-    parser.add_argument("--runs", type=int, default=32)
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--variant", action="append", choices=list(VARIANTS), help="this one alone; may be repeated")
     parser.add_argument("--against", type=Path)
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
-    print(f"processor seconds, {options.duration:g} s, batches of {options.runs}")
-    print(f"{'variant':42} {'run':>8} {'in batch':>9} {'of a run':>9} {'first':>7}  over before (middle half), first")
+    print(f"processor seconds, {options.duration:g} s")
+    print(f"{'variant':42} {'run':>8} {'first':>7}  over before (middle half), first")
     figures = {}
     for name in options.variant or VARIANTS:
         rig, values, command = VARIANTS[name]
         own = figures[name] = measured((rig, values, command, options.duration), options)
-        run, batch = own["run"][0], own["in a batch"]
-        beside = f"{batch:9.4f} {run / batch:8.1f}x" if math.isfinite(batch) else f"{'refused':>9} {'':9}"
-        row = f"{name:42} {run:8.4f} {beside} {own['first']:7.2f}"
+        row = f"{name:42} {own['run'][0]:8.4f} {own['first']:7.2f}"
         if "over before" in own:
             middle, low, high = own["over before"]
             row += f"  {middle:.2f} ({low:.2f} to {high:.2f}), {own['first'] / own['first before']:.2f}"

@@ -2,8 +2,8 @@
 
     python benchmarks/run.py [--quick] [--into FOLDER]
 
-Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib), batch.json and variants.json
-into `benchmarks/results` or the folder that is given.
+Writes solvers.json, solvers.svg (work-precision plot; needs matplotlib) and variants.json into `benchmarks/results` or
+the folder that is given.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ HERE = Path(__file__).parent
 
 
 def main() -> None:
-    """Run the scripts in turn, each in a process of its own, on one thread but for the batches."""
+    """Run the scripts in turn, each in a process of its own, on one thread."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="two rounds, two rigs, few runs: to see that all works")
     parser.add_argument("--into", type=Path, default=HERE / "results", help="folder of the figures")
@@ -30,18 +30,16 @@ def main() -> None:
         solvers += ["--plot", str(results / "solvers.svg")]
     else:
         print("no work-precision plot: matplotlib is not installed (pip install 'sealscope[report]')", file=sys.stderr)
-    batch = ["bench_batch.py", "--json", str(results / "batch.json")]
     if chosen.quick:
         solvers += ["--rounds", "2", "--duration", "20", "--case", "no throttles, 3 sin 4t"]
         solvers += ["--case", "50 % closed, 3 sin 4t"]
-        batch += ["--rounds", "2", "--runs", "32", "--duration", "20"]
     variants = ["bench_variants.py", "--json", str(results / "variants.json")]
     if chosen.quick:
-        variants += ["--rounds", "1", "--runs", "8", "--duration", "20"]
+        variants += ["--rounds", "1", "--duration", "20"]
     print(f"{platform.machine()}, {platform.python_implementation()} {platform.python_version()}", flush=True)
     failed = [
         words[0]
-        for words in (solvers, batch, variants)
+        for words in (solvers, variants)
         if subprocess.run([sys.executable, str(HERE / words[0]), *words[1:]], check=False).returncode
     ]
     if failed:

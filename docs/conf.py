@@ -162,17 +162,14 @@ def speed() -> str:
     They are from `benchmarks/run.py` and `benchmarks/speed.py`.
     """
     results = Path(__file__).parents[1] / "benchmarks" / "results"
-    solvers, batch, verdicts = (
-        json.loads((results / f"{name}.json").read_text(encoding="utf-8")) for name in ("solvers", "batch", "speed")
+    solvers, verdicts = (
+        json.loads((results / f"{name}.json").read_text(encoding="utf-8")) for name in ("solvers", "speed")
     )
     lines = ["| 180 s of | milliseconds a run | of the time of C++ |", "| --- | --- | --- |"]
     for case, figures in solvers["figures"].items():
         for peer, (ratio, *_) in figures["promised"].items():
             seconds = figures["solvers"]["ours, step chosen by error"]["seconds"][0]
             lines.append(f"| one run, {case} | {1e3 * seconds:.0f} | {100 * ratio:.0f} % of {peer} |")
-    for case, figures in batch["figures"]["cases"].items():
-        ours, ratio = figures["ours"][0], figures["ratio"][0]
-        lines.append(f"| 256 runs, {case} | {1e3 * ours:.1f} of a core | {100 * ratio:.0f} % |")
     lines += ["", f"Measured {solvers['measured']} on {solvers['machine']}.", ""]
     lines += ["| verdicts | seconds of processor | peak MiB |", "| --- | --- | --- |"]
     lines += [f"| {work} | {row['seconds']:.2g} | {row['MiB']:.0f} |" for work, row in verdicts["rows"].items()]

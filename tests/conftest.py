@@ -6,7 +6,7 @@ import gc
 import logging
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,6 @@ from threadpoolctl import threadpool_limits
 
 from sealscope.diagnosis.detectors import registry
 from sealscope.parameters import Rig, load_rig
-from sealscope.recordings import Recording
-from sealscope.signals.details import details
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import Trajectory, integrate_run
 from sealscope.simulation.leaks import Leak
@@ -27,11 +25,10 @@ from sealscope.simulation.leaks import Leak
 #: The rig of the independent results: 26.7 rad/s per volt, 0.25 MPa everywhere at the start, line volumes of 50 cm^3.
 CHECK_RIG = {"omega_per_volt": 26.7, "p_charge": 0.25e6, "V_1": 50e-6, "V_2": 50e-6}
 HALF_CLOSED = {"orifices": "present", "closed_A": "50 %", "closed_B": "50 %"}
-#: Files and folders that come first and last, in this order. Two processes take file after file. The first file
-#: compiles the simulator for lanes, which takes half a minute; meanwhile the other process runs what needs none of it,
-#: and what is compiled later is loaded. Last come a file that would compile what the other process compiles at that
-#: moment, and folders of short files, so that neither process waits long.
-FIRST = ("campaigns/test_batches.py", "recordings", "reporting")
+#: Files and folders that come first and last, in this order. Two processes take file after file. Last
+#: come a file that would compile what the other process compiles at that moment, and folders of short files, so that
+#: neither process waits long.
+FIRST = ("recordings", "reporting")
 LAST = ("control/test_margins.py", "parameters", "evaluation", "signals", "storage")
 
 
@@ -123,24 +120,6 @@ class Driven:
     """A command as a function of time."""
 
     volts: Callable[[np.ndarray], np.ndarray]
-
-
-@pytest.fixture(scope="session")
-def details_of() -> Callable[..., np.ndarray]:
-    """RMS of d1..d4 and d3d4 of both chambers between bounds [s], straight from the transform: (2, segments, 5)."""
-
-    def rms(recording: Recording, bounds: Sequence[float]) -> np.ndarray:
-        result = np.empty((2, len(bounds) - 1, 5))
-        for channel, name in enumerate(("p_A", "p_B")):
-            one = details(recording[name])
-            inside = one.inside()
-            at = np.clip(np.round(np.asarray(bounds) * recording.rate).astype(int), inside.start, inside.stop)
-            rows = np.vstack([one.values, one.product()[None]])
-            for k in range(len(bounds) - 1):
-                result[channel, k] = np.sqrt(np.mean(rows[:, at[k] : at[k + 1]] ** 2, axis=1))
-        return result
-
-    return rms
 
 
 @pytest.fixture(scope="session")

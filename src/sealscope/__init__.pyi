@@ -25,9 +25,6 @@ from sealscope.recordings import read as read
 from sealscope.recordings import read_parts as read_parts
 from sealscope.recordings import write as write
 from sealscope.reporting.page import report as report
-from sealscope.signals.streams import DetailStream as DetailStream
-from sealscope.signals.windows import RmsStream as RmsStream
-from sealscope.simulation.batch.batch import simulate_batch as simulate_batch
 from sealscope.simulation.experiment import Experiment as Experiment
 from sealscope.simulation.simulate import prove as prove
 from sealscope.simulation.simulate import simulate as simulate

@@ -67,23 +67,6 @@ def test_no_more_processes_than_two_a_core(call, tiny, tmp_path, monkeypatch):
     assert err.startswith("sealscope: --jobs 30: 4 processes are started, two a core\n")
 
 
-@pytest.mark.slow
-def test_in_batches_it_says_so_and_goes_on(call, tiny, tmp_path):
-    folder = tmp_path / "mine"
-    status, out, err = call("campaign", "run", tiny, "-o", folder, "--batch", "-j", "2")
-    assert status == 0, err
-    assert "records: 26 of 26 done" in out
-    assert "Simulated in batches: " in out
-    page = (folder / "report.html").read_text(encoding="utf-8")
-    assert "<dt>simulated</dt><dd>in batches</dd>" in re.sub(r"\s*\n\s*", "", page)
-    rows = (folder / "rows.jsonl").read_bytes()
-    assert call("campaign", "run", tiny, "-o", folder, "--batch")[0] == 0
-    assert (folder / "rows.jsonl").read_bytes() == rows
-    status, _, err = call("campaign", "run", tiny, "-o", folder)
-    assert (status, len(err.splitlines())) == (2, 1)
-    assert "the same mode of making rows" in err
-
-
 def check_page(folder, plan):
     """The page is whole, and asks nothing of a network."""
     page = (folder / "report.html").read_text(encoding="utf-8")
@@ -114,8 +97,6 @@ def test_an_incomplete_campaign_says_so(call, tiny, finished_tiny):
         (("campaign", "run", "no-such-plan"), "plan"),
         (("campaign", "report", "TINY", "-o", "nowhere"), "rows"),
         (("campaign", "run", "TINY", "-o", "nowhere", "-j", "0"), "--jobs, 1"),
-        (("campaign", "run", "bench-volume", "--batch"), "'volume balance'"),
-        (("campaign", "run", "rotary-seal", "--batch"), "--batch"),
         (("campaign", "run", "rotary-seal"), "--data"),
         (("campaign", "run", "rotary-seal", "--data", "nowhere"), "--data"),
         (("campaign", "run", "rotary-seal", "--data", ".", "-o", "."), "--output, --data"),

@@ -18,8 +18,8 @@ from sealscope.monitor.page.live import MAX_ACTUATORS, MAX_SAMPLES, LiveSamples,
 from sealscope.monitor.page.site import PageServer
 from sealscope.monitor.settings import ActuatorSettings, PageSettings
 from sealscope.recordings.recording import Recording
-from sealscope.signals.streams import DetailStream
-from sealscope.signals.windows import RmsStream
+from sealscope.signals.details import details as transform
+from sealscope.signals.windows import windowed_rms
 
 from .plant import is_viewed, until
 
@@ -104,16 +104,15 @@ def test_the_picture_is_that_of_the_samples():
     np.testing.assert_allclose(motion["x"], 20.0 * np.sin(4.0 * at), atol=0.1)  # mm
     np.testing.assert_allclose(motion["v"][1:-1], 80.0 * np.cos(4.0 * at[1:-1]), atol=1.0)  # mm/s
     np.testing.assert_allclose(motion["rpm"], 3.0 * 30.0 / np.pi, atol=0.1)
-    # the details' RMS is that of the library's streams, which take sample by sample
-    stream = DetailStream()
-    rms = RmsStream(1000, 100, skip=stream.settling, first=stream.first)
-    windows = rms.update(stream.update(SENT["p_B"]))
+    windows = windowed_rms(transform(SENT["p_B"]), 1000, 100)
     shown = pictured(SENT, pressure="p_B")["details"]
     np.testing.assert_allclose(shown["t"], SENT.t[windows.ends - 1] - SENT.t[-1], atol=1e-4)
     for level in range(4):
         np.testing.assert_allclose(np.array(shown[f"d{level + 1}"]) * 1e3, windows.rms[level], atol=0.06)
     details = pictured(SENT, detail_form="details")["details"]
-    assert max(details["d4"]) == pytest.approx(DetailStream().update(SENT["p_A"])[3, 225:].max() / 1e3, abs=1e-2)
+    assert max(details["d4"]) == pytest.approx(
+        transform(SENT["p_A"])[4][transform(SENT["p_A"]).inside()].max() / 1e3, abs=1e-2
+    )
 
 
 def test_what_is_missing_is_said_and_a_hole_begins_anew():

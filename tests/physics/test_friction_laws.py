@@ -19,7 +19,6 @@ from sealscope.physics.friction import (
     stribeck_friction,
     stuck_velocity,
 )
-from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment
 
@@ -148,27 +147,3 @@ def test_karnopps_piston_stands_still_until_it_breaks_away():
     stands = np.diff(sticking["x"]) == 0.0
     assert 0.05 < stands.mean() < 1.0
     assert np.ptp(sticking["x"]) > 1e-4
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "throttled", [pytest.param(False, id="free"), pytest.param(True, id="throttled", marks=pytest.mark.long)]
-)
-@pytest.mark.parametrize(
-    "values",
-    [
-        pytest.param({"friction.law": "karnopp", "v_th": 0.004}, id="karnopp", marks=pytest.mark.long),
-        pytest.param({**LUGRE, "backward": 1.3}, id="lugre"),
-    ],
-)
-def test_other_laws_in_lanes_are_what_they_are_alone(check_rig, details_of, throttled, values):
-    quiet = {f"sensors.{name}.{what}": 0.0 for name in ("p_A", "p_B") for what in ("noise", "drift")}
-    rig = check_rig(throttled, **values, **quiet, **{"sensors.common_noise": 0.0})
-    experiments = [
-        Experiment.of(rig=rig, command=f"{3 + k} sin(4t)", duration=4.0, step=2e-4, allow_unresolved=True)
-        for k in (0, 1)
-    ]
-    batch = simulate_batch(experiments, bounds=[0.0, 4.0])
-    for k, one in enumerate(experiments):
-        alone = details_of(simulate_experiment(one).recording, [0.0, 4.0])
-        np.testing.assert_allclose(batch.rms[k, 0], alone[0], rtol=1e-3)

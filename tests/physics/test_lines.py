@@ -29,7 +29,6 @@ from sealscope.physics.restrictors import (
 )
 from sealscope.physics.rig import rig_numbers
 from sealscope.physics.standstill import initial_state
-from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.faults import Fault, parse_fault
 from sealscope.simulation.leaks import opening_from
@@ -304,18 +303,6 @@ def clogged_R(V, R, k):
 
 
 @pytest.mark.slow
-def test_lanes_run_all_parts_as_a_run_by_itself_does(details_of):
-    """Two rigs side by side, each with numbers of its own."""
-    clogging = {**PARTS, "k_clog_A": 2e5, "k_clog_B": 1e5, "n_clog": 1.5, "p_bypass": 5e4, "G_bypass": 1e-9}
-    other = {"R_A": 8e9, "T_f": 0.2, "C_opp": 2e-7, "open_A": 0.4, "k_clog_A": 5e5, "n_clog": 1.0, "p_bypass": 3e4}
-    options = {"command": "3 sin(4t)", "duration": 2.0, "step": 2.5e-4, "allow_unresolved": True}
-    runs = [Experiment.of(rig=rig_with(**{**clogging, **QUIET, **more}), **options) for more in ({}, other)]
-    batch = simulate_batch(runs, bounds=[0.0, 2.0])
-    for k, one in enumerate(runs):
-        np.testing.assert_allclose(batch.rms[k], details_of(simulate_experiment(one).recording, [0.0, 2.0]), rtol=1e-6)
-    assert np.abs(batch.rms[0] / batch.rms[1] - 1.0).max() > 0.01
-
-
 @pytest.mark.parametrize(
     ("values", "fault", "words"),
     [

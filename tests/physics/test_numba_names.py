@@ -97,8 +97,6 @@ import sealscope as ss
 for words in ({{}}, {{"rig": "thesis-closed-loop", "command": "position 20 mm sin(2t)"}}):
     recording = ss.simulate(duration=1.0, **words)
     print(*(f"{{recording[name][-1]:.6g}}" for name in ("x", "p_A", "p_B")))
-batch = ss.simulate_batch([ss.Experiment.of(duration=2.0, seed=seed) for seed in range(2)], bounds=[0.0, 2.0])
-print(*(f"{{value:.6g}}" for value in batch.rms.ravel()))
 """
 
 

@@ -1,19 +1,14 @@
-"""The three transforms: against a slow oracle, perfect reconstruction, noise law, bands, edges, bad input."""
+"""The stationary transform: against a slow oracle, noise law, bands, edges, bad input."""
 
 import numpy as np
 import pytest
-import pywt
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from sealscope.errors import InputError
-from sealscope.signals.details import details, edge_samples, min_samples
-from sealscope.signals.filters import decomposition_filters
+from sealscope.signals.details import details, min_samples
+from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import rms
 
 from ..refusals import refusal
-
-TRANSFORMS = ("stationary", "decimated", "reconstructed")
 
 
 def slow_details(x, wavelet, levels):
@@ -42,26 +37,11 @@ def test_stationary_is_the_formula(wavelet, levels):
     np.testing.assert_allclose(result.values[:, inside], slow_details(x, wavelet, levels)[:, inside], atol=1e-13)
 
 
-@settings(deadline=None, max_examples=40)
-@given(n=st.integers(451, 900), levels=st.integers(1, 4), seed=st.integers(0, 2**32 - 1))
-def test_reconstructed_details_and_the_low_pass_part_sum_up_to_the_signal(n, levels, seed):
-    x = np.random.default_rng(seed).normal(size=n)
-    low_pass, *others = pywt.wavedec(x, "db8", level=levels)
-    approximation = pywt.waverec([low_pass, *map(np.zeros_like, others)], "db8")[:n]
-    result = details(x, levels=levels, transform="reconstructed")
-    np.testing.assert_allclose(result.values.sum(axis=0) + approximation, x, atol=1e-9)
-
-
-def test_white_noise_has_its_sigma_in_every_level_but_not_when_reconstructed():
+def test_white_noise_has_its_sigma_in_every_level():
     sigma, n = 1.23, 200_000
-    x = np.random.default_rng(2).normal(scale=sigma, size=n)
-    for transform in ("stationary", "decimated"):
-        result = details(x, transform=transform)
-        for level, within in zip((1, 2, 3, 4), (0.01, 0.015, 0.02, 0.03), strict=True):
-            assert rms(result[level][result.inside()]) == pytest.approx(sigma, rel=within), (transform, level)
-    result = details(x, transform="reconstructed")
-    assert rms(result[1]) == pytest.approx(sigma / np.sqrt(2), rel=0.01)
-    assert rms(result[2]) / rms(result[1]) == pytest.approx(0.71, abs=0.01)
+    result = details(np.random.default_rng(2).normal(scale=sigma, size=n))
+    for level, within in zip((1, 2, 3, 4), (0.01, 0.015, 0.02, 0.03), strict=True):
+        assert rms(result[level][result.inside()]) == pytest.approx(sigma, rel=within), level
 
 
 def test_each_level_has_unit_norm_exactly():
@@ -71,10 +51,9 @@ def test_each_level_has_unit_norm_exactly():
 
 
 @pytest.mark.parametrize(("rate", "levels"), [(500.0, (2, 3)), (1000.0, (3, 4))])
-@pytest.mark.parametrize("transform", TRANSFORMS)
-def test_the_rigs_70_hz_ringing_falls_into_two_levels(rate, levels, transform):
+def test_the_rigs_70_hz_ringing_falls_into_two_levels(rate, levels):
     t = np.arange(20_000) / rate
-    result = details(np.sin(2 * np.pi * 70.0 * t), transform=transform)
+    result = details(np.sin(2 * np.pi * 70.0 * t))
     energy = (result.values[:, result.inside()] ** 2).mean(axis=1)
     assert sum(energy[level - 1] for level in levels) > 0.95 * energy.sum()
     assert energy.argmax() + 1 == levels[0]
@@ -86,49 +65,28 @@ def test_a_slow_trend_and_the_charge_pressure_are_invisible():
     assert np.abs(result.values[:, result.inside()]).max() < 1e-7
 
 
-@pytest.mark.parametrize(
-    ("transform", "early", "within"),
-    [
-        ("stationary", (5.42, 7.09, 9.21, 13.23), 0.01),
-        ("decimated", (5.0, 5.5, 5.5, 5.5), 0.5),
-        ("reconstructed", (0.0, 0.0, 0.0, 0.0), 0.5),
-    ],
-)
-def test_where_the_energy_of_an_event_stands_in_each_level(transform, early, within):
+def test_where_the_energy_of_an_event_stands_in_each_level():
     result = []
     for at in range(700, 716):  # every phase of the deepest level
         x = np.zeros(1500)
         x[at] = 1.0
-        power = details(x, transform=transform).values ** 2
+        power = details(x).values ** 2
         result.append(at - power @ np.arange(1500) / power.sum(axis=1))
-    np.testing.assert_allclose(np.mean(result, axis=0), early, atol=within)
-
-
-def test_decimated_holds_every_second_to_sixteenth_stationary_coefficient():
-    x = np.random.default_rng(3).normal(size=2000)
-    fine, coarse = details(x), details(x, transform="decimated")
-    for level in (1, 2, 3, 4):
-        step = 2**level
-        held = (np.arange(2000) + 7 * (step - 1)) // step * step - 7 * (step - 1)
-        inside = coarse.inside(level)
-        np.testing.assert_allclose(coarse[level][inside], fine[level][held[inside]], atol=1e-12)
+    np.testing.assert_allclose(np.mean(result, axis=0), (5.42, 7.09, 9.21, 13.23), atol=0.01)
 
 
 @pytest.mark.parametrize("n", [500, 501, 509, 512, 1000])
-@pytest.mark.parametrize("transform", TRANSFORMS)
-def test_the_edges_are_what_the_padding_touches_and_nothing_more(transform, n):
+def test_the_edges_are_what_the_padding_touches_and_nothing_more(n):
     longer = np.random.default_rng(4).normal(size=16 * 50 + n)
-    # the decimated levels have their coefficients at multiples of 16 samples of either signal
-    padded, known = details(longer[400 : 400 + n], transform=transform), details(longer, transform=transform)
+    padded, known = details(longer[400 : 400 + n]), details(longer)
     for level in (1, 2, 3, 4):
         inside = padded.inside(level)
-        assert np.array_equal(padded.edges, edge_samples(transform=transform))
+        assert np.array_equal(padded.edges, reach())
         difference = np.abs(padded[level] - known[level][400 : 400 + n])
         assert difference[inside].max() < 1e-12
-        if transform != "reconstructed":  # tight: the very next sample does see the padding
-            assert difference[inside.start - 1] > 0
-        if transform == "stationary":
-            assert difference[inside.stop] > 0
+        # tight: the very next sample does see the padding
+        assert difference[inside.start - 1] > 0
+        assert difference[inside.stop] > 0
 
 
 @pytest.mark.parametrize("n", [226, 300, 511])
@@ -162,17 +120,14 @@ def test_counts_are_taken_as_numbers():
     assert np.array_equal(details(counts).values, details(counts.astype(float)).values)
 
 
-@pytest.mark.parametrize("transform", TRANSFORMS)
-def test_the_shortest_signal_leaves_one_sample_inside(transform):
-    n = min_samples(transform=transform)
-    result = details(np.ones(n), transform=transform)
+def test_the_shortest_signal_leaves_one_sample_inside():
+    n = min_samples()
+    result = details(np.ones(n))
     assert result.inside().stop - result.inside().start == 1
-    with pytest.raises(
-        InputError, match=f"signal must have at least {n} samples for 4 {transform} levels of db8, got 30"
-    ):
-        details(np.ones(30), transform=transform)
+    with pytest.raises(InputError, match=f"signal must have at least {n} samples for 4 levels of db8, got 30"):
+        details(np.ones(30))
     with pytest.raises(InputError, match=f"got {n - 1}$"):
-        details(np.ones(n - 1), transform=transform)
+        details(np.ones(n - 1))
 
 
 def test_bad_input_is_one_clear_line():
@@ -181,8 +136,6 @@ def test_bad_input_is_one_clear_line():
     holed[[17, 400]] = np.nan
     with refusal("signal", "nan", "sample 17", "2 of 1000"):
         details(holed)
-    with refusal("transform", "'swt'"):
-        details(x, transform="swt")
     with refusal("signal"):
         details(x.reshape(2, 500))
     with refusal("226", "0"):

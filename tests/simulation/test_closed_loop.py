@@ -14,7 +14,6 @@ from sealscope.parameters import load_rig
 from sealscope.physics.rig import pack_numbers, rig_numbers
 from sealscope.physics.solvers.advance import EXPLICIT, advance
 from sealscope.physics.standstill import initial_state
-from sealscope.simulation.batch.batch import simulate_batch
 from sealscope.simulation.closed_loop import outputs_per_sample
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run
@@ -244,8 +243,6 @@ def test_rates_and_voltages_that_cannot_be():
     with refusal("k_v", "-1.0"):
         PositionPI.from_rig(load_rig("thesis"), k_v=-1.0)
     target = Experiment.of(rig="thesis-closed-loop", command="position 10 mm sin(t)", duration=1.0)
-    with refusal("command", "target"):
-        simulate_batch([target])
 
     @dataclass(frozen=True)
     class Broken:

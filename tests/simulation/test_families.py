@@ -9,16 +9,13 @@ import numpy as np
 import pytest
 
 from sealscope.campaigns.plans.reader import load_plan
-from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 from sealscope.parameters.rig import Rig
 from sealscope.physics.rig import rig_numbers
-from sealscope.simulation.batch.run import refuse_unbatchable
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.changes import ParameterDrift, linear_path
 from sealscope.simulation.commands import Alternating, Sine, parse_command
-from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.instruments import filter_first_order, sample_with_jitter
 from sealscope.simulation.simulate import simulate
 
@@ -176,12 +173,6 @@ def test_harmonics_stand_beside_the_hum():
     for order in range(1, 6):
         assert amplitude[200 * order] / psi == pytest.approx(20.0 * 0.5 ** (order - 1), abs=0.05)
     assert amplitude[1200] / psi < 0.05
-
-
-def test_a_batch_refuses_what_its_instruments_do_not_know():
-    for name, value in (("daq.jitter", 1e-4), ("sensors.p_A.lag", 0.01), ("sensors.p_B.hum_harmonics", 0.5)):
-        with pytest.raises(InputError, match=name):
-            refuse_unbatchable(Experiment.of(duration=1.0, set={name: value}), 0)
 
 
 def test_a_duty_in_turn_is_its_sines_one_after_the_other():

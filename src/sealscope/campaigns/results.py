@@ -22,7 +22,7 @@ class CampaignResult:
     """A campaign and its results.
 
     `missing`: number of the plan's records without a row; `judgement`: statistics of the verdicts; `known`: by
-    detector, the information that it was given; `mode`: how a simulated campaign was run, "" for recordings.
+    detector, the information that it was given.
     """
 
     plan: AnyPlan
@@ -30,7 +30,6 @@ class CampaignResult:
     missing: int
     judgement: Judgement
     known: Mapping[str, PriorKnowledge]
-    mode: str = ""
 
 
 def prior_knowledge(plan: AnyPlan) -> dict[str, PriorKnowledge]:
@@ -61,8 +60,7 @@ def judge_simulated_campaign(plan: SimulatedPlan, folder: Path) -> CampaignResul
         rows, plan.detectors, false_alarm=plan.false_alarm, promise=plan.promise, confidence=plan.confidence,
         onset_s=plan.onset_s, hours=plan.duration_s / 3600.0,
     )  # fmt: skip
-    mode = str(store.read_head(folder).get("mode", store.RUN_BY_RUN))
-    return CampaignResult(plan, rows, plan.size - len(rows), judgement, prior_knowledge(plan), mode)
+    return CampaignResult(plan, rows, plan.size - len(rows), judgement, prior_knowledge(plan))
 
 
 def judge_recorded_campaign(

@@ -40,7 +40,6 @@ FolderOption = Annotated[Path | None, Option("--output", "-o", help=_FOLDER)]
 _DATA = "Folder of the recordings, for plans over recordings."
 DataOption = Annotated[Path | None, Option("--data", help=_DATA)]
 _CLUSTER = "A Dask scheduler, e.g. tcp://host:8786."
-_BATCH = "Simulate side by side; for detectors that need only the RMS of wavelet details before and after the onset."
 _TRUST = "Run the controllers that the plan names (FILE.py:NAME): read them first."
 
 
@@ -51,7 +50,6 @@ def run(
     jobs: opt.JobsOption = None,
     cluster: Annotated[str | None, Option("--cluster", metavar="ADDRESS", help=_CLUSTER)] = None,
     retry: Annotated[bool, Option("--retry", help="Carry failed records out again.")] = False,
-    batch: Annotated[bool, Option("--batch", help=_BATCH)] = False,
     trust: Annotated[bool, Option("--trust", help=_TRUST)] = False,
     data: DataOption = None,
 ) -> None:
@@ -66,18 +64,12 @@ def run(
     loaded_plan = load_plan(plan)
     target = _campaign_folder(loaded_plan, folder)
     if not isinstance(loaded_plan, SimulatedPlan):  # a plan over recordings, which are only judged
-        if batch:
-            raise InputError(
-                f"a plan in batches must simulate its records; run it without --batch ({loaded_plan.place})"
-            )
         if _write_report(loaded_plan, target, data):
             raise Exit(1)
         return
     opt.say_jobs(jobs)
     with _show_progress() as progress:
-        state = carry_out(
-            loaded_plan, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, batch=batch, trust=trust
-        )  # fmt: skip
+        state = carry_out(loaded_plan, target, jobs=jobs, cluster=cluster, retry=retry, progress=progress, trust=trust)
     echo(_format_progress(state))
     _write_report(loaded_plan, target, data)
     if state.failed:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import contracted
-from sealscope.physics.lanes import any_lane, exponential
+from sealscope.physics.lanes import exponential
 from sealscope.units import P_ATM
 
 #: 40 and 100 deg C [K], at which data sheets state viscosities.
@@ -29,8 +29,8 @@ def effective_bulk_modulus(p: float, K_oil: float, air: float, n_air: float) -> 
     Source: H. E. Merritt, Hydraulic Control Systems, 1967, effective bulk modulus (1/K is the sum of the compliances of
     liquid and gas). The Simscape library, from which the thesis took its friction law, has the same formula.
     """
-    if not any_lane(air > 0.0):
-        return K_oil + 0.0 * p  # of p's type: a number, or a vector of numbers (lanes)
+    if not air > 0.0:
+        return K_oil
     p_abs = max(p + P_ATM, _MIN_ABSOLUTE_PRESSURE)
     r = air_volume_ratio(p, air, n_air)
     return K_oil * (1.0 + r) / (1.0 + r * K_oil / (n_air * p_abs))

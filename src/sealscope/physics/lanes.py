@@ -1,11 +1,10 @@
-"""Lanes: a numba type for a short vector of numbers, which the physical laws take in place of one number.
+"""Lanes: a numba type for a short vector of numbers, which laws take in place of one number.
 
-One source serves a single run and eight runs on a processor's vector registers (sixteen in single precision). A law
-written without branches on its numbers (`select` instead of `if`) compiles for floats, for `LANES` and for `SINGLES`;
-the type of an array decides which of them `load` reads. Each operation on lanes is one LLVM vector instruction, so
-vectorisation does not depend on the compiler's heuristics. Products and sums may be contracted to fused
-multiply-adds, so a lane and a single run agree to rounding, not to the bit. Lanes exist inside compiled functions
-only: `load` and `store` move them from and to rows of arrays.
+One source serves a single run and sixteen parameter sets on a processor's vector registers. A law written without
+branches on its numbers (`select` instead of `if`) compiles for a double and for `LANES` of single-precision numbers.
+Each operation on lanes is one LLVM vector instruction, so vectorisation does not depend on the compiler's heuristics.
+Products and sums may be contracted to fused multiply-adds, so a lane agrees with a single run to rounding, not to the
+bit. Lanes exist inside compiled functions only: `load` and `store` move them from and to rows of arrays.
 """
 
 from __future__ import annotations
@@ -22,20 +21,17 @@ from numba.extending import lower_builtin, lower_cast, models, register_model
 
 from sealscope.compiled import contracted
 
-#: Lanes of doubles and of single-precision numbers: a register of 512 bits.
-WIDTH = 8
-SINGLE_WIDTH = 2 * WIDTH
+#: Number of lanes of single-precision numbers in a register of 512 bits.
+WIDTH = 16
 _FLAGS = ("contract",)  # LLVM may fuse products and sums
 
 
 class Lanes(types.Type):  # type: ignore[misc]
-    """The numba type of a vector of `width` numbers, its lanes; `number` is their type, float64 or float32."""
+    """The numba type of a vector of `WIDTH` single-precision numbers, its lanes."""
 
-    def __init__(self, number: Any, width: int) -> None:
-        self.number, self.width = number, width
-        element = ir.DoubleType() if number == types.float64 else ir.FloatType()
-        self.llvm_type = ir.VectorType(element, width)
-        super().__init__(name=f"Lanes({number}, {width})")
+    def __init__(self) -> None:
+        self.llvm_type = ir.VectorType(ir.FloatType(), WIDTH)
+        super().__init__(name=f"Lanes({WIDTH})")
 
     def can_convert_from(self, typingctx: Any, source: Any) -> Any:
         """Tell numba that a single number, but no other `source`, can be converted to lanes of equal numbers."""
@@ -47,14 +43,12 @@ class Lanes(types.Type):  # type: ignore[misc]
 class Mask(types.Type):  # type: ignore[misc]
     """The numba type of a vector of truth values, one for each lane of a vector of numbers."""
 
-    def __init__(self, lanes: Lanes) -> None:
-        self.lanes = lanes
-        self.llvm_type = ir.VectorType(ir.IntType(1), lanes.width)
-        super().__init__(name=f"Mask({lanes.width})")
+    def __init__(self) -> None:
+        self.llvm_type = ir.VectorType(ir.IntType(1), WIDTH)
+        super().__init__(name=f"Mask({WIDTH})")
 
 
-LANES, SINGLES = Lanes(types.float64, WIDTH), Lanes(types.float32, SINGLE_WIDTH)
-_MASKS = {LANES: Mask(LANES), SINGLES: Mask(SINGLES)}
+LANES, MASK = Lanes(), Mask()
 
 
 @register_model(Lanes)
@@ -67,32 +61,30 @@ class _VectorModel(models.PrimitiveModel):  # type: ignore[misc]
         super().__init__(manager, vector, vector.llvm_type)
 
 
-def _broadcast(builder: Any, scalar: Any, lanes: Lanes) -> Any:
-    """Build the LLVM instructions that copy the number `scalar` into every lane of a vector of the type `lanes`."""
+def _broadcast(builder: Any, scalar: Any) -> Any:
+    """Build the LLVM instructions that copy the number `scalar` into every lane of a vector."""
     zero = ir.Constant(ir.IntType(32), 0)
-    first_lane = builder.insert_element(ir.Constant(lanes.llvm_type, ir.Undefined), scalar, zero)
-    zeros = ir.Constant(ir.VectorType(ir.IntType(32), lanes.width), [0] * lanes.width)
+    first_lane = builder.insert_element(ir.Constant(LANES.llvm_type, ir.Undefined), scalar, zero)
+    zeros = ir.Constant(ir.VectorType(ir.IntType(32), WIDTH), [0] * WIDTH)
     return builder.shuffle_vector(first_lane, first_lane, zeros)
 
 
-def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any, lanes: Lanes) -> Any:
+def _convert_to_lanes(context: Any, builder: Any, value: Any, value_type: Any) -> Any:
     """Build the LLVM instructions that convert a number of the type `value_type` to lanes; lanes stay as they are."""
     if isinstance(value_type, Lanes):
         return value
-    return _broadcast(builder, context.cast(builder, value, value_type, lanes.number), lanes)
+    return _broadcast(builder, context.cast(builder, value, value_type, types.float32))
 
 
 @lower_cast(types.Number, Lanes)  # type: ignore[untyped-decorator]
 def _cast_to_lanes(context: Any, builder: Any, value_type: Any, lanes: Any, value: Any) -> Any:
     """Convert a number to lanes for a variable that has a number in one branch and lanes in the other."""
-    return _convert_to_lanes(context, builder, value, value_type, lanes)
+    return _convert_to_lanes(context, builder, value, value_type)
 
 
-def _common_lanes_type(arg_types: tuple[Any, ...]) -> Lanes | None:
-    """Find the vector type (lanes) among argument types; None if there is none, if two differ, or for non-numbers."""
-    lanes = {arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)}
-    compatible = len(lanes) == 1 and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
-    return lanes.pop() if compatible else None
+def _have_lanes(arg_types: tuple[Any, ...]) -> bool:
+    """Return True if lanes are among the types of arguments, and all others are single numbers."""
+    return LANES in arg_types and all(isinstance(arg_type, Lanes | types.Number) for arg_type in arg_types)
 
 
 def _define_type(function: Any, infer_type: Any) -> None:
@@ -131,20 +123,19 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
     """Tell numba how a Python function or operator on lanes (vectors of numbers) is compiled.
 
     Its arguments may mix lanes with single numbers. `build(builder, *values)` adds the LLVM instructions to LLVM's
-    `builder` for `values` that are lanes of one type. The result is lanes, or a mask of truth values if `is_test`.
+    `builder` for `values` that are lanes. The result is lanes, or a mask of truth values if `is_test`.
     """
 
     def result_type(arg_types: tuple[Any, ...]) -> Any:
-        """Find the type of the result, None for arguments without a common type of lanes."""
-        lanes = _common_lanes_type(arg_types)
-        return _MASKS[lanes] if is_test and lanes else lanes
+        """Find the type of the result, None for arguments without lanes."""
+        if not _have_lanes(arg_types):
+            return None
+        return MASK if is_test else LANES
 
     def lower(context: Any, builder: Any, sig: Any, args: Any) -> Any:
         """Build the LLVM instructions of one call, with single numbers first converted to lanes."""
-        lanes = _common_lanes_type(sig.args)
-        assert lanes is not None
         pairs = zip(args, sig.args, strict=True)
-        vectors = [_convert_to_lanes(context, builder, value, value_type, lanes) for value, value_type in pairs]
+        vectors = [_convert_to_lanes(context, builder, value, value_type) for value, value_type in pairs]
         return build(builder, *vectors)
 
     _define_type(function, result_type)
@@ -154,11 +145,10 @@ def _define_on_lanes(function: Any, build: Any, *, is_test: bool = False) -> Non
 
 def _lower_division_by_number(context: Any, builder: Any, sig: Any, args: Any) -> Any:
     """Build the LLVM instructions for lanes / number: a product with the reciprocal, which LLVM moves out of loops."""
-    lanes, number_type = sig.args
-    number = context.cast(builder, args[1], number_type, types.float64)
+    number = context.cast(builder, args[1], sig.args[1], types.float64)
     reciprocal = builder.fdiv(ir.Constant(ir.DoubleType(), 1.0), number)
-    reciprocal = context.cast(builder, reciprocal, types.float64, lanes.number)
-    return builder.fmul(args[0], _broadcast(builder, reciprocal, lanes), flags=_FLAGS)
+    reciprocal = context.cast(builder, reciprocal, types.float64, types.float32)
+    return builder.fmul(args[0], _broadcast(builder, reciprocal), flags=_FLAGS)
 
 
 _ARITHMETIC = {operator.add: "fadd", operator.sub: "fsub", operator.mul: "fmul", operator.truediv: "fdiv"}
@@ -172,23 +162,18 @@ _define_on_lanes(operator.neg, lambda builder, a: builder.fneg(a))
 
 
 def _intrinsic_builder(name: str) -> Any:
-    """Return a `build` for `_define_on_lanes` that calls the LLVM intrinsic `name`, such as "sqrt"."""
+    """Return a `build` for `_define_on_lanes` that calls the LLVM intrinsic `name`, such as "fabs"."""
 
     def build(builder: Any, *values: Any) -> Any:
-        """Build the call of the intrinsic, whose full name ends with the vector's type, such as llvm.sqrt.v8f64."""
-        vector = values[0].type
-        bits = 64 if vector.element == ir.DoubleType() else 32
-        function_type = ir.FunctionType(vector, [vector] * len(values))
-        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.v{vector.count}f{bits}")
+        """Build the call of the intrinsic, whose full name ends with the vector's type, such as llvm.fabs.v16f32."""
+        function_type = ir.FunctionType(LANES.llvm_type, [LANES.llvm_type] * len(values))
+        function = cgutils.get_or_insert_function(builder.module, function_type, f"llvm.{name}.v{WIDTH}f32")
         return builder.call(function, values)
 
     return build
 
 
-_define_on_lanes(math.sqrt, _intrinsic_builder("sqrt"))
 _define_on_lanes(abs, _intrinsic_builder("fabs"))
-_define_on_lanes(math.copysign, _intrinsic_builder("copysign"))
-_define_on_lanes(math.pow, _intrinsic_builder("pow"))  # lane by lane
 _define_on_lanes(min, lambda builder, a, b: builder.select(builder.fcmp_ordered("<", b, a), b, a))
 _define_on_lanes(max, lambda builder, a, b: builder.select(builder.fcmp_ordered(">", b, a), b, a))
 
@@ -213,9 +198,8 @@ def select(condition: Any, yes: Any, no: Any) -> Any:
 
 def _select_type(arg_types: Any) -> Any:
     """Find the type of the result of `select`: that of the vectors among its arguments, double if there are none."""
-    if isinstance(arg_types[0], Mask):  # the condition
-        return arg_types[0].lanes
-    return next((arg_type for arg_type in arg_types if isinstance(arg_type, Lanes)), types.float64)
+    has_lanes = isinstance(arg_types[0], Mask) or LANES in arg_types  # [0]: the condition
+    return LANES if has_lanes else types.float64
 
 
 @register_lowering(select, 3, _select_type)
@@ -224,31 +208,17 @@ def _lower_select(context: Any, builder: Any, arg_types: Any, values: Any) -> An
     result_type = _select_type(arg_types)
     pairs = zip(values[1:], arg_types[1:], strict=True)
     if isinstance(result_type, Lanes):
-        yes, no = (_convert_to_lanes(context, builder, value, value_type, result_type) for value, value_type in pairs)
+        yes, no = (_convert_to_lanes(context, builder, value, value_type) for value, value_type in pairs)
     else:
         yes, no = (context.cast(builder, value, value_type, types.float64) for value, value_type in pairs)
     return builder.select(values[0], yes, no)
-
-
-def any_lane(condition: Any) -> Any:
-    """Return True if any truth value of a mask is true; return a single truth value as it is."""
-    return condition
-
-
-@register_lowering(any_lane, 1, lambda _: types.boolean)
-def _lower_any_lane(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `any_lane`: test that a mask's bits, as one integer, are not all zero."""
-    if not isinstance(arg_types[0], Mask):
-        return values[0]
-    bits = ir.IntType(arg_types[0].lanes.width)
-    return builder.icmp_unsigned("!=", builder.bitcast(values[0], bits), ir.Constant(bits, 0))
 
 
 def _float_constant(value_type: Any, value: float) -> Any:
     """Return the LLVM constant of a number, repeated for every lane if `value_type` is a type of vectors (lanes)."""
     if not isinstance(value_type, Lanes):
         return ir.Constant(ir.DoubleType(), value)
-    return ir.Constant(value_type.llvm_type, [value] * value_type.width)
+    return ir.Constant(value_type.llvm_type, [value] * WIDTH)
 
 
 def nearest_integer(x: Any) -> Any:
@@ -262,12 +232,12 @@ def nearest_integer(x: Any) -> Any:
 @register_lowering(nearest_integer, 1, lambda arg_types: arg_types[0])
 def _lower_nearest_integer(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `nearest_integer`: add the constant of x's precision and subtract it again."""
-    large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == SINGLES else _ROUNDING_DOUBLE)
+    large = _float_constant(arg_types[0], _ROUNDING_SINGLE if arg_types[0] == LANES else _ROUNDING_DOUBLE)
     return builder.fsub(builder.fadd(values[0], large, flags=_FLAGS), large, flags=_FLAGS)
 
 
 def power_of_two(n: Any) -> Any:
-    """Compute 2^n for whole n (float or vector of floats) in -1022..1023; single precision limits n to -126..127."""
+    """Compute 2^n for whole n (float or vector of floats) in -1022..1023; for a vector n is limited to -126..127."""
     return math.ldexp(1.0, int(n))
 
 
@@ -275,9 +245,9 @@ def power_of_two(n: Any) -> Any:
 def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `power_of_two`: shift n plus the exponent's bias to the bits of the exponent."""
     n_type, n = arg_types[0], values[0]
-    single = n_type == SINGLES
+    single = n_type == LANES
     integer = ir.IntType(32 if single else 64)
-    integers = ir.VectorType(integer, n_type.width) if isinstance(n_type, Lanes) else integer
+    integers = ir.VectorType(integer, WIDTH) if single else integer
     mantissa_bits = 23 if single else 52
     if single:
         n_min, n_max = _float_constant(n_type, -126.0), _float_constant(n_type, 127.0)
@@ -287,12 +257,8 @@ def _lower_power_of_two(context: Any, builder: Any, arg_types: Any, values: Any)
     # this is faster than converting each lane to an integer
     rounding = _float_constant(n_type, _ROUNDING_SINGLE + 127.0 if single else _ROUNDING_DOUBLE + 1023.0)
     exponent = builder.bitcast(builder.fadd(n, rounding), integers)
-    shift = ir.Constant(integers, [mantissa_bits] * n_type.width if isinstance(n_type, Lanes) else mantissa_bits)
+    shift = ir.Constant(integers, [mantissa_bits] * WIDTH if single else mantissa_bits)
     return builder.bitcast(builder.shl(exponent, shift), n.type)
-
-
-#: Type of the vector in a row of an array, by the numba type of the array's numbers.
-_LANES_OF_DTYPE = {types.float64: LANES, types.float32: SINGLES}
 
 
 def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
@@ -302,30 +268,28 @@ def _row_address(context: Any, builder: Any, arg_types: Any, values: Any) -> Any
     """
     data = context.make_array(arg_types[0])(context, builder, values[0]).data
     row = context.cast(builder, values[1], arg_types[1], types.intp)
-    lanes = _LANES_OF_DTYPE[arg_types[0].dtype]
-    first_element = builder.mul(row, ir.Constant(row.type, lanes.width))
-    return builder.bitcast(cgutils.gep_inbounds(builder, data, first_element), lanes.llvm_type.as_pointer())
+    first_element = builder.mul(row, ir.Constant(row.type, WIDTH))
+    return builder.bitcast(cgutils.gep_inbounds(builder, data, first_element), LANES.llvm_type.as_pointer())
 
 
 def load(array: Any, row: int) -> Any:
     """Load one row of a C-ordered array as lanes (a vector of numbers), in compiled code only (`_lower_load`).
 
-    `array`: (..., WIDTH) doubles, or (..., SINGLE_WIDTH) in single precision; `row`: index of the row, counted over all
-    axes but the last.
+    `array`: (..., WIDTH) in single precision; `row`: index of the row, counted over all axes but the last.
     """
 
 
 def _loaded_type(arg_types: Any) -> Any:
     """Find the type of the vector (lanes) that `load` reads; None unless it gets a suitable array and an integer."""
     array, row = arg_types[:2]  # `_stored_type` passes the vector's type, too
-    is_loadable = isinstance(array, types.Array) and array.dtype in _LANES_OF_DTYPE and array.layout == "C"
-    return _LANES_OF_DTYPE[array.dtype] if is_loadable and isinstance(row, types.Integer) else None
+    is_loadable = isinstance(array, types.Array) and array.dtype == types.float32 and array.layout == "C"
+    return LANES if is_loadable and isinstance(row, types.Integer) else None
 
 
 @register_lowering(load, 2, _loaded_type)
 def _lower_load(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `load`."""
-    return builder.load(_row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
+    return builder.load(_row_address(context, builder, arg_types, values), align=4)
 
 
 def store(array: Any, row: int, value: Any) -> None:
@@ -341,18 +305,8 @@ def _stored_type(arg_types: Any) -> Any:
 @register_lowering(store, 3, _stored_type)
 def _lower_store(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
     """Build the LLVM instructions of `store`."""
-    builder.store(values[2], _row_address(context, builder, arg_types, values), align=arg_types[0].dtype.bitwidth // 8)
+    builder.store(values[2], _row_address(context, builder, arg_types, values), align=4)
     return context.get_dummy_value()
-
-
-def broadcast(value: Any) -> Any:
-    """Copy a number into every lane of a vector of doubles; for compiled code, which `_lower_broadcast` builds."""
-
-
-@register_lowering(broadcast, 1, lambda _: LANES)
-def _lower_broadcast(context: Any, builder: Any, arg_types: Any, values: Any) -> Any:
-    """Build the LLVM instructions of `broadcast`."""
-    return _convert_to_lanes(context, builder, values[0], arg_types[0], LANES)
 
 
 _LOG2_E = 1.4426950408889634
@@ -366,8 +320,8 @@ def exponential(x: Any) -> Any:
     """Compute exp(x) for a number or for lanes (a vector of numbers), with x limited to -708..709.
 
     exp(x) is 2^n times a polynomial in r = x - n ln 2, where n is the whole number nearest to x/ln 2. The relative
-    error is below 1e-14, the same for a number and for lanes. In single precision it is below 2e-6 for x in -60..60;
-    beyond -87..88 the result stays near 2^-126 or 2^127.
+    error is below 1e-14. On lanes, in single precision, it is below 2e-6 for x in -60..60; beyond -87..88 the result
+    stays near 2^-126 or 2^127.
 
     Source: W. J. Cody, W. Waite, Software Manual for the Elementary Functions, 1980 (reduction by ln 2 in two parts);
     Taylor's polynomial, whose remainder for |r| <= ln 2/2 is below 7e-15.

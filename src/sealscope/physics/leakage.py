@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.compiled import contracted, kernel
-from sealscope.physics.lanes import any_lane
 from sealscope.physics.restrictors import orifice_flow
 
 
@@ -29,7 +28,7 @@ def piston_leakage(dp: float, G: float, C: float, dp_0: float) -> float:
     `dp` = p_A - p_B [Pa]; `G`: conductance of the gap [m^3/(s Pa)]; `C`: flow coefficient of the orifice
     [m^3/(s Pa^0.5)], whose flow is linear in dp for |dp| below about `dp_0` [Pa] (`orifice_flow`).
     """
-    if not any_lane(C > 0.0):  # no orifice
+    if not C > 0.0:  # no orifice
         return laminar_leakage(dp, G)
     return laminar_leakage(dp, G) + orifice_flow(dp, C, dp_0)
 

@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 from sealscope.compiled import contracted, law
-from sealscope.physics.lanes import any_lane, select
+from sealscope.physics.lanes import select
 
 
 @law
@@ -73,7 +73,7 @@ def _solve_scaled_flow(b: float, a: float) -> float:
         step = 2.0 * residual * d * d * slope / (2.0 * d * slope * slope - residual * curvature)
         w = w - step
         # convergence is cubic: after this step the relative error is of the order of (step/w)^3 r^2/(a + r)^2
-        if not any_lane(abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r)):
+        if not abs(step * step * step) * r_2 > 1e-12 * square * w * (a + r) * (a + r):
             break
     return w  # type: ignore[no-any-return]
 

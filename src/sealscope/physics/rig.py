@@ -11,8 +11,8 @@ both to the chambers. With throttles, only their two flows are stiff (microsecon
 rest), so the right-hand side is in two parts: `rates_without_throttles` and `throttle_rates`.
 
 The argument `p` is always the rig's numbers, `RigNumbers`. An optional part of the rig (`LAWS`) is an empty tuple in
-`p` if the rig does not have it, so `len(p.valved) > 0` asks for a servo valve. The laws also compile for vectors over
-runs (`lanes`) in place of numbers; `0.0 * v` is a zero of v's type.
+`p` if the rig does not have it, so `len(p.valved) > 0` asks for a servo valve. Laws of the pressure
+response also compile for vectors over parameter sets (`lanes`) in place of numbers.
 """
 
 from __future__ import annotations

@@ -1,21 +1,13 @@
 """Wavelet details d_1 .. d_levels of a complete signal, by PyWavelets.
 
-The thesis's "db8 details" can be read in three ways, which differ in length, in the scale of the levels and in the RMS
-of white noise with standard deviation sigma:
-
-===============  =======================================================  ====================================
-transform        what d_j is                                              RMS of white noise
-===============  =======================================================  ====================================
-`stationary`     a trous transform, unit l2 norm per level (default)      sigma in every level
-`decimated`      Mallat's transform, each coefficient held 2^j samples    sigma in every level
-`reconstructed`  part of the signal from level j; all parts sum up to it  sigma 2^(-j/2): d_2/d_1 = 0.71
-===============  =======================================================  ====================================
+The thesis's "db8 details" are those of the stationary (a trous) transform, with unit l2 norm in each level: white noise
+of standard deviation sigma has the RMS sigma in every level.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,7 +17,6 @@ from sealscope.signals.filters import Array, IntArray, discrete_wavelet, reach, 
 
 #: Quantities of a chamber pressure: its details to level 4, and the sample product of the third and the fourth.
 QUANTITIES = ("d1", "d2", "d3", "d4", "d3d4")
-Transform = Literal["stationary", "decimated", "reconstructed"]
 #: Mode of PyWavelets by which a signal is continued beyond its ends: its mirror image.
 _PADDING = "symmetric"
 
@@ -80,77 +71,37 @@ class Details:
         return slice(int(before), self.values.shape[1] - int(after))
 
 
-def edge_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> IntArray:
-    """Count the samples at the beginning and at the end of each level that can depend on padding, (levels, 2).
-
-    The detail d_j of a sample depends on before_j earlier and after_j later samples (`reach`). The two counts are:
-
-    - stationary: before_j and after_j;
-    - decimated: ``2^j k - before_j`` and after_j, with ``k = ceil(2 before_j / 2^j)``. Coefficient k is repeated from
-      sample ``2^j k - before_j`` on and depends on the before_j samples before that one, so this k is the first without
-      padding;
-    - reconstructed: before_j + after_j at both ends, since analysis and synthesis both reach beyond a sample. This is
-      ``(L - 1)(2^j - 1)`` for filters of L taps.
-
-    At the end of a decimated level, and at both ends of a reconstructed one, the counts are upper limits.
-    """
-    if transform not in get_args(Transform):
-        raise InputError(f"transform must be one of {', '.join(get_args(Transform))}, got {transform!r}")
-    stationary = reach(wavelet, levels)
-    if transform == "stationary":
-        return stationary
-    if transform == "decimated":
-        step = 2 ** np.arange(1, levels + 1, dtype=np.int64)
-        first_coefficient = -(-2 * stationary[:, 0] // step)  # -(-a // b) is a / b, rounded up
-        before = first_coefficient * step - stationary[:, 0]
-        return np.stack([before, stationary[:, 1]], axis=1)
-    total_reach = stationary.sum(axis=1)
-    return np.stack([total_reach, total_reach], axis=1)
-
-
-def min_samples(wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary") -> int:
+def min_samples(wavelet: str = "db8", levels: int = 4) -> int:
     """Compute the length of the shortest signal in which each level has a sample that does not depend on padding.
 
-    It is 226 samples for the stationary transform with db8 to level 4.
+    It is 226 samples for db8 to level 4.
     """
-    deepest_edges = edge_samples(wavelet, levels, transform)[-1]  # the largest of all levels
-    return int(deepest_edges.sum()) + 1
+    deepest_reach = reach(wavelet, levels)[-1]  # the largest of all levels
+    return int(deepest_reach.sum()) + 1
 
 
-def details(
-    signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4, transform: Transform = "stationary"
-) -> Details:
-    """Compute the wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
+def details(signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4) -> Details:
+    """Compute the stationary wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 
-    Let g and h be the wavelet's decomposition filters, high-pass and low-pass, with L taps each. The `transform` is
+    Let g and h be the wavelet's decomposition filters, high-pass and low-pass, with L taps each. Then
+    ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, and a_j is the same with h in place of g
+    (`reach` gives the support of each level). Beyond its ends the signal is continued by its mirror image;
+    `Details.inside` excludes the samples that depend on this padding.
 
-    - "stationary": ``a_0 = signal, d_j[n] = sum_k g[k] a_(j-1)[n + 2^(j-1)(L/2 - k)]``, and a_j is the same with h in
-      place of g (`reach` gives the support of each level);
-    - "decimated": Mallat's transform, with each coefficient of level j repeated 2^j times;
-    - "reconstructed": d_j is the part of the signal that comes from level j.
-
-    Beyond its ends the signal is continued by its mirror image; `Details.inside` excludes the samples that depend on
-    this padding.
-
-    The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4
-    (5 to 6 in each decimated level, 0 in each reconstructed one). A causal system knows d_j of sample n only at sample
-    ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56 and 120 samples later.
+    The alignment is that of PyWavelets: the energy of a pulse appears 5, 7, 9 and 13 samples early in db8's d_1 .. d_4.
+    A causal system knows d_j of sample n only at sample ``n + (L/2)(2^j - 1)``, for db8 8, 24, 56, 120 samples later.
 
     Raises InputError for a signal that is not finite and one-dimensional or is shorter than `min_samples`, for an
-    unknown wavelet or transform, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal
-    Leakage in Hydrostatic Actuation Systems", chapter 5; Mallat, A Wavelet Tour of Signal Processing, 3rd ed. (2009),
-    sections 5.2.2 and 7.3; PyWavelets `swt(norm=False)`, `wavedec`, `waverec`.
+    unknown wavelet, and for invalid levels. Source: "Understanding Effect and Diagnosis of Internal Leakage in
+    Hydrostatic Actuation Systems", chapter 5; Mallat, A Wavelet Tour of Signal Processing, 3rd ed. (2009), section
+    5.2.2; PyWavelets `swt(norm=False)`.
     """
     levels = require_levels(levels)
     x = require_finite(signal, ndim=1)
-    needed = min_samples(wavelet, levels, transform)
+    needed = min_samples(wavelet, levels)
     if x.size < needed:
-        raise InputError(
-            f"signal must have at least {needed} samples for {levels} {transform} levels of {wavelet}, got {x.size}"
-        )
-    methods = {"stationary": _atrous_details, "decimated": _mallat_details, "reconstructed": _inverse_details}
-    values = methods[transform](x, discrete_wavelet(wavelet), levels)
-    return Details(values, edge_samples(wavelet, levels, transform))
+        raise InputError(f"signal must have at least {needed} samples for {levels} levels of {wavelet}, got {x.size}")
+    return Details(_atrous_details(x, discrete_wavelet(wavelet), levels), reach(wavelet, levels))
 
 
 def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
@@ -183,36 +134,3 @@ def _atrous_details(x: Array, wavelet: Any, levels: int) -> Array:
     padded = pywt.pad(x, (before, after), _PADDING)
     _, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
     return np.array([detail[before : before + x.size] for detail in reversed(deepest_first)])
-
-
-def _mallat_details(x: Array, wavelet: Any, levels: int) -> Array:
-    """Compute the decimated details (levels, n), d_1 first, of a signal x (n,) with a `pywt.Wavelet`.
-
-    This is Mallat's transform, with each coefficient of level j repeated 2^j times, so that all levels have the length
-    of the signal.
-    """
-    import pywt
-
-    _, *deepest_first = pywt.wavedec(x, wavelet, mode=_PADDING, level=levels)
-    values = []
-    for level, (before, _) in enumerate(reach(wavelet.name, levels), start=1):
-        # coefficient k of level j is the stationary detail at sample 2^j k - before_j
-        held = np.repeat(deepest_first[-level], 2**level)
-        values.append(held[before : before + x.size])
-    return np.array(values)
-
-
-def _inverse_details(x: Array, wavelet: Any, levels: int) -> Array:
-    """Compute the reconstructed details (levels, n), d_1 first, of a signal x (n,) with a `pywt.Wavelet`.
-
-    Mallat's transform is inverted with the coefficients of one level at a time.
-    """
-    import pywt
-
-    coefficients = pywt.wavedec(x, wavelet, mode=_PADDING, level=levels)  # of the low-pass part, and of d_levels .. d_1
-    values = []
-    for index in range(levels, 0, -1):
-        level_coefficients = [c if i == index else np.zeros_like(c) for i, c in enumerate(coefficients)]
-        # `waverec` returns one sample more for a signal of odd length
-        values.append(pywt.waverec(level_coefficients, wavelet, mode=_PADDING)[: x.size])
-    return np.array(values)

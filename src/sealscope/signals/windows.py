@@ -1,4 +1,4 @@
-"""RMS over sliding windows, of a complete series and of a stream, with identical results.
+"""RMS over sliding windows of a series.
 
 The windows lie over the coefficients of the transformed signal (by default 1000 samples, 500 apart: "Understanding
 Effect and Diagnosis of Internal Leakage in Hydrostatic Actuation Systems", section 5.2). Squares are summed over pieces
@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 from sealscope.errors import InputError
 from sealscope.signals.details import Details
 from sealscope.signals.filters import Array, IntArray, require_finite, require_whole
-from sealscope.storage.plain_state import require_count, require_numbers, require_part
 
 WINDOW_SIZE = 1000
 WINDOW_STEP = 500
@@ -57,121 +56,11 @@ def windowed_rms(
     if isinstance(series, Details):
         inside = series.inside()
         return windowed_rms(series.values[:, inside], size, step, first=first + inside.start)
-    return RmsStream(size, step, first=first).update(require_finite(series, "series"))
-
-
-class RmsStream:
-    """RMS over sliding windows of live series; identical to `windowed_rms`, for blocks of any size.
-
-    For the output of a `DetailStream`, pass its `settling` as `skip` and its `first` as `first`. The result then has
-    the same windows as ``windowed_rms(details)``. A value that is not finite affects only the windows that contain it.
-
-    Parameters
-    ----------
-    size, step : int
-        Number of samples in a window, and from the start of one window to the start of the next.
-    skip : int, default 0
-        Number of values to omit at the beginning of the stream.
-    first : int, default 0
-        Sample number of the first value that is used.
-
-    Raises
-    ------
-    InputError
-        For a size or a step below 1, or a negative skip.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import sealscope as ss
-    >>> stream = ss.RmsStream(100, 50)
-    >>> windows = stream.update(np.ones(120))
-    >>> windows.ends.tolist(), windows.rms.tolist()
-    ([100], [1.0])
-    """
-
-    def __init__(self, size: int = WINDOW_SIZE, step: int = WINDOW_STEP, *, skip: int = 0, first: int = 0) -> None:
-        """Begin a stream without samples; the class describes the parameters."""
-        self.size = require_whole(size, "size", unit=" sample")
-        self.step = require_whole(step, "step", unit=" sample")
-        self._piece = math.gcd(self.size, self.step)  # samples in a piece; windows consist of whole pieces
-        self._skip = require_whole(skip, "skip", 0, " samples")  # samples still to be dropped at the beginning
-        self._next_end = int(first) + self.size  # sample number just after the next window
-        self._rest: Array | None = None  # samples of an incomplete piece, (..., fewer than piece)
-        self._sums: Array | None = None  # sums of squares of the pieces that coming windows need, (..., pieces)
-        self._n_unused = 0  # number of coming pieces before the next window (if step > size)
-
-    def update(self, block: ArrayLike) -> WindowedRms:
-        """Add the next block of samples and return the RMS of the windows that it completes.
-
-        Parameters
-        ----------
-        block : array_like
-            Values (..., n); the leading axes must have the same lengths in all blocks.
-
-        Returns
-        -------
-        WindowedRms
-            `ends` (w,), the number of the sample just after each window, and `rms` (..., w); w may be 0.
-
-        Raises
-        ------
-        InputError
-            If the block is a single number, or its leading axes differ from those of the first block.
-        """
-        x = np.asarray(block, dtype=np.float64)
-        if x.ndim == 0:
-            raise InputError("block must be at least one-dimensional, got a single number")
-        leading_axes = x.shape[:-1]
-        if self._rest is None or self._sums is None:
-            self._rest = self._sums = np.empty((*leading_axes, 0))
-        if leading_axes != self._rest.shape[:-1]:
-            raise InputError(f"block must have leading axes {self._rest.shape[:-1]} as before, got {leading_axes}")
-        n_omitted = min(self._skip, x.shape[-1])
-        self._skip -= n_omitted
-        x = np.concatenate([self._rest, x[..., n_omitted:]], axis=-1)
-        n_full = x.shape[-1] // self._piece * self._piece  # samples in whole pieces, of which windows consist
-        self._rest = x[..., n_full:].copy()
-        sums = np.concatenate([self._sums, _piece_sums(x[..., :n_full], self._piece)], axis=-1)
-        values = _rms_of_pieces(sums[..., self._n_unused :], self.size, self.step)
-        n_windows = values.shape[-1]
-        n_before = self._n_unused + n_windows * (self.step // self._piece)  # pieces before the next window
-        self._sums = sums[..., n_before:].copy()
-        self._n_unused = max(0, n_before - sums.shape[-1])
-        ends = self._next_end + self.step * np.arange(n_windows, dtype=np.int64)
-        self._next_end += n_windows * self.step
-        return WindowedRms(ends, values)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the state of the stream as numbers, None, and arrays, from which `from_state` continues."""
-        return {
-            "size": self.size,
-            "step": self.step,
-            "skip": self._skip,
-            "next_end": self._next_end,
-            "ahead": self._n_unused,  # the name in states saved so far
-            "rest": None if self._rest is None else self._rest.copy(),
-            "sums": None if self._sums is None else self._sums.copy(),
-        }
-
-    @classmethod
-    def from_state(cls, state: dict[str, Any]) -> RmsStream:
-        """Make a stream that continues from a saved `state_dict`; raise InputError if the state is not valid."""
-        size, step, rest, sums = (require_part(state, name, object) for name in ("size", "step", "rest", "sums"))
-        stream = cls(size, step, skip=require_count(state, "skip"))
-        stream._next_end = require_count(state, "next_end")
-        stream._n_unused = require_count(state, "ahead")
-        if rest is None and sums is None:  # saved before the first block
-            return stream
-        try:
-            rest_shape, sums_shape = np.shape(rest), np.shape(sums)
-        except ValueError:  # rows of different lengths
-            rest_shape = sums_shape = ()
-        if not rest_shape or not sums_shape or rest_shape[:-1] != sums_shape[:-1]:
-            raise InputError("saved state must have rest and sums of the same leading axes, got others")
-        stream._rest = require_numbers(state, "rest", rest_shape)
-        stream._sums = require_numbers(state, "sums", sums_shape)
-        return stream
+    x = require_finite(series, "series")
+    size, step = require_whole(size, "size", unit=" sample"), require_whole(step, "step", unit=" sample")
+    piece = math.gcd(size, step)
+    values = _rms_of_pieces(_piece_sums(x[..., : x.shape[-1] // piece * piece], piece), size, step)
+    return WindowedRms(first + size + step * np.arange(values.shape[-1], dtype=np.int64), values)
 
 
 def _piece_sums(x: Array, piece: int) -> Array:
@@ -185,7 +74,7 @@ def _rms_of_pieces(sums: Array, size: int, step: int) -> Array:
     """Compute the RMS (..., windows) of each complete window of `size` samples; one begins every `step` samples.
 
     `sums` (..., pieces): sums of squares of consecutive pieces of gcd(size, step) samples. The sums of a window are
-    added in their order, so that rounding does not depend on how the series is divided into blocks.
+    added in their order.
     """
     piece = math.gcd(size, step)
     pieces_per_window, pieces_per_step = size // piece, step // piece

@@ -87,21 +87,16 @@ def case_experiment(plan: SimulatedPlan, case: CampaignCase) -> Experiment:
     return replace(experiment, leaks=size_leaks_on_short_run(experiment))
 
 
-def sizing_experiment(experiment: Experiment) -> Experiment:
-    """Shorten an experiment to `SIZING_SECONDS` with its leaks open from the start, to find their coefficients."""
-    return replace(
-        experiment,
-        duration=min(experiment.duration, SIZING_SECONDS),
-        leaks=tuple(replace(leak, opening=opening_from(0.0)) for leak in experiment.leaks),
-    )
-
-
 def size_leaks_on_short_run(experiment: Experiment) -> tuple[Leak, ...]:
     """Find the coefficients of an experiment's leaks that give their planned mean flows; return the completed leaks.
 
-    The search uses a short run (`sizing_experiment`), so the true mean flow of the record may differ a little.
+    The search uses a run of at most `SIZING_SECONDS` with the leaks open from the start, so the true mean flow of the
+    record may differ a little.
     """
     if not experiment.leaks:
         return ()
-    sized, _ = run_with_sized_leaks(sizing_experiment(experiment))
+    open_leaks = tuple(replace(leak, opening=opening_from(0.0)) for leak in experiment.leaks)
+    sized, _ = run_with_sized_leaks(
+        replace(experiment, duration=min(experiment.duration, SIZING_SECONDS), leaks=open_leaks)
+    )
     return tuple(replace(leak, opening=planned.opening) for leak, planned in zip(sized, experiment.leaks, strict=True))

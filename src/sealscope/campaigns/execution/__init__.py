@@ -1,1 +1,1 @@
-"""Execution: a campaign's cases run in processes, batches or on a cluster; a folder stores their results."""
+"""Execution: a campaign's cases run in processes or on a cluster; a folder stores their results."""

@@ -10,7 +10,7 @@ from sealscope.campaigns.cases.case import interleave_cases, list_cases
 from sealscope.campaigns.cases.recordings import ProgressCallback
 from sealscope.campaigns.cases.row import CaseRow
 from sealscope.campaigns.cases.scoring import run_case
-from sealscope.campaigns.execution import batches, store
+from sealscope.campaigns.execution import store
 from sealscope.campaigns.execution.workers import iter_results, iter_rows, process_count
 from sealscope.campaigns.plans.duty import check_controllers
 from sealscope.campaigns.plans.model import SimulatedPlan
@@ -29,7 +29,6 @@ def run(
     cluster: str | None = None,
     retry: bool = False,
     progress: ProgressCallback | None = None,
-    batch: bool = False,
     trust: bool = False,
 ) -> store.CampaignProgress:
     """Run the cases of a plan that have no result in `folder` yet, and return the campaign's progress.
@@ -38,26 +37,19 @@ def run(
     - `cluster`: address of a Dask scheduler to use instead
     - `retry`: True to run failed cases again
     - `progress`: called with the numbers of cases done, of all cases, and of failed ones
-    - `batch`: True to simulate cases side by side with `jobs` threads, not one by one in processes
     - `trust`: True to run controllers that the plan names by file or module, whose code may be hostile
 
-    Raises InputError for an untrusted controller, for a folder that has another campaign or is in use by another run,
-    and for a plan that batches cannot run.
+    Raises InputError for an untrusted controller, and for a folder that has another campaign or is in use by another
+    run.
     """
     if jobs is not None and jobs < 1:
         raise InputError(f"--jobs must be >= 1, got {jobs}")
     check_controllers(plan, trust)
     cases = list_cases(plan)
-    mode = store.RUN_BY_RUN
-    if batch:
-        if cluster is not None:
-            raise InputError("--cluster cannot be combined with --batch: a batch runs on one machine")
-        batches.check_plan(plan, cases)
-        mode = batches.IN_BATCHES
     place = Path(folder)
     make_folder(place)
     with lock_rows(place, store.WHAT):
-        store.begin_campaign(place, store.collect_row_inputs(plan, mode))
+        store.begin_campaign(place, store.collect_row_inputs(plan))
         rows = store.read_plan_rows(plan, place)
         if retry:
             rows = {name: row for name, row in rows.items() if row.error is None}
@@ -67,12 +59,9 @@ def run(
         report(n_done, plan.size, n_failed)
         recordings = make_inner_folder(place, RECORDINGS) if plan.keep_recordings else None
         jobs = process_count(jobs)
-        if batch:
-            new_rows = batches.iter_batch_rows(plan, waiting, jobs)
-        else:
-            results = iter_results(partial(run_case, plan, folder=recordings), waiting, jobs, cluster)
-            error = "the process that ran the record died"
-            new_rows = iter_rows(results, lambda case: CaseRow.from_case(case, error=error))
+        results = iter_results(partial(run_case, plan, folder=recordings), waiting, jobs, cluster)
+        error = "the process that ran the record died"
+        new_rows = iter_rows(results, lambda case: CaseRow.from_case(case, error=error))
         for row in store_rows(place, new_rows, store.WHAT):
             n_done += 1
             n_failed += row.error is not None

@@ -27,7 +27,6 @@ _SHARED_ENTRIES = {
     "name": "campaign",
     "world": "rig, bench, length, onset or seed",
     "code": "program code",
-    "mode": "mode of making rows (run by run, or in batches)",
     "false_alarm_within": "false-alarm probability, at which its detectors search within a record",
     "assumed": "rig that its detectors assume",
     "plug_ins": "detectors of other distributions",
@@ -38,8 +37,6 @@ FORMAT = 3
 #: Name of the head's file, and of the folder's content in messages.
 HEAD, WHAT = "campaign.json", "a campaign"
 _MAX_HEAD_BYTES = 1_000_000
-#: Mode of rows that are not made in batches.
-RUN_BY_RUN = "run by run"
 
 
 @dataclass(frozen=True)
@@ -56,11 +53,10 @@ class CampaignProgress:
     seconds: float | None
 
 
-def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str, Any]:
+def collect_row_inputs(plan: SimulatedPlan) -> dict[str, Any]:
     """Collect the inputs on which all rows (results) of a campaign depend, as plain JSON values.
 
-    Title and version of Sealscope are added for readers only. `mode`: how the records are simulated, `RUN_BY_RUN` or
-    `batches.IN_BATCHES`.
+    Title and version of Sealscope are added for readers only.
     """
     detectors = [parse_detector_name(name) for name in plan.detectors]
     # scores of scorers depend neither on the false-alarm probability nor on the assumed rig
@@ -71,7 +67,6 @@ def collect_row_inputs(plan: SimulatedPlan, mode: str = RUN_BY_RUN) -> dict[str,
         "name": plan.name,
         "title": plan.title,
         "world": shared_inputs(plan),
-        "mode": mode,
         "code": code_key(),
         "false_alarm_within": plan.false_alarm if has_verdicts else None,
         "assumed": digest(assumed_values) if has_verdicts else None,
@@ -117,8 +112,8 @@ def read_plan_rows(plan: SimulatedPlan, folder: Path) -> dict[str, CaseRow]:
     the rows belong to another plan, and UnreadableFile if the inputs in a row differ from those of its case.
     """
     rows_by_id = read_rows(folder)
-    if rows_by_id:  # rows from another mode or program code can still be read
-        _check_same_inputs(folder, read_head(folder), collect_row_inputs(plan), ignored=("mode", "code"))
+    if rows_by_id:  # rows from other program code can still be read
+        _check_same_inputs(folder, read_head(folder), collect_row_inputs(plan), ignored=("code",))
     detectors = set(plan.detectors)
     plan_rows: dict[str, CaseRow] = {}
     for case in sorted(list_cases(plan), key=lambda case: case.id):

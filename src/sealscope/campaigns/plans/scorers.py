@@ -16,8 +16,8 @@ import numpy as np
 
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, details, edge_samples, mean_squares
-from sealscope.signals.filters import IntArray
+from sealscope.signals.details import QUANTITIES, details, mean_squares
+from sealscope.signals.filters import IntArray, reach
 
 #: The machine's start is left out of the first part: this many seconds, but at most this fraction of the part.
 START_SECONDS, START_FRACTION = 2.0, 0.05
@@ -43,7 +43,7 @@ def split_bounds(n: int, rate: float, split: int) -> IntArray:
     `START_FRACTION` of the first part. A part without usable samples has end <= begin.
     """
     # samples before and after a sample on which its wavelet details depend: the last level has the longest filter
-    before, after = (int(samples) for samples in edge_samples()[-1])
+    before, after = (int(samples) for samples in reach()[-1])
     begin = max(before, int(min(START_SECONDS * rate, START_FRACTION * split)))
     return np.array([[begin, split - after], [split + before, n - after]])
 

@@ -16,7 +16,7 @@ import numpy as np
 from sealscope.compiled import contracted, law
 from sealscope.physics import rig
 from sealscope.physics.cylinder import pressure_rate
-from sealscope.physics.lanes import any_lane, select
+from sealscope.physics.lanes import select
 from sealscope.physics.rig import RigNumbers
 from sealscope.physics.state import P_1, P_2, P_A, P_B, POSITION, Pressures, State, add_step, add_to_pressures
 from sealscope.units import P_ATM
@@ -105,7 +105,7 @@ def _solve_stage(z: State, h: float, p: RigNumbers) -> tuple[State, Pressures]:
         if max_iterations > 1:
             change_A = max(abs(solved[P_A] - previous[P_A]), abs(solved[P_1] - previous[P_1]))
             change_B = max(abs(solved[P_B] - previous[P_B]), abs(solved[P_2] - previous[P_2]))
-            if not any_lane(max(change_A, change_B) >= STAGE_TOLERANCE):
+            if max(change_A, change_B) < STAGE_TOLERANCE:
                 break
     return solved, s
 

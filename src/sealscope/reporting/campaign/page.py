@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.campaigns.execution.store import RUN_BY_RUN
 from sealscope.campaigns.judging.alarms import AlarmFractions
 from sealscope.campaigns.judging.curves import DetectorPod, SizeRoc
 from sealscope.campaigns.judging.judge import Judgement
@@ -146,7 +145,6 @@ def _notes(result: CampaignResult) -> list[str]:
     with_onset = [name for name, known in result.known.items() if known.onset]
     notes += [_say("true_onset", detectors=", ".join(with_onset))] if with_onset else []
     notes += _prior_knowledge_notes(result)
-    notes += [_say("batched", mode=result.mode)] if _is_batched(result) else []
     notes += [plan.note] if plan.note else []
     notes += [_say("missing", count=result.missing)] if result.missing else []
     notes += [_say("failed", count=len(judgement.failed))] if judgement.failed else []
@@ -168,11 +166,6 @@ def _prior_knowledge_notes(result: CampaignResult) -> list[str]:
     key = "channels" if len(by_channels) == 1 else "channels_of"
     notes = [_say(key, channels=channels, detectors=", ".join(names)) for channels, names in by_channels.items()]
     return notes + [_say("rig", rig=rig, detectors=", ".join(names)) for rig, names in by_rig.items() if rig]
-
-
-def _is_batched(result: CampaignResult) -> bool:
-    """Return True if a campaign's records were simulated in batches, False if one by one or if they are recordings."""
-    return result.mode not in ("", RUN_BY_RUN)
 
 
 def write_campaign_page(result: CampaignResult, path: Path, files: Sequence[str] = ()) -> Path:
@@ -219,7 +212,6 @@ def _facts(result: CampaignResult) -> list[tuple[str, str]]:
         ("records", f"{plan.duration_s:g} s at {plan.rig.daq.sample_rate:g} Hz, leaks open at {plan.onset_s:g} s"),
         *((name, ", ".join(str(level) for level in levels)) for name, levels in plan.factors.items()),
         ("base seed", str(plan.seed)),
-        *([("simulated", result.mode)] if _is_batched(result) else []),
         *((f"channels of view @ {view}" if view else "channels", ", ".join(plan.views[view])) for view in plan.views),
     ]
     if any(parse_detector_name(name).scorer is None for name in plan.detectors):

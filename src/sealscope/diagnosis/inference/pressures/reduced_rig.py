@@ -21,7 +21,7 @@ from sealscope.diagnosis.inference.pressures.fit import Priors
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.physics.cylinder import piston_acceleration, pressure_rate
 from sealscope.physics.friction import coulomb_friction, stribeck_force
-from sealscope.physics.lanes import SINGLE_WIDTH, load, select, store
+from sealscope.physics.lanes import WIDTH, load, select, store
 from sealscope.physics.leakage import laminar_leakage
 from sealscope.physics.motor import controller_voltage, shaft_acceleration, winding_current_rate
 from sealscope.physics.pump import pump_flow, pump_torque
@@ -246,10 +246,10 @@ class Machine(NamedTuple):
         `command` (n + 1,), `states` (8, m): as in `simulate_response`. Returns p_A - p_B (m, n), and the states (8, m)
         at the last sample.
         """
-        lanes = np.minimum(np.arange(SINGLE_WIDTH), len(sets) - 1)  # unused lanes repeat the last set
+        lanes = np.minimum(np.arange(WIDTH), len(sets) - 1)  # unused lanes repeat the last set
         theta = np.ascontiguousarray(sets[lanes, : LAG + 1].T, dtype=np.float32)  # without scale and offset
         ends = np.ascontiguousarray(states[:, lanes], dtype=np.float32)
-        out = np.empty((command.size - 1, SINGLE_WIDTH), dtype=np.float32)
+        out = np.empty((command.size - 1, WIDTH), dtype=np.float32)
         simulate_response(command, self.rate, self.n_substeps, theta, ends, self.numbers, out)
         return out[:, : len(sets)].T.astype(np.float64, order="C"), ends[:, : len(sets)].astype(np.float64)
 

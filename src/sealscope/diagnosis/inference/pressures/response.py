@@ -51,7 +51,7 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
 )
 from sealscope.diagnosis.inference.pressures.samples import block_edges, find_unmet_requirement, mains_waves
 from sealscope.diagnosis.priors.pressures import PRESSURE
-from sealscope.physics.lanes import SINGLE_WIDTH
+from sealscope.physics.lanes import WIDTH
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording, compute_once
@@ -271,7 +271,7 @@ def fit_from_priors(segment: Segment, total: Array, noise: float) -> Linearisati
         `values` maps the index of a varied parameter to its value in each variant (16,). The result has the shape
         (16/n_groups, n_groups, p), the best of each group first.
         """
-        sets = np.tile(theta, (SINGLE_WIDTH, 1))
+        sets = np.tile(theta, (WIDTH, 1))
         for parameter, column in values.items():
             sets[:, parameter] = column
         order = section.residual_squares(sets).reshape(n_groups, -1).argsort(axis=1).T
@@ -301,8 +301,8 @@ def fit_from_conductances(segment: Segment, noise: float) -> Linearisation:
 
     The fit starts from the best of several conductances. `noise`: variance of the noise [Pa^2].
     """
-    sets = np.tile(segment.priors.centre, (SINGLE_WIDTH, 1))
-    sets[1:, G] = _geometric_grid(*PRESSURE.jump["G"], count=SINGLE_WIDTH - 1)
+    sets = np.tile(segment.priors.centre, (WIDTH, 1))
+    sets[1:, G] = _geometric_grid(*PRESSURE.jump["G"], count=WIDTH - 1)
     best_starts = sets[segment.residual_squares(sets).argsort()[:_N_CONDUCTANCES]]
     return fit_from_starts(segment, best_starts, noise, n_best=2)
 
@@ -467,8 +467,8 @@ class Follower:
         if not is_explained(candidates[0][0], segment.n_samples):
             # the grid of the conductance after a jump is absolute, that of the stiffness relative to the current one
             for parameter, unit, jump in ((G, 1.0, PRESSURE.jump["G"]), (K_OIL, self.theta[K_OIL], PRESSURE.jump["K"])):
-                sets = np.tile(self.theta, (SINGLE_WIDTH, 1))
-                sets[:, parameter] = unit * _geometric_grid(*jump, count=SINGLE_WIDTH)
+                sets = np.tile(self.theta, (WIDTH, 1))
+                sets[:, parameter] = unit * _geometric_grid(*jump, count=WIDTH)
                 best = int(segment.residual_squares(sets).argmin())
                 candidates.append(fit_candidate(sets[best], self._prior(block_s, jumped=parameter)))
         _, fit, prior = min(candidates, key=lambda candidate: candidate[0])

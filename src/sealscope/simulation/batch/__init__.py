@@ -1,1 +1,0 @@
-"""Many experiments at once, reduced to statistics while they run."""
