@@ -336,7 +336,7 @@ class WatchedActuators:
                 raise
             self._unread_files[rig] = time.monotonic() + _RETRY_S
             reason = str(error) if isinstance(error, SealscopeError) else describe_error(error)
-            self.supervisor.part(part).begin_outage(f"{reason}: the machine read before stays")
+            self.supervisor.part(part).begin_outage(f"the machine read before stays: {reason}")
             return make(self._machines[rig])
         self._machines[rig] = watched
         if self._unread_files.pop(rig, None) is not None:

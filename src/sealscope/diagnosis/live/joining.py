@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.live.unwrapping import AngleUnwrapper
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
@@ -69,7 +70,7 @@ class SampleRun(NamedTuple):
 class SampleJoiner(SavedAttributes):
     """Divide the samples of an actuator into runs without a gap."""
 
-    SAVED: ClassVar = ("is_final", "names", "rate", "newest", "changed", "counters")
+    SAVED: ClassVar = ("is_final", "names", "rate", "newest", "changed", "counters", "angle")
     SAVED_TYPES: ClassVar = {"names": tuple[str, ...], "counters": dict[str, int]}
 
     ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
@@ -79,6 +80,7 @@ class SampleJoiner(SavedAttributes):
     newest: float = -math.inf  # time of the newest sample [s]
     changed: bool = False  # True if `rate` differs from the rate of the last run
     counters: dict[str, int] = field(default_factory=dict)  # numbers of dropped samples and of interruptions, by reason
+    angle: AngleUnwrapper = field(default_factory=AngleUnwrapper)  # for the pump's angle theta
 
     def count(self, reason: str, number: int = 1) -> None:
         """Add `number` to the counter called `reason`."""
@@ -109,6 +111,10 @@ class SampleJoiner(SavedAttributes):
                 self.count("gap")
             self.newest = float(samples.t[stop - 1])
             channels = {name: samples[name][first:stop] for name in self.names}
+            if "theta" in channels:
+                channels["theta"], n_wraps = self.angle.unwrap(channels["theta"])
+                if n_wraps:
+                    self.count("wraps of the motor angle, undone", n_wraps)
             yield SampleRun(samples.t[first:stop], channels, self.rate, has_no_gap and not self.changed)
             self.changed = False
 
