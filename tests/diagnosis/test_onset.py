@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
-from scipy.stats import binom
+from scipy.stats import binom, truncnorm
 
 from sealscope.diagnosis.inference.onset import (
     MIN_BLOCKS,
+    Estimate,
     Information,
     NullLaw,
     StepTest,
@@ -312,3 +313,17 @@ def test_a_turbulent_part_of_the_healthy_leakage_is_no_step_but_a_leak_beside_it
     assert chance(values + 3.0 * step(30, 60.0), turbulent=True) < 1e-4
     # a part that is larger than believed is not explained away
     assert chance(values + 100.0 * shape, turbulent=True) < 1e-3
+
+
+@pytest.mark.parametrize("value", [-30.0, -2.0, -0.3, 0.0, 0.4, 1.9, 1.97, 8.0])
+def test_a_flow_that_is_never_negative_keeps_its_95_percent(value: float) -> None:
+    """The interval holds 95 % of the normal distribution truncated at 0, and is the usual one far above 0."""
+    deviation = 0.7
+    estimate = Estimate(value * deviation, deviation)
+    interval = estimate.nonnegative_interval()
+    probability = truncnorm(-value, np.inf, loc=estimate.value, scale=deviation).cdf
+    mass = probability(interval.high) - probability(interval.low)
+    assert 0.0 <= interval.low <= interval.value <= interval.high
+    # with half the tail beyond the end at 0 cut off, the usual interval holds up to 97.5 %
+    assert 0.95 - 1e-6 <= mass <= 0.976
+    assert interval.low > 0.0 or mass == pytest.approx(0.95, abs=1e-6)

@@ -34,6 +34,7 @@ D. D. Boos, J. Am. Statist. Assoc. 89 (1994) 1012 (supremum over a confidence se
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -96,6 +97,21 @@ class Estimate(NamedTuple):
 
     value: float
     deviation: float
+
+    def nonnegative_interval(self) -> Interval:
+        """Compute the 95 % interval of a quantity that is never below 0, such as a flow down a pressure difference.
+
+        Where the interval of the normal distribution begins below 0, it is that from 0 to the 95 % quantile of the
+        distribution truncated at 0, and the value is at least 0.
+        """
+        half_width = WITHIN_95 * self.deviation
+        if self.value >= half_width:
+            return Interval(self.value, self.value - half_width, self.value + half_width)
+        from scipy.special import log_ndtr, ndtri_exp
+
+        log_tail = math.log(1.0 - BOUND_PROBABILITY) + float(log_ndtr(self.value / self.deviation))
+        high = self.value - self.deviation * float(ndtri_exp(log_tail))
+        return Interval(max(self.value, 0.0), 0.0, high)
 
 
 class Interval(NamedTuple):

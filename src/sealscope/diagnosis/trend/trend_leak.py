@@ -122,7 +122,7 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
     """Add the error of the machine's sizes to the interval of the present leakage `total` [L/min]."""
     half_width = WITHIN_95 * total.value * size_deviation  # part of the error that is due to the sizes
     below, above = (float(np.hypot(end - total.value, half_width)) for end in (total.low, total.high))
-    return TotalLeakage(total.value, (total.value - below, total.value + above), pressure)
+    return TotalLeakage(max(total.value, 0.0), (max(total.value - below, 0.0), max(total.value + above, 0.0)), pressure)
 
 
 def _report_ringing(before: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:

@@ -438,9 +438,9 @@ class BalanceLeak(LeakMeasure):
         limit, lpm_per_flow = healthy_leakage(balance.rig), size.scale / LITRE_PER_MINUTE
         lpm = interval_lpm = None
         if flow is not None and size.stated:
-            lpm = flow.value * lpm_per_flow
-            half_width = WITHIN_95 * float(np.hypot(flow.deviation, flow.value * size.deviation)) * lpm_per_flow
-            interval_lpm = (lpm - half_width, lpm + half_width)
+            deviation = float(np.hypot(flow.deviation, flow.value * size.deviation))
+            lpm, *interval = Estimate(flow.value * lpm_per_flow, deviation * lpm_per_flow).nonnegative_interval()
+            interval_lpm = (interval[0], interval[1])
         return TotalLeakage(
             lpm=lpm,
             interval_lpm=interval_lpm,
