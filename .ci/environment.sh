@@ -28,8 +28,8 @@ cd "$work/checkout"
 "$python" -m venv "$work/venv"
 . "$work/venv/bin/activate"
 
-# install_system_packages: what some tests need of the system: a browser, a broker, a proxy, a database; they skip where
-# these cannot be installed
+# install_system_packages: what some tests need of the system: a browser, a broker, a proxy, a database, a compiler for
+# controllers; they skip where these cannot be installed
 install_system_packages() {
     if ! command -v apt-get >/dev/null || [ "$(id -u)" != 0 ]; then return; fi
     local wanted=()
@@ -37,6 +37,7 @@ install_system_packages() {
     command -v mosquitto >/dev/null || wanted+=(mosquitto)
     command -v nginx >/dev/null || wanted+=(nginx)
     ls /usr/lib/postgresql/*/bin/initdb >/dev/null 2>&1 || wanted+=(postgresql)
+    command -v arm-none-eabi-gcc >/dev/null || wanted+=(gcc-arm-none-eabi libnewlib-arm-none-eabi)
     if [ ${#wanted[@]} -gt 0 ]; then
         (apt-get install -qq -y "${wanted[@]}" || (apt-get update -qq && apt-get install -qq -y "${wanted[@]}")) \
             >/dev/null 2>&1 || true

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
+from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings, stream_kernels, stream_layout
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.compiler import find_compiler
 from sealscope.emit.run_program import CompiledStream
@@ -55,6 +56,33 @@ def c_stream(unit):
     return CompiledStream(unit, render_c(unit, **WORDS), "leak")
 
 
+def numba_results(unit, samples):
+    """Results after each block, by the kernels that numba compiles on the record of the same layout."""
+    kernels, n_parts = stream_kernels(unit.settings), parts_a_sample(unit.settings)
+    start, add_sample, advance, write = (
+        getattr(kernels, name) for name in ("start", "add_sample", "advance", "write_results")
+    )
+
+    @numba.njit(error_model="numpy")
+    def run(memory, samples, results):
+        m, n = memory[0], 0
+        start(m)
+        for k in range(len(samples)):
+            n_ended, was_busy = m.n_ended, m.phase != 0
+            add_sample(m, samples[k, 0], samples[k, 1], samples[k, 2], samples[k, 3])
+            was_busy = was_busy or m.n_ended != n_ended
+            for _ in range(n_parts):
+                advance(m)
+            if was_busy and m.phase == 0:
+                write(m, results[n])
+                n += 1
+        return n
+
+    results = np.zeros((len(samples), len(RESULTS)))
+    n = run(np.zeros(1, stream_layout(unit.settings)), samples, results)
+    return results[:n]
+
+
 def run_st(unit, samples, learned=()):
     """Results of the monitor's function block after each block of the stream, and the block."""
     program = Program(render_st(unit, **WORDS, learned=learned)["leak.st"])
@@ -80,6 +108,28 @@ def test_structured_text_computes_what_c_computes():
     results, _ = run_st(unit, samples)
     assert len(results) >= 4 and np.count_nonzero(expected[:, 0]) >= 2
     assert results == pytest.approx(expected[-len(results) :], rel=1e-9, abs=1e-25)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2])
+def test_c_equals_the_compiled_kernels_to_the_bit(seed):
+    """Arrays share memory in both; with lost readings, numbers that are none, and a leak."""
+    unit, random = unit_at(25.0), np.random.default_rng(seed)
+    samples = samples_of(machine(seed, G=step(0.0, 4e-13, at=90.0), duration=140.0, rate=25.0))
+    samples = np.concatenate([samples[:2000], nuisances(samples[2000:], random)])
+    results = numba_results(unit, samples)
+    expected = np.array(list(c_stream(unit).feed(samples, parts_a_sample(unit.settings))))
+    assert len(expected) > 25
+    assert np.array_equal(results[-len(expected) :], expected)
+
+
+def test_a_state_of_a_controller_is_small():
+    """Of every kind of machine that a stream runs for, at usual rates: 64 kB in double, 48 kB in single precision."""
+    for rig, rate in (("thesis", 100.0), ("thesis", 500.0), ("single-rod-eha", 100.0)):
+        fields = stream_program(StreamSettings.from_rig(ss.load_rig(rig), rate)).program.fields
+        doubles = sum((8 if field.kind == "real" else 4) * (field.size or 1) for field in fields)
+        assert doubles <= 64000
+        assert sum(4 * (field.size or 1) for field in fields) <= 48000
 
 
 @pytest.mark.slow

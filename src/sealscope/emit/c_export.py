@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from sealscope.diagnosis.inference.rows.row_weights import MAX_ITERATIONS, SUPPORT
 from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED
 from sealscope.diagnosis.live.kernel.step import MAX_ONSETS
-from sealscope.diagnosis.live.kernel.stream import HALVINGS, ONSETS_A_CALL, StreamSettings
+from sealscope.diagnosis.live.kernel.stream import ADDED_A_CALL, HALVINGS, WEIGHED_A_CALL, StreamSettings
 from sealscope.emit.c99 import CText
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.stream_program import StreamProgram, result_rows
@@ -45,8 +45,9 @@ def templates() -> jinja2.Environment:
 def most_parts() -> int:
     """Compute the most parts of the work at the end of a block."""
     weighting = (MAX_ITERATIONS + 1) * (2 * SUPPORT + 2)
-    onsets = math.ceil(MAX_ONSETS / ONSETS_A_CALL)
-    return weighting + SUPPORT + 3 * LEARNED + 1 + onsets * (HALVINGS + 2) + 3
+    using = SUPPORT + 4 * LEARNED + 2
+    testing = math.ceil(MAX_ONSETS / WEIGHED_A_CALL) + math.ceil(MAX_ONSETS / ADDED_A_CALL) * (HALVINGS + 1)
+    return weighting + using + testing + 3
 
 
 def parts_a_sample(settings: StreamSettings) -> int:

@@ -110,14 +110,47 @@ class Several:
 Value = Expression | Known | Record | View | Several
 
 
-def state_fields(layout: np.dtype[Any], prefix: str = "") -> Iterator[StateField]:
-    """Yield the fields of a state record, those of nested records with their names joined by an underscore."""
-    for name, (dtype, *_) in (layout.fields or {}).items():
+def _iter_fields(layout: np.dtype[Any], prefix: str = "", begin: int = 0) -> Iterator[tuple[StateField, int, int]]:
+    """Yield the fields of a state record with their begin and end in bytes, those of nested records, too.
+
+    The names of nested records and their fields are joined by an underscore.
+    """
+    for name, (dtype, offset, *_) in (layout.fields or {}).items():
         if dtype.fields:
-            yield from state_fields(dtype, f"{prefix}{name}_")
+            yield from _iter_fields(dtype, f"{prefix}{name}_", begin + offset)
         else:
             size = int(np.prod(dtype.shape)) if dtype.shape else None
-            yield StateField(prefix + name, _kind_of(dtype.base), size)
+            yield StateField(prefix + name, _kind_of(dtype.base), size), begin + offset, begin + offset + dtype.itemsize
+
+
+def allocate_fields(layout: np.dtype[Any]) -> tuple[tuple[StateField, ...], dict[str, tuple[str, int]]]:
+    """Find the fields of a state record, where arrays that overlap become one array.
+
+    Returns the fields, and for each of the arrays that overlap, by its name, the common array and the index of its
+    first number in it. Raises InputError if fields other than arrays of real numbers overlap.
+    """
+    groups: list[list[tuple[StateField, int, int]]] = []
+    reach = 0
+    for entry in sorted(_iter_fields(layout), key=lambda entry: entry[1]):
+        if groups and entry[1] < reach:
+            groups[-1].append(entry)
+        else:
+            groups.append([entry])
+        reach = max(reach, entry[2])
+    fields: list[StateField] = []
+    places: dict[str, tuple[str, int]] = {}
+    for group in groups:
+        if len(group) == 1:
+            fields.append(group[0][0])
+            continue
+        names = [field.name for field, _, _ in group]
+        if any(field.kind != "real" or field.size is None for field, _, _ in group):
+            raise InputError(f"fields of a state that overlap must be arrays of real numbers, got {', '.join(names)}")
+        begin, end = group[0][1], max(last for _, _, last in group)
+        common = f"shared_{len({name for name, _ in places.values()})}"
+        fields.append(StateField(common, "real", (end - begin) // 8, f"at different times {', '.join(names)}"))
+        places |= {field.name: (common, (first - begin) // 8) for field, first, _ in group}
+    return tuple(fields), places
 
 
 def specialise(layout: np.dtype[Any], entries: Mapping[str, tuple[Any, Mapping[str, Any]]]) -> Program:
@@ -140,7 +173,7 @@ def specialise(layout: np.dtype[Any], entries: Mapping[str, tuple[Any, Mapping[s
     for name, (kernel, arguments) in entries.items():
         values = {key: _value_of_argument(key, kind, layout) for key, kind in arguments.items()}
         writer.add_function(source_function(kernel), values, name)
-    return Program(tuple(state_fields(layout)), writer.tables, tuple(writer.functions.values()))
+    return Program(writer.fields, writer.tables, tuple(writer.functions.values()))
 
 
 def source_function(kernel: Any) -> Callable[..., Any]:
@@ -167,6 +200,7 @@ class _Writer:
 
     def __init__(self, layout: np.dtype[Any]) -> None:
         self.layout = layout
+        self.fields, self.places = allocate_fields(layout)
         self.functions: dict[Any, Function] = {}
         self.writes_state: set[str] = set()
         self.tables: dict[str, tuple[float | int, ...]] = {}
@@ -670,7 +704,8 @@ class _Body:
             return Element(name, None, kind)
         sizes = tuple(Constant(size, "whole") for size in dtype.shape)
         strides = tuple(int(np.prod(dtype.shape[k + 1 :], dtype=int)) for k in range(len(dtype.shape)))
-        return View(name, kind, Constant(0, "whole"), sizes, strides)
+        common, first = self._writer.places.get(name, (name, 0))
+        return View(common, kind, Constant(first, "whole"), sizes, strides)
 
     def _value_Subscript(self, node: ast.Subscript) -> Value:
         """Return an element or a part of a view, a tuple or a table."""

@@ -83,8 +83,10 @@ class StreamProgram(NamedTuple):
 def stream_program(settings: StreamSettings) -> StreamProgram:
     """Specialise the kernels of a stream to a program whose state includes the results."""
     kernels, layout = stream_kernels(settings), stream_layout(settings)
-    fields: list[Any] = [(name, layout[name]) for name in layout.names or ()]
-    with_results = np.dtype([*fields, ("results", "f8", (len(RESULTS),))])
+    fields = {name: (dtype, offset) for name, (dtype, offset, *_) in (layout.fields or {}).items()}
+    fields["results"] = np.dtype(("f8", (len(RESULTS),))), layout.itemsize
+    formats, offsets = zip(*fields.values(), strict=True)
+    with_results = np.dtype({"names": [*fields], "formats": [*formats], "offsets": [*offsets]})
     write_results = kernels.write_results
 
     @law

@@ -44,18 +44,18 @@ MISFIT = 5  # residual variance of the last block over the usual variance
 class Coefficients(NamedTuple):
     """Nuisances of a volume balance, n in number, and the sums over blocks from which they are computed."""
 
+    # work arrays
+    block: Any  # (n + 2, n + 2): products of one block
+    matrix: Any  # (n, n + 3): normal equations
     sums: Any  # (n + 2, n + 2): weighted products of the columns of nuisances, leak and left side
     values: Any  # (n,): the nuisances
     leak_products: Any  # (n,): products of the leak's column with the nuisances' columns
     numbers: Any  # (6,): by the indices above
-    # work arrays
-    block: Any  # (n + 2, n + 2): products of one block
-    matrix: Any  # (n, n + 3): normal equations
 
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of the arrays of a `Coefficients` with n nuisances, in the order of its fields."""
-    return (n + 2, n + 2), (n,), (n,), (6,), (n + 2, n + 2), (n, n + 3)
+    return (n + 2, n + 2), (n, n + 3), (n + 2, n + 2), (n,), (n,), (6,)
 
 
 @law

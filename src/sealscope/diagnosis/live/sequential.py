@@ -38,6 +38,9 @@ from sealscope.diagnosis.live.kernel.special import LOG_ZERO
 from sealscope.diagnosis.live.kernel.step import (
     ARRAYS,
     LAYOUT,
+    MAX_OLD,
+    MAX_RECENT,
+    PARTS,
     RECENT,
     WALKS,
     find_bound,
@@ -58,8 +61,11 @@ _PRIORS = LIVE.step
 _NOISE_WALK = WALKS.index(0.1)
 #: Largest estimate, in the unit of the first block, whose square fits into a float.
 _MAX_NUMBER = 1e60
-#: Saved numbers of the record, whole ones, and arrays; those of the last two have a column for each onset.
-_NUMBERS, _WHOLE_NUMBERS = ("unit", "count", "log_evidence", "end"), ("n_blocks", "n_onsets", "has_level")
+#: Saved numbers of the record, whole ones, and arrays of the walks.
+_NUMBERS, _WHOLE_NUMBERS = (
+    ("unit", "count", "log_evidence", "end"),
+    ("n_blocks", "n_onsets", "n_stored", "n_old", "has_level"),
+)
 _ARRAYS = ("level", "level_variance", "squares", "log_variances", "log_weights")
 
 
@@ -73,7 +79,8 @@ class StepDetector:
     - `squares`, `count`: T and n of all innovations, with fading memory,
     - `log_weights`: log probability of each q,
     - `log_variances`: sum of log S over all innovations,
-    - `sums` (5, q, j) and `onsets` (j, 5): by the indices of `kernel.step`, for each of `n_onsets` onsets j,
+    - `sums` (5, q, b) and `blocks` (b, 5): by the indices of `kernel.step`, for each of `n_stored` blocks b with
+      onsets; `firsts` (2, q, b) and `variances` (b,): the same of the recent ones, those but the first `n_old`,
     - `log_evidence`: log probability density of all innovations since `forget` without a step, where q may change,
     - `unit`: standard deviation of the first block, the unit in which estimates are stored,
     - `n_blocks`: number of blocks,
@@ -144,13 +151,13 @@ class StepDetector:
 
     def state(self) -> dict[str, Any]:
         """Return the numbers and arrays to save as plain values for JSON, which `load_state` restores exactly."""
-        record, n_onsets = self._memory[0], int(self._memory["n_onsets"][0])
+        record = self._memory[0]
+        n_stored, n_old = int(record["n_stored"]), int(record["n_old"])
         return {
             **{name: float(record[name]) for name in _NUMBERS},
             **{name: int(record[name]) for name in _WHOLE_NUMBERS},
             **{name: plain_array(record[name]) for name in _ARRAYS},
-            "sums": plain_array(record["sums"][:, :, :n_onsets]),
-            "onsets": plain_array(record["onsets"][:n_onsets]),
+            **{name: plain_array(record[name][part]) for name, part in _stored_parts(n_stored, n_old).items()},
         }
 
     def load_state(self, state: Any) -> None:
@@ -158,14 +165,24 @@ class StepDetector:
         memory = np.zeros(1, LAYOUT)
         for name in (*_NUMBERS, *_WHOLE_NUMBERS):
             memory[name] = require_part(state, name, int if name in _WHOLE_NUMBERS else (float, int))
-        n_onsets = int(memory["n_onsets"][0])
-        rows, n_walks, most = ARRAYS["sums"]
-        shapes = {**{name: (n_walks,) for name in _ARRAYS}, "sums": (rows, n_walks, n_onsets), "onsets": (n_onsets, 5)}
-        if not 0 <= n_onsets <= most:
-            raise InputError(f"saved state's n_onsets must be 0 to {most}, got {n_onsets}")
-        for name, shape in shapes.items():
-            values = restore_array(require_part(state, name, object), name)
+        n_onsets, n_stored, n_old = (int(memory[name][0]) for name in ("n_onsets", "n_stored", "n_old"))
+        is_possible = 0 <= n_old <= min(n_stored, MAX_OLD) and n_stored - n_old <= MAX_RECENT
+        if not is_possible or n_onsets != n_old + len(PARTS) * (n_stored - n_old):
+            raise InputError(f"saved state's n_onsets must fit its blocks, got {n_onsets} of {n_stored}, {n_old} old")
+        parts = {**{name: (slice(None),) for name in _ARRAYS}, **_stored_parts(n_stored, n_old)}
+        for name, part in parts.items():
+            values, shape = restore_array(require_part(state, name, object), name), memory[name][0][part].shape
             if values.shape != shape:
                 raise InputError(f"saved state's {name} must have the shape {shape}, got {values.shape}")
-            memory[name][0][tuple(slice(size) for size in shape)] = values
+            memory[name][0][part] = values
         self._memory = memory
+
+
+def _stored_parts(n_stored: int, n_old: int) -> dict[str, tuple[slice, ...]]:
+    """Return the used part of each array that has an entry for each stored block, by name."""
+    recent = slice(n_stored - n_old)
+    used = {"sums": slice(n_stored), "firsts": recent, "variances": recent}
+    return {
+        **{name: (*[slice(None)] * (len(ARRAYS[name]) - 1), size) for name, size in used.items()},
+        "blocks": (slice(n_stored),),
+    }

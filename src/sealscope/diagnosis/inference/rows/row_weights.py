@@ -40,22 +40,26 @@ class Workspace(NamedTuple):
 
     - `weights`, `residual` (r,): weight and magnitude of the residual of each row;
     - `ordered` (r,): copy of `residual`, which the median reorders;
-    - `reduced` (K, c, c): Gram matrices after elimination of the fast coefficients;
+    - `fast` (K, f, c): the f fast coefficients of each block as sums of the other columns;
     - `fit` (K, c - 1): coefficients in each block;
-    - `normal` (s + 1, s + 1): normal equations of the slow coefficients.
+    - `normal` (s + 1, s + 1): normal equations of the slow coefficients;
+    - `reduced` (c, c): a block's Gram matrix, in which the fast coefficients are eliminated.
     """
 
     weights: Any
-    residual: Any
-    ordered: Any
-    reduced: Any
+    fast: Any
     fit: Any
     normal: Any
+    # not used while coefficients are estimated from a block
+    reduced: Any
+    residual: Any
+    ordered: Any
 
 
 def workspace_shapes(rows: int, blocks: int, columns: int, slow: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of a `Workspace`; `columns` includes the left side, `slow` does not."""
-    return (rows,), (rows,), (rows,), (blocks, columns, columns), (blocks, columns - 1), (slow + 1, slow + 1)
+    fast = (blocks, columns - slow - 1, columns)
+    return (rows,), fast, (blocks, columns - 1), (slow + 1, slow + 1), (columns, columns), (rows,), (rows,)
 
 
 @large_law
@@ -110,13 +114,16 @@ def sum_products(values: Any, begin: int, end: int, weights: Any, gram: Any) -> 
     """Write the Gram matrix of the rows `begin` to `end` - 1 of `values` (r, m), with `weights` (r,), to `gram`."""
     width = values.shape[1]
     for i in range(width):
-        for j in range(width):
+        for j in range(i, width):
             gram[i, j] = 0.0
     for r in range(begin, end):
         for i in range(width):
             value = weights[r] * values[r, i]
-            for j in range(width):
+            for j in range(i, width):
                 gram[i, j] += value * values[r, j]
+    for i in range(width):
+        for j in range(i):
+            gram[i, j] = gram[j, i]
 
 
 @large_law
@@ -154,30 +161,39 @@ def reweigh(values: Any, ends: Any, column_order: Any, workspace: Any) -> bool:
     return change < TOLERANCE * count or not limit > 0.0
 
 
-@large_law
-def add_reduced(workspace: Any, earlier_sums: Any, n_blocks: int, n_fast: int, converged: bool) -> None:
-    """Sum the normal equations of the slow coefficients: of earlier blocks, unless `converged`, and of these blocks."""
-    normal, reduced = workspace.normal, workspace.reduced
+@law
+def start_normal(normal: Any, earlier_sums: Any, converged: bool) -> None:
+    """Begin the normal equations of the slow coefficients: with those of earlier blocks, unless `converged`."""
     for i in range(len(normal)):
         for j in range(len(normal)):
             normal[i, j] = 0.0 if converged else earlier_sums[i, j]
-            for block in range(n_blocks):
-                normal[i, j] += reduced[block, n_fast + i, n_fast + j]
+
+
+@law
+def add_reduced(workspace: Any, block: int, n_fast: int) -> None:
+    """Add a block's reduced Gram matrix to the normal equations, and store the rows of its fast coefficients."""
+    normal, reduced = workspace.normal, workspace.reduced
+    for i in range(len(normal)):
+        for j in range(len(normal)):
+            normal[i, j] += reduced[n_fast + i, n_fast + j]
+    for i in range(n_fast):
+        for j in range(len(reduced)):
+            workspace.fast[block, i, j] = reduced[i, j]
 
 
 @large_law
 def fit_blocks(workspace: Any, n_blocks: int, n_fast: int) -> None:
     """Solve the normal equations for the slow coefficients, from which the fast ones of each block follow."""
-    normal, reduced, fit = workspace.normal, workspace.reduced, workspace.fit
+    normal, fast, fit = workspace.normal, workspace.fast, workspace.fit
     n_slow = len(normal) - 1
     left = n_fast + n_slow
     eliminate(normal, n_slow)
     for block in range(n_blocks):
         for i in range(left):
-            fit[block, i] = reduced[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
+            fit[block, i] = fast[block, i, left] if i < n_fast else normal[i - n_fast, n_slow]
         for i in range(n_fast):
             for j in range(n_fast, left):
-                fit[block, i] -= reduced[block, i, j] * fit[block, j]
+                fit[block, i] -= fast[block, i, j] * fit[block, j]
 
 
 @law
@@ -214,12 +230,13 @@ def weigh_rows(
         workspace.weights[r] = 1.0
     converged = n_rows == 0  # then one pass writes Gram matrices of zeros
     for iteration in range(MAX_ITERATIONS + 1):
+        converged = converged or iteration == MAX_ITERATIONS
+        start_normal(workspace.normal, earlier_sums, converged)
         for block in range(n_blocks):
             begin = int(ends[block - 1]) if block else 0
             sum_products(values, begin, int(ends[block]), workspace.weights, gram[block])
-            eliminate_fast(gram[block], column_order, n_fast, workspace.reduced[block])
-        converged = converged or iteration == MAX_ITERATIONS
-        add_reduced(workspace, earlier_sums, n_blocks, n_fast, converged)
+            eliminate_fast(gram[block], column_order, n_fast, workspace.reduced)
+            add_reduced(workspace, block, n_fast)
         if converged:
             break
         fit_blocks(workspace, n_blocks, n_fast)

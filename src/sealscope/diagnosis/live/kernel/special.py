@@ -7,7 +7,7 @@ import math
 from sealscope.compiled import law
 
 #: Logarithm of a number that is 0.
-LOG_ZERO = -1e300
+LOG_ZERO = -1e30
 #: Beyond so many standard deviations the normal distribution is 0 or 1 in double precision.
 _FAR = 37.0
 #: Argument from which Stirling's series for the logarithm of the gamma function is exact to 1e-15.

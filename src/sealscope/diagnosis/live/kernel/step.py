@@ -1,9 +1,15 @@
 """Kernels of the detector of steps (`live.sequential`, whose docstring derives the formulas) on a record of fixed size.
 
-`take_estimate` adds the estimate of a block. `weigh_onset` computes what one possible onset says; when all have been
-weighed, `sum_evidence` computes log M, the onset and the size. `add_exceedance` sums P(rise > x) over the onsets, from
-which `bisect_bound` finds the bound of an undetected rise. Each does little at a time, so that a controller can spread
-them over its cycles.
+`take_estimate` adds the estimate of a block. After `start_evidence`, `weigh_onset` adds what one possible onset says;
+when all have been weighed, `finish_evidence` computes onset and size. `add_exceedance` sums P(rise > x) over the
+onsets, from which `bisect_bound` finds the bound of an undetected rise. Each does little at a time, so that a
+controller can spread them over its cycles.
+
+The filter is linear: a step that acts in the part p of its first block, whose gain is G_1, follows it by the fraction
+p G_1, and then as any other step of the size 1 - p G_1 does. Hence all onsets within a block share the sums over the
+blocks after it, and with the first block's innovation e_1 of the variance S_1
+
+    a = p e_1/S_1 + (1 - p G_1) a',    b = p^2/S_1 + (1 - p G_1)^2 b'.
 """
 
 from __future__ import annotations
@@ -39,8 +45,9 @@ _MIN_SQUARE = 1e-12
 _N_WARM = 4
 #: Number of blocks from one thinning of the onsets to the next.
 _SELECT_EVERY = 8
-#: Most onsets that are stored: those of the last blocks until the next thinning, and those of older ones.
-MAX_ONSETS = (RECENT + _SELECT_EVERY) * _N_PARTS + (RECENT // 4 + 1) * math.ceil(math.log2(HORIZON / RECENT))
+#: Most recent and older blocks with onsets: those since the last thinning, and those that it keeps.
+MAX_RECENT, MAX_OLD = RECENT + _SELECT_EVERY, (RECENT // 4 + 1) * math.ceil(math.log2(HORIZON / RECENT))
+MAX_BLOCKS, MAX_ONSETS = MAX_RECENT + MAX_OLD, MAX_RECENT * _N_PARTS + MAX_OLD
 _LOG_CHOICES = math.log(_N_SIZES * _N_PARTS)
 _LOG_PI = math.log(math.pi)
 #: Least positive number, against division by 0.
@@ -52,37 +59,59 @@ _FAR, BISECTIONS = 12.0, 50
 #: Tail of the posterior on either side of the interval of the onset.
 _TAIL = 0.025
 
-#: Rows of `sums`, for each walk and onset: part of a unit step that the filter has followed (1 - f of the next block),
-#: a, b, T, and log pi_j minus the log likelihood of the blocks before the onset.
-FOLLOWED, A, B, T, LOG_PRIOR = range(5)
-#: Columns of `onsets`: n of the innovations in T, number of the block, time, begin of the block [s], and log evidence
-#: of the blocks before it.
-N, BLOCK, TIME, BLOCK_BEGIN, EVIDENCE = range(5)
-#: Columns of `views`, what an onset says: log of its part of M; log of its posterior probability, but for the time that
-#: it stands for; mean and mean square of the size given the onset.
-_LOG_M, _LOG_POSTERIOR, _SIZE, _SIZE_SQUARE = range(4)
+#: Rows of `sums`, for each walk and block with onsets: f of the next block, for a step that the filter has not followed
+#: in the first block; a' and b' of the blocks after the first; T; log pi_j minus the log likelihood of the blocks
+#: before. Of an old block with one onset, f, a and b are those of this onset.
+RESPONSE, A, B, T, LOG_PRIOR = range(5)
+#: Rows of `firsts`, for each walk and recent block: e_1/S_1 and 1/S_1.
+_FIRST_A, _FIRST_B = range(2)
+#: Columns of `blocks`: n of the innovations in T, number, begin and end [s] of the block with the onsets, and log
+#: evidence of the blocks before it.
+N, BLOCK, BEGIN, END, EVIDENCE = range(5)
 
-#: Arrays of the record, with their shapes, and its numbers: see `live.sequential.StepDetector`.
+#: Arrays of the record, with their shapes, and its numbers: see `live.sequential.StepDetector`. `variances`: of the
+#: first estimate of recent blocks; `posteriors`, `weights`: of each onset, and of each walk and onset.
 ARRAYS: dict[str, tuple[int, ...]] = {
     **dict.fromkeys(("level", "level_variance", "squares", "log_variances", "log_weights"), (_N_WALKS,)),
     **dict.fromkeys(("log_prior", "innovation", "variance", "gain", "square", "likelihood"), (_N_WALKS,)),
-    "sums": (5, _N_WALKS, MAX_ONSETS),
-    "onsets": (MAX_ONSETS, 5),
-    "views": (MAX_ONSETS, 4),
+    "sums": (5, _N_WALKS, MAX_BLOCKS),
+    "firsts": (2, _N_WALKS, MAX_RECENT),
+    "variances": (MAX_RECENT,),
+    "blocks": (MAX_BLOCKS, 5),
+    "posteriors": (MAX_ONSETS,),
     "weights": (_N_WALKS, MAX_ONSETS),
 }
 NUMBERS = (
     *("unit", "count", "log_evidence", "end", "log_e", "onset", "onset_low", "onset_high", "size", "size_deviation"),
     *("heaviest", "largest", "rising", "exceedance", "low", "high", "bound"),
+    # sums over onsets by their posterior weights, relative to the largest, whose logarithm is `reference`
+    *("reference", "weight_sum", "onset_sum", "size_sum", "square_sum"),
 )
-WHOLE_NUMBERS = ("n_blocks", "n_onsets", "has_level")
-LAYOUT = np.dtype(
-    [
-        *((name, "f8") for name in NUMBERS),
-        *((name, "i8") for name in WHOLE_NUMBERS),
-        *((name, "f8", shape) for name, shape in ARRAYS.items()),
-    ]
-)
+#: `n_stored`: blocks with onsets, of which the first `n_old` have one onset, and the others one for each of `PARTS`.
+WHOLE_NUMBERS = ("n_blocks", "n_onsets", "n_stored", "n_old", "has_level")
+#: Arrays of the record that are used only while onsets are weighed and the bound is found.
+SCRATCH = ("posteriors", "weights")
+
+
+def detector_layout(gap: int = 0, sums: int = 0) -> np.dtype[Any]:
+    """Build the layout of the record, with a `gap` of so many numbers before `sums`, which takes `sums` or more.
+
+    A record around it may use the gap. The arrays of `SCRATCH` are the last.
+    """
+    sizes = {name: int(np.prod(shape)) for name, shape in ARRAYS.items()}
+    small = [name for name in ARRAYS if name not in ("sums", *SCRATCH)]
+    formats: list[Any] = [*("f8" for _ in NUMBERS), *("i8" for _ in WHOLE_NUMBERS)]
+    names = [*NUMBERS, *WHOLE_NUMBERS, *small, "sums", *SCRATCH]
+    spans = [1] * len(formats) + [sizes[name] for name in small]
+    spans[-1] += gap
+    spans += [max(sizes["sums"], sums), *(sizes[name] for name in SCRATCH)]
+    places = np.cumsum([0, *spans]) * 8
+    formats += [("f8", ARRAYS[name]) for name in names[len(formats) :]]
+    offsets, end = places[:-1].tolist(), int(places[-1])
+    return np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": end})
+
+
+LAYOUT = detector_layout()
 
 
 @law
@@ -99,7 +128,7 @@ def start_detector(d: Any) -> None:
 @law
 def forget_onsets(d: Any) -> None:
     """Drop the evidence of all blocks so far, and keep the learned noise and random walk."""
-    d.has_level = d.n_onsets = 0
+    d.has_level = d.n_onsets = d.n_stored = d.n_old = 0
     d.log_evidence = 0.0
 
 
@@ -139,7 +168,9 @@ def take_estimate(d: Any, begin: float, end: float, g: float, deviation: float) 
         d.square[q] = d.innovation[q] * d.innovation[q] / d.variance[q]
     if may_begin:
         _add_evidence(d)
-    _add_innovation(d, may_begin)
+    _add_innovation(d)
+    if may_begin:
+        _add_first(d, variance)
     _update_walks(d)
     for q in range(_N_WALKS):
         d.level[q] += d.gain[q] * d.innovation[q]
@@ -149,38 +180,89 @@ def take_estimate(d: Any, begin: float, end: float, g: float, deviation: float) 
 @large_law
 def _add_onsets(d: Any, begin: float, end: float) -> None:
     """Add possible onsets of a step, one for each of `PARTS`, in the block from `begin` to `end` [s]."""
-    if d.n_onsets + _N_PARTS > MAX_ONSETS or d.n_blocks % _SELECT_EVERY == 0:
-        _select_onsets(d)
-    for part in range(_N_PARTS):
-        j = int(d.n_onsets)
-        for q in range(_N_WALKS):
-            d.sums[FOLLOWED, q, j] = d.sums[A, q, j] = d.sums[B, q, j] = 0.0
-            # T begins with its value before the onset; the log likelihood until then is subtracted from the log prior
-            d.sums[T, q, j] = d.squares[q]
-            before = d.count * math.log(d.squares[q]) + d.log_variances[q]
-            d.sums[LOG_PRIOR, q, j] = d.log_prior[q] + 0.5 * before
-        d.onsets[j, N], d.onsets[j, BLOCK], d.onsets[j, BLOCK_BEGIN] = d.count, d.n_blocks, begin
-        d.onsets[j, TIME], d.onsets[j, EVIDENCE] = end - PARTS[part] * (end - begin), d.log_evidence
-        d.n_onsets += 1
+    if d.n_stored >= MAX_BLOCKS or d.n_stored - d.n_old >= MAX_RECENT or d.n_blocks % _SELECT_EVERY == 0:
+        _select_blocks(d)
+    b = int(d.n_stored)
+    for q in range(_N_WALKS):
+        d.sums[RESPONSE, q, b], d.sums[A, q, b], d.sums[B, q, b] = 1.0, 0.0, 0.0
+        # T begins with its value before the onset; the log likelihood until then is subtracted from the log prior
+        d.sums[T, q, b] = d.squares[q]
+        before = d.count * math.log(d.squares[q]) + d.log_variances[q]
+        d.sums[LOG_PRIOR, q, b] = d.log_prior[q] + 0.5 * before
+    d.blocks[b, N], d.blocks[b, BLOCK], d.blocks[b, EVIDENCE] = d.count, d.n_blocks, d.log_evidence
+    d.blocks[b, BEGIN], d.blocks[b, END] = begin, end
+    d.n_stored += 1
+    d.n_onsets += _N_PARTS
 
 
 @large_law
-def _select_onsets(d: Any) -> None:
-    """Keep all onsets of the last `RECENT` blocks, and older ones at the start of blocks on a coarser grid."""
-    n_kept = 0
-    for j in range(int(d.n_onsets)):
-        age = d.n_blocks - int(d.onsets[j, BLOCK])
+def _select_blocks(d: Any) -> None:
+    """Keep all onsets of the last `RECENT` blocks, and the first one of older blocks on a coarser grid."""
+    n_kept = n_old = 0
+    for b in range(int(d.n_stored)):
+        age, recent = d.n_blocks - int(d.blocks[b, BLOCK]), b - int(d.n_old)  # recent: place in `firsts`
         spacing, reach = 2, RECENT
         while reach < age:
             spacing, reach = 2 * spacing, 2 * reach
-        is_on_grid = int(d.onsets[j, BLOCK]) % spacing == 0 and d.onsets[j, TIME] <= d.onsets[j, BLOCK_BEGIN]
-        if age < RECENT or (is_on_grid and age < HORIZON):
-            for row in range(5):
-                d.onsets[n_kept, row] = d.onsets[j, row]
-                for q in range(_N_WALKS):
-                    d.sums[row, q, n_kept] = d.sums[row, q, j]
+        is_recent = age < RECENT and n_kept - n_old < MAX_RECENT - 1
+        if is_recent or (int(d.blocks[b, BLOCK]) % spacing == 0 and age < HORIZON and n_kept < MAX_OLD):
+            for column in range(5):
+                d.blocks[n_kept, column] = d.blocks[b, column]
+            for q in range(_N_WALKS):
+                for row in range(5):
+                    d.sums[row, q, n_kept] = d.sums[row, q, b]
+                if is_recent:
+                    d.firsts[_FIRST_A, q, n_kept - n_old] = d.firsts[_FIRST_A, q, recent]
+                    d.firsts[_FIRST_B, q, n_kept - n_old] = d.firsts[_FIRST_B, q, recent]
+                elif recent >= 0:  # from now on a single onset, at the block's begin
+                    d.sums[A, q, n_kept], d.sums[B, q, n_kept] = _step_sums(d, q, b, 1.0)
+                    d.sums[RESPONSE, q, n_kept] *= _unfollowed(d, q, recent, 1.0)
+            if is_recent:
+                d.variances[n_kept - n_old] = d.variances[recent]
+            else:
+                n_old += 1
             n_kept += 1
-    d.n_onsets = n_kept
+    d.n_stored, d.n_old = n_kept, n_old
+    d.n_onsets = n_old + (n_kept - n_old) * _N_PARTS
+
+
+@law
+def _unfollowed(d: Any, q: int, recent: int, part: float) -> float:
+    """Compute 1 - p G_1: how much of a step in the `part` p of a recent block the filter has not followed in it."""
+    return float(1.0 - part * (1.0 - d.variances[recent] * d.firsts[_FIRST_B, q, recent]))
+
+
+@law
+def _step_sums(d: Any, q: int, b: int, part: float) -> tuple[float, float]:
+    """Compute a and b of a step that acts in a `part` of the stored block b, by the module's docstring."""
+    recent = b - int(d.n_old)
+    later_a, later_b = d.sums[A, q, b], d.sums[B, q, b]
+    if recent < 0:
+        return later_a, later_b
+    rest = _unfollowed(d, q, recent, part)
+    a = part * d.firsts[_FIRST_A, q, recent] + rest * later_a
+    return a, part * part * d.firsts[_FIRST_B, q, recent] + rest * rest * later_b
+
+
+@law
+def _block_of(d: Any, j: int) -> int:
+    """Return the place of the block of onset j."""
+    n_old = int(d.n_old)
+    return j if j < n_old else n_old + (j - n_old) // _N_PARTS
+
+
+@law
+def _part_of(d: Any, j: int) -> float:
+    """Return the part of its first block in which a step at onset j acts."""
+    n_old = int(d.n_old)
+    return PARTS[(j - n_old) % _N_PARTS] if j >= n_old else 1.0
+
+
+@law
+def _time_of(d: Any, j: int) -> float:
+    """Compute the time [s] of onset j."""
+    b, part = _block_of(d, j), _part_of(d, j)
+    return float(d.blocks[b, END] - part * (d.blocks[b, END] - d.blocks[b, BEGIN]))
 
 
 @law
@@ -196,19 +278,29 @@ def _add_evidence(d: Any) -> None:
 
 
 @large_law
-def _add_innovation(d: Any, may_begin: bool) -> None:
-    """Add the block's innovation to the sums of each onset; a step that begins in this block acts in a part of it."""
-    n_onsets = int(d.n_onsets)
-    first_new = n_onsets - _N_PARTS if may_begin else n_onsets
+def _add_innovation(d: Any) -> None:
+    """Add the block's innovation to the sums of each stored block."""
+    n_stored = int(d.n_stored)
     for q in range(_N_WALKS):
-        for j in range(n_onsets):
-            f = PARTS[j - first_new] if j >= first_new else 1.0 - d.sums[FOLLOWED, q, j]
-            d.sums[FOLLOWED, q, j] += d.gain[q] * f
-            d.sums[A, q, j] += f / d.variance[q] * d.innovation[q]
-            d.sums[B, q, j] += f / d.variance[q] * f
-            d.sums[T, q, j] += d.square[q]
-    for j in range(n_onsets):
-        d.onsets[j, N] += 1.0
+        rest = 1.0 - d.gain[q]
+        for b in range(n_stored):
+            f = d.sums[RESPONSE, q, b]
+            d.sums[RESPONSE, q, b] = f * rest
+            d.sums[A, q, b] += f / d.variance[q] * d.innovation[q]
+            d.sums[B, q, b] += f / d.variance[q] * f
+            d.sums[T, q, b] += d.square[q]
+    for b in range(n_stored):
+        d.blocks[b, N] += 1.0
+
+
+@law
+def _add_first(d: Any, variance: float) -> None:
+    """Move the innovation of the newest stored block, whose estimate has this `variance`, to `firsts`."""
+    b, recent = int(d.n_stored) - 1, int(d.n_stored - d.n_old) - 1
+    d.variances[recent] = variance
+    for q in range(_N_WALKS):
+        d.firsts[_FIRST_A, q, recent], d.firsts[_FIRST_B, q, recent] = d.sums[A, q, b], d.sums[B, q, b]
+        d.sums[RESPONSE, q, b], d.sums[A, q, b], d.sums[B, q, b] = 1.0, 0.0, 0.0
 
 
 @large_law
@@ -240,28 +332,39 @@ def limit_log_e(d: Any) -> float:
     """
     largest = LOG_ZERO
     for j in range(int(d.n_onsets)):
+        k, part = _block_of(d, j), _part_of(d, j)
         for q in range(_N_WALKS):
-            a = max(d.sums[A, q, j], 0.0)
-            explained = min(a * a / (d.sums[B, q, j] * d.sums[T, q, j]), _MOST_EXPLAINED)
-            largest = max(largest, -0.5 * d.onsets[j, N] * math.log1p(-explained))
+            a, b = _step_sums(d, q, k, part)
+            a = max(a, 0.0)
+            explained = min(a * a / (b * d.sums[T, q, k]), _MOST_EXPLAINED)
+            largest = max(largest, -0.5 * d.blocks[k, N] * math.log1p(-explained))
     return float(largest + math.log(d.n_onsets / _N_PARTS)) if d.n_onsets > 0 else LOG_ZERO
+
+
+@law
+def start_evidence(d: Any) -> None:
+    """Begin to weigh all onsets."""
+    d.log_e = d.heaviest = d.reference = LOG_ZERO
+    d.largest = d.weight_sum = d.onset_sum = d.size_sum = d.square_sum = 0.0
 
 
 @large_law
 def weigh_onset(d: Any, j: int) -> None:
-    """Compute what onset j says: its part of M, its posterior, the size given it, and the weights of each walk."""
-    n, total = d.onsets[j, N], LOG_ZERO
+    """Add what onset j says: its part of M, its posterior with the size given it, and the weights of each walk."""
+    k, part = _block_of(d, j), _part_of(d, j)
+    n, total = d.blocks[k, N], LOG_ZERO
     for q in range(_N_WALKS):
-        log_likelihood = n * math.log(d.sums[T, q, j]) + d.log_variances[q]
-        d.likelihood[q] = d.sums[LOG_PRIOR, q, j] - 0.5 * log_likelihood
+        log_likelihood = n * math.log(d.sums[T, q, k]) + d.log_variances[q]
+        d.likelihood[q] = d.sums[LOG_PRIOR, q, k] - 0.5 * log_likelihood
         total = add_logs(total, d.likelihood[q])
-    n_before = n - (d.n_blocks - d.onsets[j, BLOCK] + 1.0)
-    log_before = d.onsets[j, EVIDENCE] + _log_normalisation(n) - _log_normalisation(n_before)
+    n_before = n - (d.n_blocks - d.blocks[k, BLOCK] + 1.0)
+    log_before = d.blocks[k, EVIDENCE] + _log_normalisation(n) - _log_normalisation(n_before)
     freedom = max(n - 2.0, 1.0)  # the variance is n/(n - 2) times the squared scale
     log_m, weight_sum, size_sum, square_sum = LOG_ZERO, 0.0, 0.0, 0.0
     reference = LOG_ZERO  # the largest logarithm so far, by which the sums are scaled
     for q in range(_N_WALKS):
-        a, b, rest = d.sums[A, q, j], d.sums[B, q, j], d.sums[T, q, j]
+        a, b = _step_sums(d, q, k, part)
+        rest = d.sums[T, q, k]
         log_ratio = LOG_ZERO  # of all sizes together; a step down has the size 0
         for v in range(_N_SIZES):
             precision = b + 1.0 / SIZES[v]
@@ -282,11 +385,30 @@ def weigh_onset(d: Any, j: int) -> None:
                 size_sum += weight * size
                 square_sum += weight * (variance + size * size)
         d.weights[q, j] = d.likelihood[q] - total + log_ratio
-    has_rise = weight_sum > 0.0
-    d.views[j, _LOG_M] = log_m - total - _LOG_CHOICES if has_rise else LOG_ZERO
-    d.views[j, _LOG_POSTERIOR] = log_m + log_before if has_rise else LOG_ZERO
-    d.views[j, _SIZE] = size_sum / weight_sum if has_rise else 0.0
-    d.views[j, _SIZE_SQUARE] = square_sum / weight_sum if has_rise else 0.0
+        d.heaviest = max(d.heaviest, d.weights[q, j])
+        d.largest = max(d.largest, a / b + _FAR * _size_deviation(a, b, rest, n))
+    d.posteriors[j] = LOG_ZERO
+    if weight_sum > 0.0:
+        d.log_e = add_logs(d.log_e, log_m - total - _LOG_CHOICES)
+        _add_posterior(d, j, log_m + log_before, size_sum / weight_sum, square_sum / weight_sum)
+
+
+@law
+def _add_posterior(d: Any, j: int, log_density: float, size: float, square: float) -> None:
+    """Add onset j, of this posterior `log_density` and mean and mean `square` of the size, to the sums over onsets."""
+    d.posteriors[j] = log_density + math.log(_spacing(d, j))
+    if d.posteriors[j] > d.reference:
+        shrink = math.exp(d.reference - d.posteriors[j]) if d.reference > LOG_ZERO else 0.0
+        d.weight_sum *= shrink
+        d.onset_sum *= shrink
+        d.size_sum *= shrink
+        d.square_sum *= shrink
+        d.reference = d.posteriors[j]
+    weight = math.exp(d.posteriors[j] - d.reference)
+    d.weight_sum += weight
+    d.onset_sum += weight * (_time_of(d, j) - d.end)  # relative to the present, against rounding
+    d.size_sum += weight * size
+    d.square_sum += weight * square
 
 
 @law
@@ -296,70 +418,61 @@ def _spacing(d: Any, j: int) -> float:
     before, after = max(j - 1, 0), min(j + 1, last)
     if after == before:
         return 1.0
-    return float(max((d.onsets[after, TIME] - d.onsets[before, TIME]) / (after - before), _TINY))
+    return float(max((_time_of(d, after) - _time_of(d, before)) / (after - before), _TINY))
 
 
-@large_law
-def sum_evidence(d: Any) -> None:
-    """Compute log M (`log_e`), and the posterior of onset [s] and size [unit of g], once all onsets are weighed."""
-    n_onsets = int(d.n_onsets)
-    d.log_e, heaviest = LOG_ZERO, LOG_ZERO
-    for j in range(n_onsets):
-        d.log_e = add_logs(d.log_e, d.views[j, _LOG_M])
-        heaviest = max(heaviest, d.views[j, _LOG_POSTERIOR] + math.log(_spacing(d, j)))
-    d.onset = d.onset_low = d.onset_high = d.size = d.size_deviation = 0.0
-    if not heaviest > LOG_ZERO:
+@law
+def finish_evidence(d: Any) -> None:
+    """Compute the posterior of onset [s] and size [unit of g], once all onsets are weighed."""
+    d.onset = d.size = d.size_deviation = 0.0
+    if d.weight_sum > 0.0:
+        mean = d.size_sum / d.weight_sum
+        d.onset, d.size = d.end + d.onset_sum / d.weight_sum, d.unit * mean
+        d.size_deviation = d.unit * math.sqrt(max(d.square_sum / d.weight_sum - mean * mean, 0.0))
+
+
+@law
+def find_onset_interval(d: Any) -> None:
+    """Find the 95 % interval of the onset [s], once all onsets are weighed."""
+    d.onset_low = d.onset_high = 0.0
+    if not d.weight_sum > 0.0:
         return
-    total = onset = size = square = 0.0
-    for j in range(n_onsets):
-        weight = math.exp(d.views[j, _LOG_POSTERIOR] - heaviest) * _spacing(d, j)
-        total += weight
-        onset += weight * (d.onsets[j, TIME] - d.end)  # relative to the present, against rounding
-        size += weight * d.views[j, _SIZE]
-        square += weight * d.views[j, _SIZE_SQUARE]
-    mean = size / total
-    d.onset, d.size = d.end + onset / total, d.unit * mean
-    d.size_deviation = d.unit * math.sqrt(max(square / total - mean * mean, 0.0))
+    n_onsets = int(d.n_onsets)
     below, first, last = 0.0, -1, n_onsets - 1
     for j in range(n_onsets):
-        below += math.exp(d.views[j, _LOG_POSTERIOR] - heaviest) * _spacing(d, j)
-        if first < 0 and below >= _TAIL * total:
+        below += math.exp(d.posteriors[j] - d.reference)
+        if first < 0 and below >= _TAIL * d.weight_sum:
             first = j
-        if below >= (1.0 - _TAIL) * total:
+        if below >= (1.0 - _TAIL) * d.weight_sum:
             last = j
             break
     first = max(first, 0)
-    d.onset_low = d.onsets[first, TIME] - _spacing(d, first)
-    d.onset_high = d.onsets[last, TIME] + _spacing(d, last)
+    d.onset_low = _time_of(d, first) - _spacing(d, first)
+    d.onset_high = _time_of(d, last) + _spacing(d, last)
 
 
 @law
 def start_bound(d: Any) -> None:
-    """Begin the search for the bound: find the largest weight, which scales the others, and the largest size."""
-    d.heaviest, d.largest = LOG_ZERO, 0.0
-    for j in range(int(d.n_onsets)):
-        for q in range(_N_WALKS):
-            d.heaviest = max(d.heaviest, d.weights[q, j])
-            size = d.sums[A, q, j] / d.sums[B, q, j]
-            d.largest = max(d.largest, size + _FAR * _size_deviation(d, q, j, size))
+    """Begin the search for the bound, once all onsets are weighed."""
     d.rising = d.exceedance = 0.0
     d.low, d.high = 0.0, d.largest
 
 
 @law
-def _size_deviation(d: Any, q: int, j: int, size: float) -> float:
-    """Compute the standard error of the least-squares size of a step at onset j with walk q."""
-    squares = max(d.sums[T, q, j] - d.sums[A, q, j] * size, _TINY)
-    return max(math.sqrt(squares / d.onsets[j, N] / d.sums[B, q, j]), _TINY)
+def _size_deviation(a: float, b: float, squares: float, n: float) -> float:
+    """Compute the standard error of the least-squares size a/b of a step, from T (`squares`) of n innovations."""
+    return max(math.sqrt(max(squares - a * (a / b), _TINY) / n / b), _TINY)
 
 
 @large_law
 def add_exceedance(d: Any, j: int, x: float) -> None:
     """Add to `exceedance` the weighted probability, given onset j, that the size is larger than x."""
+    k, part = _block_of(d, j), _part_of(d, j)
     for q in range(_N_WALKS):
-        size = d.sums[A, q, j] / d.sums[B, q, j]
+        a, b = _step_sums(d, q, k, part)
         weight = math.exp(d.weights[q, j] - d.heaviest)
-        d.exceedance += weight * normal_probability((size - x) / _size_deviation(d, q, j, size))
+        deviation = _size_deviation(a, b, d.sums[T, q, k], d.blocks[k, N])
+        d.exceedance += weight * normal_probability((a / b - x) / deviation)
 
 
 @law
@@ -394,6 +507,14 @@ def take_block(memory: Any, begin: float, end: float, g: float, deviation: float
     take_estimate(memory[0], begin, end, g, deviation)
 
 
+@large_law
+def weigh_onsets(d: Any) -> None:
+    """Weigh all onsets."""
+    start_evidence(d)
+    for j in range(int(d.n_onsets)):
+        weigh_onset(d, j)
+
+
 @kernel
 def weigh_all(memory: Any, min_log_e: float) -> None:
     """Weigh all onsets and sum their evidence, unless a quick bound of log M is at most `min_log_e`."""
@@ -401,22 +522,20 @@ def weigh_all(memory: Any, min_log_e: float) -> None:
     if limit_log_e(d) <= min_log_e:
         d.log_e = LOG_ZERO
         return
-    for j in range(int(d.n_onsets)):
-        weigh_onset(d, j)
-    sum_evidence(d)
+    weigh_onsets(d)
+    finish_evidence(d)
+    find_onset_interval(d)
 
 
 @kernel
 def find_bound(memory: Any) -> float:
     """Weigh all onsets, and compute the bound of an undetected rise."""
     d = memory[0]
-    n_onsets = int(d.n_onsets)
-    for j in range(n_onsets):
-        weigh_onset(d, j)
+    weigh_onsets(d)
     start_bound(d)
     for k in range(BISECTIONS + 1):
         x = 0.5 * (d.low + d.high) if k > 0 else 0.0
-        for j in range(n_onsets):
+        for j in range(int(d.n_onsets)):
             add_exceedance(d, j, x)
         bisect_bound(d)
     return float(d.bound)

@@ -46,6 +46,7 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     median,
     move_sums,
     reweigh,
+    start_normal,
     sum_products,
     workspace_shapes,
 )
@@ -85,19 +86,19 @@ from sealscope.parameters import Rig
 WINDOW = 20
 #: Blocks after a pause of so many seconds are not compared with earlier ones.
 PAUSE = float(LIVE.watch.pause)
-#: Onsets that a call of `advance` weighs, and halvings of the interval of the bound after each block.
-ONSETS_A_CALL, HALVINGS = 4, 20
+#: Onsets that a call of `advance` weighs, and for the bound adds up; halvings of the bound's interval after each block.
+WEIGHED_A_CALL, ADDED_A_CALL, HALVINGS = 2, 12, 20
 #: Blocks from which on the times of the detector of steps begin anew, and by how many.
 _MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
 #: Parts of the work at the end of a block: `phase` of the record.
 (
-    IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, WEIGH, DECIDE, BOUND,
-    FINISH,
-) = range(14)  # fmt: skip
+    IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, TAKE, WEIGH, DECIDE,
+    BOUND, FINISH,
+) = range(15)  # fmt: skip
 #: Columns of `history`, the results of the last blocks: conductance G estimated with the present coefficients [m^3/(s
-#: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, and the mean
-#: of abs(p_A - p_B) [Pa].
-_G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE = range(5)
+#: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, the mean of
+#: abs(p_A - p_B) [Pa], and the block's number.
+_G, _COMPARABLE_G, _VARIANCE, _SYSTEMATIC_VARIANCE, _PRESSURE, _HISTORY_NUMBER = range(6)
 #: Columns of `pressure_sums`: the sum of abs(p_A - p_B) [Pa] over a block's samples, and their number.
 _SUM, _NUMBER = 0, 1
 #: Columns of `waiting_sizes`: number of rows, mean abs(p_A - p_B) [Pa], and number of a block.
@@ -131,7 +132,7 @@ _REAL_NUMBERS = (
 )
 _WHOLE_NUMBERS = (
     # samples so far, less whole periods; blocks: ended, weighted, open, being worked on, that wait for the first fit,
-    # successive ones of larger motion, estimated, dropped
+    # successive ones of larger motion, estimated, of these taken by the detector, dropped
     *(
         "sample_count",
         "n_ended",
@@ -141,6 +142,7 @@ _WHOLE_NUMBERS = (
         "n_waiting",
         "n_moving",
         "n_estimated",
+        "n_tested",
         "n_dropped",
     ),
     # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, iterations
@@ -211,36 +213,90 @@ class StreamSettings(NamedTuple):
 
 
 def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
-    """Build the layout of a stream's state: a numpy record of numbers and arrays."""
+    """Build the layout of a stream's state: a numpy record of numbers and arrays.
+
+    Arrays that are used at different times share memory. Until the first fit there are no onsets; their sums give place
+    to the blocks that wait for it, and to the rows of the first `SUPPORT` blocks, which are weighted together. While
+    onsets are weighed, no rows are; and no row is weighted while a block's leakage is estimated.
+    """
     _, block_strides, half = settings.counts
     n_columns = len(settings.expressions)
     n_slow = len(settings.column_order) - settings.n_fast - 1  # - 1: the left side
     support_rows = SUPPORT * block_strides
-    workspace = workspace_shapes(support_rows, SUPPORT, len(settings.column_order), n_slow)
-    arrays = record_dtype(
+    n_packed = n_columns * (n_columns + 1) // 2
+    # finished rows: of the blocks that are worked on, then of the open ones; later than the first blocks, one of each
+    n_rows, n_later = (support_rows + block_strides) * n_columns, 2 * block_strides * n_columns
+    arena = max(LEARNED * n_packed, n_rows - n_later + SUPPORT * n_packed)
+    steps = step.detector_layout(gap=n_later, sums=arena)
+    end_of_sums, end_of_steps = _offset(steps, step.SCRATCH[0]), steps.itemsize
+    workspace = record_dtype(
+        **dict(
+            zip(
+                Workspace._fields,
+                workspace_shapes(support_rows, SUPPORT, len(settings.column_order), n_slow),
+                strict=True,
+            )
+        )
+    )
+    # nuisances: all columns but the leak and the left side
+    shapes = dict(zip(Coefficients._fields, coefficient_shapes(n_columns - 2), strict=True))
+    gram_bytes = 8 * n_columns * n_columns
+    workspace_begin = end_of_sums + gram_bytes
+    model_begin = workspace_begin + _offset(workspace, "reduced")
+    end_of_work = max(end_of_steps, workspace_begin + workspace.itemsize)
+    model = _model_layout(shapes, end_of_work - model_begin)
+    fields: dict[str, tuple[Any, int]] = {
+        "steps": (steps, 0),
+        "rows": (("f8", (support_rows + block_strides, n_columns)), _offset(steps, "sums") - 8 * n_later),
+        # lower triangles of the Gram matrices of blocks that wait for the first fit, the first block at the end
+        "waiting_grams": (("f8", (LEARNED, n_packed)), end_of_sums - 8 * LEARNED * n_packed),
+        "gram": (("f8", (n_columns, n_columns)), end_of_sums),  # of the block that is worked on
+        "workspace": (workspace, workspace_begin),
+        "model": (model, model_begin),
+    }
+    further = record_dtype(
         *_REAL_NUMBERS,
         ring=(len(settings.channels), 2 * half + 2),  # last samples, those that the increments need
         increments=(n_columns,),  # of each term of the balance over the last sampling interval
         unfinished=(SPAN, n_columns),  # the rows to which the present sample adds
-        # finished rows: of the blocks that are worked on, then of the open ones
-        rows=(support_rows + block_strides, n_columns),
         ends=(SUPPORT,),  # index past the last row of each open block
         closed_ends=(SUPPORT,),  # the same of the blocks that are worked on
-        gram=(SUPPORT, n_columns, n_columns),  # of the blocks weighted last
         # sum of abs(p_A - p_B), and number of samples; + 1: the last rows of a block end when the next has begun
         pressure_sums=(SUPPORT + 1, 2),
         slow_sums=(n_slow + 1, n_slow + 1),  # over earlier blocks, for the coefficients not fitted to each block
-        waiting_grams=(LEARNED, n_columns, n_columns),  # of the blocks that wait for the first fit
-        waiting_sizes=(LEARNED, 3),  # `_BLOCK_ROWS`, `_BLOCK_PRESSURE` and `_BLOCK_NUMBER` of these blocks
+        waiting_sizes=(LEARNED, 3),  # `_BLOCK_ROWS`, `_BLOCK_PRESSURE` and `_BLOCK_NUMBER` of the waiting blocks
         precisions=(LEARNED,),  # of their estimates
-        history=(WINDOW, 5),  # results of each of the last blocks (`_G` ... `_PRESSURE`)
-        workspace=record_dtype(**dict(zip(Workspace._fields, workspace, strict=True))),
-        # nuisances: all columns but the leak and the left side
-        model=record_dtype(**dict(zip(Coefficients._fields, coefficient_shapes(n_columns - 2), strict=True))),
-        steps=step.LAYOUT,
+        history=(WINDOW, 6),  # results of each of the last blocks (`_G` ... `_HISTORY_NUMBER`)
     )
-    wholes = [(name, np.dtype("i8")) for name in _WHOLE_NUMBERS]
-    return np.dtype([*wholes, *((name, field[0]) for name, field in (arrays.fields or {}).items())])
+    begin = model_begin + model.itemsize
+    fields |= {name: (further[name], begin + _offset(further, name)) for name in further.names or ()}
+    begin += further.itemsize
+    fields |= {name: (np.dtype("i8"), begin + 8 * k) for k, name in enumerate(_WHOLE_NUMBERS)}
+    formats, offsets = zip(*fields.values(), strict=True)
+    end = begin + 8 * len(_WHOLE_NUMBERS)
+    return np.dtype({"names": [*fields], "formats": [*formats], "offsets": [*offsets], "itemsize": end})
+
+
+def _offset(layout: np.dtype[Any], name: str) -> int:
+    """Return the offset of a field in bytes."""
+    assert layout.fields is not None
+    return layout.fields[name][1]
+
+
+def _model_layout(shapes: dict[str, tuple[int, ...]], work_bytes: int) -> np.dtype[Any]:
+    """Build the layout of a `Coefficients` whose work arrays, its first two fields, take `work_bytes` or more."""
+    sizes = [8 * math.prod(shape) for shape in shapes.values()]
+    begin = max(work_bytes, sizes[0] + sizes[1])
+    offsets = [0, sizes[0], *(begin + sum(sizes[2:k]) for k in range(2, len(sizes)))]
+    formats = [("f8", shape) for shape in shapes.values()]
+    end = begin + sum(sizes[2:])
+    return np.dtype({"names": [*shapes], "formats": formats, "offsets": offsets, "itemsize": end})
+
+
+@law
+def packed_index(i: int, j: int) -> int:
+    """Compute the index of row i, column j <= i in the packed lower triangle of a symmetric matrix."""
+    return i * (i + 1) // 2 + j
 
 
 @lru_cache(maxsize=8)
@@ -285,7 +341,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         m.leak_error, m.angle_sign = leak_error, 1.0
         m.usual_precision = m.leak_size = m.leak_deviation = m.leak_onset = m.block_end = 0.0
         m.sample_count = m.n_ended = m.n_weighted = m.n_open = m.n_closed = m.n_waiting = m.n_moving = 0
-        m.n_estimated = m.n_dropped = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = 0
+        m.n_estimated = m.n_tested = m.n_dropped = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = 0
         m.has_converged = m.is_fitting = m.halvings = m.alarm = m.first_closed = m.first_number = 0
         m.reason = _LEARNING
         m.slow_sums[:, :] = 0.0
@@ -367,29 +423,36 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         for r in range(int(m.n_closed_rows)):
             m.workspace.weights[r] = 1.0
         m.place = m.iteration = 0
-        m.has_converged = 1 if m.n_closed_rows == 0 else 0  # then one pass writes Gram matrices of zeros
+        m.has_converged = 1 if m.n_closed_rows == 0 else 0  # then one pass computes Gram matrices of zeros
         m.phase = PRODUCTS
 
     @large_law
     def weigh_part(m: Any) -> None:
-        """Do a part of the weighting of rows: see `row_weights.weigh_rows`."""
+        """Do a part of the weighting of rows: see `row_weights.weigh_rows`.
+
+        In the last pass, with the final weights, each block is used as soon as its Gram matrix is computed.
+        """
         b, n_closed, n_closed_rows = int(m.place), int(m.n_closed), int(m.n_closed_rows)
+        is_last = m.has_converged == 1 or m.iteration == MAX_ITERATIONS
         if m.phase == PRODUCTS:
             begin = int(m.closed_ends[max(b - 1, 0)]) if b > 0 else 0
-            sum_products(m.rows, begin, int(m.closed_ends[b]), m.workspace.weights, m.gram[b])
+            sum_products(m.rows, begin, int(m.closed_ends[b]), m.workspace.weights, m.gram)
             m.phase = REDUCE
         elif m.phase == REDUCE:
-            eliminate_fast(m.gram[b], column_order, n_fast, m.workspace.reduced[b])
-            m.place = b + 1
-            m.phase = PRODUCTS if b + 1 < n_closed else NORMAL
+            if b == 0:
+                start_normal(m.workspace.normal, m.slow_sums, is_last)
+            eliminate_fast(m.gram, column_order, n_fast, m.workspace.reduced)
+            add_reduced(m.workspace, b, n_fast)
+            if is_last:
+                m.phase = BLOCK
+            else:
+                begin_next_block(m)
         elif m.phase == NORMAL:
-            is_last = m.has_converged == 1 or m.iteration == MAX_ITERATIONS
-            add_reduced(m.workspace, m.slow_sums, n_closed, n_fast, is_last)
-            m.place = 0
             if is_last:
                 # a later block changes the sums less
                 move_sums(m.workspace.normal, m.slow_sums, n_closed, min(1.0, SUPPORT / m.n_weighted))
-                m.phase = BLOCK
+                m.place = 0
+                m.phase = WEIGH if m.steps.n_onsets > 0 else FINISH
             else:
                 fit_blocks(m.workspace, n_closed, n_fast)
                 m.phase = REWEIGH
@@ -397,7 +460,14 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             has_converged = reweigh(m.rows[:n_closed_rows], m.closed_ends[:n_closed], column_order, m.workspace)
             m.has_converged = 1 if has_converged else 0
             m.iteration += 1
+            m.place = 0
             m.phase = PRODUCTS
+
+    @law
+    def begin_next_block(m: Any) -> None:
+        """Begin the work on the next block of a pass, or after the last one on the normal equations."""
+        m.place += 1
+        m.phase = PRODUCTS if m.place < m.n_closed else NORMAL
 
     @law
     def find_flow_sign(m: Any) -> None:
@@ -409,24 +479,32 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         # sums over the rows; the bias has the same value in each row
         weight = leak_sum = response_sum = product = 0.0
         for k in range(LEARNED):
-            gram = m.waiting_grams[k]
-            weight += gram[bias, bias]
-            leak_sum += gram[bias, leak]
-            response_sum += gram[bias, response]
-            product += gram[leak, response]
+            gram = m.waiting_grams[LEARNED - 1 - k]
+            weight += gram[packed_index(bias, bias)]
+            leak_sum += gram[packed_index(max(bias, leak), min(bias, leak))]
+            response_sum += gram[packed_index(response, bias)]
+            product += gram[packed_index(response, leak)]
         m.angle_sign = -1.0 if product < leak_sum * response_sum / weight else 1.0
 
     @law
-    def load_signed_block(m: Any, gram: Any) -> None:
-        """Copy the Gram matrix of a block to `m.model.block`; correct the sign of the response by `m.angle_sign`."""
-        load_block(m.model, gram, all_columns)
+    def correct_sign(m: Any) -> None:
+        """Correct the sign of the response in `m.model.block` by `m.angle_sign`."""
         for j in range(response):
             m.model.block[j, response] *= m.angle_sign
             m.model.block[response, j] *= m.angle_sign
 
+    @law
+    def load_waiting_block(m: Any, k: int) -> None:
+        """Copy the Gram matrix of waiting block k to `m.model.block`, with the sign of `m.angle_sign`."""
+        for i in range(n_columns):
+            for j in range(i + 1):
+                m.model.block[i, j] = m.waiting_grams[LEARNED - 1 - k, packed_index(i, j)]
+                m.model.block[j, i] = m.model.block[i, j]
+        correct_sign(m)
+
     @large_law
     def append_conductance(m: Any, n_rows: float, pressure: float, number: float, is_learned: bool) -> None:
-        """Estimate the leakage conductance of the block loaded in `m.model`, append it to the history, and test it.
+        """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
         An estimate is left out if its precision (1/variance) is not positive or, at standstill, at most
         `MIN_REST_PRECISION` times the usual one. `n_rows`, `pressure` [Pa], `number`: rows of the volume balance in the
@@ -444,29 +522,37 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         comparable_G = G - weighted_shift / precision  # without jumps where the other coefficients improve
         history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
         history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (m.size_error * G) ** 2
-        history[k, _PRESSURE] = pressure
+        history[k, _PRESSURE], history[k, _HISTORY_NUMBER] = pressure, number
         m.n_estimated += 1
         m.reason = 0
-        test_estimate(m, number, comparable_G, math.sqrt(1.0 / precision))
 
-    @law
-    def test_estimate(m: Any, number: float, g: float, deviation: float) -> None:
-        """Add the conductance of block `number` to the detector of steps, whose unit of time is a block."""
-        steps = m.steps
+    @large_law
+    def take_part(m: Any) -> None:
+        """Give the next block of the history to the detector of steps, whose unit of time is a block."""
+        k, steps = int(m.n_tested) % WINDOW, m.steps
+        if steps.n_blocks > _MOST_BLOCKS:  # times remain small, also in single precision
+            shift_times(m)
+        number, g = m.history[k, _HISTORY_NUMBER], m.history[k, _COMPARABLE_G]
         if steps.has_level == 1 and number - steps.end > pause:
             step.forget_onsets(steps)
-        if steps.n_blocks > _MOST_BLOCKS:  # times remain small, also in single precision
-            steps.n_blocks -= _SHIFTED_BLOCKS
-            steps.end -= _SHIFTED_BLOCKS
-            m.n_ended -= _SHIFTED_BLOCKS
-            m.leak_onset -= _SHIFTED_BLOCKS
-            for j in range(int(steps.n_onsets)):
-                steps.onsets[j, step.BLOCK] -= _SHIFTED_BLOCKS
-                steps.onsets[j, step.TIME] -= _SHIFTED_BLOCKS
-                steps.onsets[j, step.BLOCK_BEGIN] -= _SHIFTED_BLOCKS
-            number -= _SHIFTED_BLOCKS
-        step.take_estimate(steps, number, number + 1.0, g, deviation)
+        step.take_estimate(steps, number, number + 1.0, g, math.sqrt(m.history[k, _VARIANCE]))
         m.block_end = number + 1.0
+        m.n_tested += 1
+
+    @law
+    def shift_times(m: Any) -> None:
+        """Count blocks and their times from a later block on."""
+        steps = m.steps
+        steps.n_blocks -= _SHIFTED_BLOCKS
+        steps.end -= _SHIFTED_BLOCKS
+        m.n_ended -= _SHIFTED_BLOCKS
+        m.leak_onset -= _SHIFTED_BLOCKS
+        for b in range(int(steps.n_stored)):
+            steps.blocks[b, step.BLOCK] -= _SHIFTED_BLOCKS
+            steps.blocks[b, step.BEGIN] -= _SHIFTED_BLOCKS
+            steps.blocks[b, step.END] -= _SHIFTED_BLOCKS
+        for k in range(WINDOW):
+            m.history[k, _HISTORY_NUMBER] -= _SHIFTED_BLOCKS
 
     @law
     def forget_standstill(m: Any) -> None:
@@ -479,7 +565,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         model.leak_products[:] = 0.0
         model.numbers[:] = 0.0
         m.usual_precision = 0.0
-        m.n_moving = m.n_estimated = 0
+        m.n_moving = m.n_estimated = m.n_tested = 0
         m.reason = _LEARNING
         step.forget_onsets(m.steps)
 
@@ -499,14 +585,15 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         if not n_rows > 0.0:
             m.reason = _MISSING
             return
-        motion_square = m.gram[b, response, response]
+        motion_square = m.gram[response, response]
         if m.usual_precision > 0.0:  # after the first fit
             motion = relative_motion(motion_square, n_rows, m.model.numbers)
             m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
             if m.n_moving >= N_WAKING:
                 forget_standstill(m)
                 return
-            load_signed_block(m, m.gram[b])
+            load_block(m.model, m.gram, all_columns)
+            correct_sign(m)
             append_conductance(m, n_rows, pressure, number, is_learned=True)
             return
         k = int(m.n_waiting)
@@ -515,9 +602,11 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             return
         m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE] = n_rows, pressure
         m.waiting_sizes[k, _BLOCK_NUMBER] = number
+        if m.steps.n_stored > 0:  # its memory is now that of the waiting blocks
+            step.forget_onsets(m.steps)
         for i in range(n_columns):
-            for j in range(n_columns):
-                m.waiting_grams[k, i, j] = m.gram[b, i, j]
+            for j in range(i + 1):
+                m.waiting_grams[LEARNED - 1 - k, packed_index(i, j)] = m.gram[i, j]
         m.n_waiting = k + 1
         if k + 1 == LEARNED:
             find_flow_sign(m)
@@ -531,7 +620,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             fit_coefficients(model)
             m.n_waiting, m.phase = LEARNED, FIT_PRECISION
             return
-        load_signed_block(m, m.waiting_grams[k])
+        load_waiting_block(m, k)
         n_rows, pressure = m.waiting_sizes[k, _BLOCK_ROWS], m.waiting_sizes[k, _BLOCK_PRESSURE]
         if m.phase == FIT_ADD:
             add_block(model, n_rows, weight=1.0, has_stepped=False)
@@ -550,21 +639,23 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             m.phase = FIT_APPEND
         else:
             m.n_waiting = m.is_fitting = 0
-            m.phase = BLOCK
+            m.phase = TAKE
 
     @large_law
     def test_part(m: Any) -> None:
         """Do a part of the test for a step: weigh the onsets, decide, and find the bound."""
-        steps, n_onsets = m.steps, int(m.steps.n_onsets)
-        first, last = int(m.place), min(int(m.place) + ONSETS_A_CALL, n_onsets)
+        steps, n_onsets, first = m.steps, int(m.steps.n_onsets), int(m.place)
+        last = min(first + (WEIGHED_A_CALL if m.phase == WEIGH else ADDED_A_CALL), n_onsets)
         if m.phase == WEIGH:
+            if first == 0:
+                step.start_evidence(steps)
             for j in range(first, last):
                 step.weigh_onset(steps, j)
             m.place = last
             if last == n_onsets:
                 m.phase = DECIDE
         elif m.phase == DECIDE:
-            step.sum_evidence(steps)
+            step.finish_evidence(steps)
             if steps.log_e > m.log_threshold:
                 m.alarm = 1
                 m.leak_size, m.leak_deviation, m.leak_onset = steps.size, steps.size_deviation, steps.onset
@@ -602,16 +693,18 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         if m.phase <= REWEIGH:
             weigh_part(m)
         elif m.phase == BLOCK:
-            if m.place >= m.n_closed:
-                m.place = 0
-                m.phase = WEIGH if m.steps.n_onsets > 0 else FINISH
+            use_block(m)
+            if m.is_fitting == 1:
+                m.n_waiting, m.phase = LEARNED, FIT_ADD
             else:
-                use_block(m)
-                m.place += 1
-                if m.is_fitting == 1:
-                    m.n_waiting, m.phase = LEARNED, FIT_ADD
+                m.phase = TAKE
         elif m.phase <= FIT_APPEND:
             fit_part(m)
+        elif m.phase == TAKE:
+            if m.n_tested < m.n_estimated:
+                take_part(m)
+            else:
+                begin_next_block(m)
         elif m.phase <= BOUND:
             test_part(m)
         else:
@@ -638,7 +731,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     def resume(m: Any) -> None:
         """Begin with samples anew, after a power cut, with what was learned before."""
         m.sample_count = m.n_ended = m.n_open = m.n_closed = m.n_waiting = m.n_moving = m.n_estimated = 0
-        m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = m.has_converged = m.is_fitting = 0
+        m.n_tested = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = m.has_converged = m.is_fitting = 0
         m.block_end = m.leak_onset = 0.0
         m.reason = 0 if m.usual_precision > 0.0 else _LEARNING
         step.forget_onsets(m.steps)
