@@ -29,12 +29,3 @@ def test_the_watched_machine_is_saved_and_continued(
     assert onset == pytest.approx(90.0, abs=0.5)
     low, high = map(float, re.findall(r"\((\d\.\d+) to (\d\.\d+)\)", lines[1])[0])
     assert low <= 0.0042 <= high
-
-
-@pytest.mark.slow
-def test_a_machine_without_a_position_is_watched_too(capsys: pytest.CaptureFixture[str]) -> None:
-    exec(compile(EXAMPLES[1], PAGE.name, "exec"), {"__name__": "page"})
-    said = re.fullmatch(r"by pressures: [\d.]+ L/min \(([\d.]+) to ([\d.]+)\) since (\d+) s\n", capsys.readouterr().out)
-    assert said is not None
-    assert float(said[1]) <= 0.015 <= float(said[2])
-    assert abs(int(said[3]) - 600) <= 15

@@ -24,7 +24,6 @@ from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import WatchSettings, read_settings, template
 from sealscope.monitor.sources.source_block import compute_digest
-from sealscope.simulation.simulate import simulate
 
 from ..diagnosis.balance_machine import machine
 from ..refusals import refusal
@@ -65,25 +64,6 @@ def test_kills_at_random_instants_change_no_row(undisturbed, tmp_path):
     lines.write_bytes(LINES)
     assert kill_often(settings, lines, 2, seed=1) == 2
     assert rows_of(settings.database) == undisturbed
-
-
-@pytest.mark.slow
-def test_an_actuator_without_a_position_is_stored_alike_whatever_the_restarts(tmp_path):
-    """The response's state comes back with the same bits, before its first fit and after."""
-    pressed = simulate(command="5 sin(2t)", duration=75.0, seed=1).only(("p_A", "p_B", "u"))
-    lines = lines_of({"press 1": pressed}, 2500)
-    (tmp_path / "whole").mkdir()
-    whole = settings_in(tmp_path / "whole")
-    served(whole, lines)
-    settings = settings_in(tmp_path)
-    for share in (0.75, 0.93, 1.0):
-        service, _ = served(settings, lines[: round(share * len(lines))])
-    rows = rows_of(settings.database)
-    assert rows == rows_of(whole.database)
-    assert [row[3] for row in rows["estimates"]] == ["settling"] * 10 + ["learning"] * 2
-    summaries = service.actuators.summaries()
-    assert summaries["press 1"]["by"] == "pressures"
-    assert 'sealscope_watched{actuator="press 1",by="pressures"} 1.0' in format_metrics(summaries, {})
 
 
 @pytest.mark.slow
@@ -409,7 +389,7 @@ SERVER = '[opcua]\nurl = "opc.tcp://localhost:4840"\n'
         (NODES.format("x", "") + SERVER, "[opcua], rate"),
         (NODES.format("valve", "rate = 50.0") + SERVER, "nodes, x, theta"),
         ('[opcua]\nurl = "opc.tcp://user:secret@localhost"\n', "opcua.url"),
-        (NODES.format("theta", "rate = 50.0") + SERVER, "'press 3', p_A, p_B, u, theta"),
+        (NODES.format("theta", "rate = 50.0") + SERVER, "'press 3', p_A and p_B, theta"),
         *(
             (f'[webhook]\nurl = "{url}"\n', "webhook.url")
             for url in ("ftp://host/x", "http://user:password@host/", "file:///etc/passwd", "host")

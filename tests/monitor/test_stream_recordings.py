@@ -1,9 +1,10 @@
-"""The stream of a commissioned machine is judged in recordings, as the files of a folder are."""
+"""The stream of a commissioned machine, or without a position, is judged in recordings, as files of a folder are."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +13,13 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.monitor.alarms import AlarmJudge
+from sealscope.monitor.outputs.prometheus import format_metrics
 from sealscope.monitor.service import Service
 from sealscope.monitor.settings import WatchSettings, read_settings
 from sealscope.monitor.sources.source_block import decode_message
 from sealscope.monitor.sources.stream_recordings import StreamRecorder
 from sealscope.monitor.verdicts import RecordingVerdict
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 
 from ..diagnosis.balance_machine import machine, step
 from ..refusals import refusal
@@ -32,7 +34,7 @@ def settings_of(folder: Path, machine_file: Path, more: str = "", recording_s: f
     """Settings of one machine whose samples come as lines, in recordings of a minute."""
     file = folder / "watch.toml"
     file.write_text(
-        f'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
+        'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
         f"recording_s = {recording_s}\nfalse_alarms_per_1000_h = {rate}\n{more}",
         encoding="utf-8",
     )
@@ -105,6 +107,68 @@ def test_a_monitor_that_restarts_within_a_recording_has_the_rows_of_one_that_did
     assert len(expected["alarms"]) == 1
     for table in ("estimates", "alarms", "events", "summaries", "pending"):
         assert rows[table] == expected[table], table
+
+
+def rig_settings(folder: Path):
+    """Settings of a machine of which only the rig is known."""
+    file = folder / "watch.toml"
+    text = 'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nrig = "thesis"\nrecording_s = 60\n'
+    file.write_text(text, encoding="utf-8")
+    return read_settings(file)
+
+
+@pytest.mark.slow
+def test_a_stream_without_a_position_is_judged_as_diagnose_judges_its_recordings(tmp_path):
+    """No block shows anything; the summary has the verdict on the last recording, whatever the restarts."""
+    worn = ss.simulate(command="5 sin(2t)", duration=100.0, seed=1, leak="0.015 L/min from 25 s")
+    worn = worn.only(("p_A", "p_B", "u"))
+    lines = lines_of({"press": worn}, 500).splitlines(keepends=True)
+    service, _ = served(rig_settings(tmp_path), b"".join(lines))
+    summary = service.summaries()["press"]
+    stated = summary["recording"]
+    recorder = StreamRecorder("press", 60.0)
+    blocks = [worn.samples(slice(k, k + 500)) for k in range(0, len(worn), 500)]
+    (recording,) = recordings_of(recorder, blocks)
+    diagnosis = ss.diagnose(replace(recording, t=recording.t - recording.t[0]), rig="thesis")
+    assert (stated["verdict"], summary["by"]) == (diagnosis.verdict, "recordings") == ("leak", "recordings")
+    assert summary["leak_lpm"] == pytest.approx(diagnosis.leak_lpm, rel=0.01)  # lines have fewer digits
+    assert summary["state"]["condition"].startswith("leak")
+    assert 'sealscope_watched{actuator="press",by="recordings"} 1.0' in format_metrics(service.summaries(), {})
+    assert rows_of(service.settings.database)["estimates"] == []
+    (tmp_path / "halves").mkdir()
+    halves = rig_settings(tmp_path / "halves")
+    for part in (lines[:30], lines[30:]):
+        served(halves, b"".join(part))
+    assert rows_of(halves.database)["summaries"] == rows_of(service.settings.database)["summaries"]
+
+
+def test_of_a_rig_alone_a_stream_with_a_position_is_judged_by_its_blocks(tmp_path, leak_lines):
+    service, _ = served(rig_settings(tmp_path), b"".join(leak_lines.splitlines(keepends=True)[:70]))
+    actuator = service.actuators._actuator("press")
+    assert actuator.recorder is not None and actuator.recorder.blocks == []
+    assert service.summaries()["press"]["recording"] is None
+    assert actuator.watch.blocks > 10
+
+
+@pytest.mark.parametrize(
+    ("rig", "names"),
+    [
+        ("thesis", ("p_A", "p_B", "u")),
+        ("single-rod-eha", ("p_A", "p_B", "theta")),
+        ("servo-valve", ("p_A", "p_B", "u")),
+    ],
+)
+def test_channels_that_do_not_suffice_for_blocks_are_refused_with_those_that_do(rig: str, names: tuple[str, ...]):
+    t = np.arange(0.0, 100.0, 0.002)
+    units = {name: CHANNEL_UNITS[name] for name in names}
+    watch = ss.watch(rig)
+    samples = Recording(t, {name: np.sin(t) for name in names}, units, 500.0)
+    assert watch.lacks_channels(samples)
+    assert watch.update(samples) == []
+    ((reason, number),) = watch.counters.items()
+    assert number == len(t)
+    assert reason.startswith("samples without p_A, p_B")
+    assert watch.evidence.verdict == "cannot tell" and reason in watch.evidence.reason
 
 
 def test_only_the_samples_of_a_recording_that_has_not_ended_are_stored(commissioned, tmp_path):

@@ -91,8 +91,17 @@ class _Actuator:
     # last samples during an alarm, which may become a healthy recording
     alarm_samples: list[Recording] = field(default_factory=list)
     last_times: tuple[float, float] = (0.0, 0.0)  # begin and end of the last block of samples by its rate [s]
-    # None for files, for machines that are not commissioned, and for `recording_s` = 0
-    recorder: StreamRecorder | None = None
+    recorder: StreamRecorder | None = None  # None for files, and for `recording_s` = 0
+    is_commissioned: bool = False  # True if recordings are compared with healthy ones
+
+    def record(self, number: int, samples: Recording) -> Recording | None:
+        """Collect a stream's block with the running `number`; return the recording that ends with it, if it is judged.
+
+        Without a commissioned machine recordings are judged only if the blocks are not, for want of a position.
+        """
+        if self.recorder is None or not (self.is_commissioned or self.watch.lacks_channels(samples)):
+            return None
+        return self.recorder.take(number, samples)
 
     def judge_samples(
         self, samples: Recording, *, follows: bool, settings: WatchSettings, verdict: RecordingVerdict | None = None
@@ -228,8 +237,9 @@ class _Actuator:
 
         - `blocks`: number of blocks of some seconds so far; `t`: end of the last block or of the verdict's recording,
           whichever is later [s]; `status`: result in words; `state`: state by NAMUR NE 107;
-        - `by`: quantity that the detector watches, "volumes" or "pressures"; `counters`: its counters; `why_no_litres`:
-          reason why it states no L/min, else "", and "" beside a verdict, whose own texts are shown;
+        - `by`: what is judged, "volumes" of blocks or, without a position, "recordings"; `counters`: those of the
+          detector of blocks; `why_no_litres`: reason why it states no L/min, else "", and "" beside a verdict, whose
+          own texts are shown;
         - `total_lpm`, `leak_lpm`, `bound_lpm` [L/min]: total leakage, leak, and upper bound of a leak that is not
           found; `recording`: texts of the last verdict; `alarm`: id of the open alarm; `status_word`: 0 without one.
         """
@@ -240,7 +250,7 @@ class _Actuator:
             "t": t if verdict is None else max(verdict.end_s, t or -math.inf),
             "status": (_WAITS if self.last is None else self.last.status) if verdict is None else verdict.summary,
             "state": self._machine_state().as_dict(),
-            "by": self.watch.method,
+            "by": "volumes" if self.watch.has_begun or self.verdict is None else "recordings",
             "total_lpm": result.total_lpm,
             "total_interval_lpm": result.total_interval_lpm,
             "leak_lpm": result.leak_lpm,
@@ -308,16 +318,25 @@ class WatchedActuators:
         name = settings.name
 
         def make(watched: WatchedMachine) -> _Actuator:
-            is_recorded = watched.machine is not None and settings.folder is None and settings.recording_s > 0.0
+            is_recorded = settings.folder is None and settings.recording_s > 0.0
+            is_commissioned = watched.machine is not None
+            # the blocks have a share of the allowed false alarms; the recordings take the rest
+            share = 1.0 - STREAM_SHARE if is_recorded and is_commissioned else 1.0
             fresh = watch(
                 watched.rig,
-                # the blocks have a share of the allowed false alarms; the recordings take the rest
-                false_alarms_per_1000_h=settings.false_alarms_per_1000_h * (1.0 - STREAM_SHARE if is_recorded else 1.0),
+                false_alarms_per_1000_h=settings.false_alarms_per_1000_h * share,
                 learn_hours=settings.learn_hours,
                 healthy=watched.healthy,
             )
             recorder = StreamRecorder(name, settings.recording_s) if is_recorded else None
-            return _Actuator(settings, fresh, AlarmJudge(name), n_stored=n_stored, recorder=recorder)
+            return _Actuator(
+                settings,
+                fresh,
+                AlarmJudge(name),
+                n_stored=n_stored,
+                recorder=recorder,
+                is_commissioned=is_commissioned,
+            )
 
         return self._with_machine(settings.rig, make)
 
@@ -388,8 +407,7 @@ class WatchedActuators:
                 if actuator.recorder is not None:
                     actuator.recorder.refill(number, samples)
                 continue
-            if actuator.recorder is not None:  # a recording that ends here has the stored verdict
-                actuator.recorder.take(number, samples)
+            actuator.record(number, samples)  # a recording that ends here has the stored verdict
             # with the settings of the first time, if readable
             actuator.judge_samples(samples, follows=follows, settings=stored_settings or settings, verdict=verdict)
         # samples that are damaged have no effect on the restored detector, but their estimates are stored
@@ -493,7 +511,7 @@ class WatchedActuators:
         self._check_time_unit(actuator, samples)
         settings, recorder = actuator.settings, actuator.recorder
         name, number = settings.name, actuator.n_stored
-        if recorder is not None and (recording := recorder.take(number, samples)) is not None:
+        if (recording := actuator.record(number, samples)) is not None:
             try:
                 watched = self._with_machine(settings.rig, lambda watched: watched)  # the file may have changed
                 verdict = judge_stream(watched, recording, limit_lpm=settings.error_lpm)

@@ -6,8 +6,9 @@ alarm whose cause has ended is "returned to normal, unacknowledged" in the stand
 
 Two ways lead to an alarm, both in `AlarmJudge`: `update`, from the blocks of a stream, once their detector (`Watch`)
 has found a leak; and `update_from_verdict`, from whole recordings. For a file, a verdict of leak or no leak replaces
-the results of its blocks. The recordings of a commissioned machine's stream add up their evidence; they and the blocks
-have half the rate `false_alarms_per_1000_h` each (`verdicts.STREAM_SHARE`), and other streams' blocks all of it. Nine
+the results of its blocks. The recordings of a commissioned machine's stream, or of one without a position, add up their
+evidence; they and the blocks have half the rate `false_alarms_per_1000_h` each (`verdicts.STREAM_SHARE`), and other
+streams' blocks all of it. Nine
 tenths of the blocks' part go to their test for a step, one tenth to that against the baseline
 (`diagnosis/live/priors.toml`).
 """

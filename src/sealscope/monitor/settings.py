@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, IPvAnyAddress, ValidationInfo, model_validator
 
 from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.diagnosis.live.joining import CHANNELS, format_ways, ways_to_watch
+from sealscope.diagnosis.live.joining import CHANNELS, format_ways
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
@@ -65,7 +65,7 @@ class WatchSettings(_Table):
     error_lpm: float | None = Field(default=None, gt=0, allow_inf_nan=False)
     debounce_blocks: int = Field(default=2, ge=1, le=1000)  # successive blocks after which the alarm changes
     return_share: float = Field(default=0.7, gt=0, lt=1)  # fraction of a threshold below which the leak has ended
-    # length of the recordings into which the stream of a commissioned machine is cut, 0 for none
+    # length of the recordings into which a stream is cut, 0 for none
     recording_s: Annotated[float, AfterValidator(_check_recording_length)] = 180.0
     no_data_s: float = Field(default=3600.0, gt=0)
     not_comparable_s: float = Field(default=3600.0, gt=0)
@@ -273,9 +273,10 @@ def _check_channels(actuator: ActuatorSettings, *, has_opcua: bool) -> None:
         return
     watched, nodes = load_watched(actuator.rig), actuator.nodes.keys()
     # recordings of the stream, which are judged as a whole, may do with other channels than its blocks
-    is_recorded = watched.machine is not None and actuator.recording_s > 0.0
-    ways = ways_to_watch(watched.rig)  # the sets of channels that suffice to watch the actuator by blocks
-    if not (is_recorded and nodes >= {"p_A", "p_B"}) and not any(nodes >= {*way} for way in ways):
+    ways = watched.rig.circuit.watched_by  # the sets of channels that suffice to watch the actuator by blocks
+    if actuator.recording_s > 0.0:
+        ways = (("p_A", "p_B"), *ways)
+    if not any(nodes >= {*way} for way in ways):
         raise ValueError(f"nodes of {actuator.name!r} must give {format_ways(ways)}, got {', '.join(nodes)}")
 
 

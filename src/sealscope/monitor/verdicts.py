@@ -14,7 +14,9 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.commissioned.watched import WatchedMachine
+from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
+from sealscope.diagnosis.live.joining import find_way
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -181,15 +183,22 @@ def judge_recording(
     """Judge a recording by comparison with its machine's healthy recordings, like `sealscope diagnose --machine`.
 
     `file`: name of its file; `shift` [s]: added to its times to give seconds since 1970; `limit_lpm` [L/min]: leak that
-    calls for a repair, None for the limit in the machine's file. Returns None if the file has no healthy recordings.
+    calls for a repair, None for the limit in the machine's file. Without healthy recordings, a recording with a
+    position is not judged, as its blocks are: the result is None. One without a position is judged like `sealscope
+    diagnose`.
     """
     machine = watched.machine
-    if machine is None:
+    limit = None if limit_lpm is None else f"{limit_lpm:.12g} L/min"
+    if machine is not None:
+        # the limit in the machine's file is used in its own unit: a limit of creep is compared with the creep
+        if limit_lpm not in (None, watched.limit_lpm):
+            machine = replace(machine, limit=limit)
+        diagnosis = machine.diagnose(recording)
+    elif find_way(watched.rig.circuit.watched_by, recording.channels):
         return None
-    # the limit in the machine's file is used in its own unit: a limit of creep is compared with the creep
-    if limit_lpm not in (None, watched.limit_lpm):
-        machine = replace(machine, limit=f"{limit_lpm:.12g} L/min")
-    diagnosis = replace(machine.diagnose(recording), file=file)
+    else:
+        diagnosis = diagnose(recording, rig=watched.rig, limit=limit)
+    diagnosis = replace(diagnosis, file=file)
     times = recording.t[np.isfinite(recording.t)]
     start_s, end_s = (float(times[0]), float(times[-1])) if times.size else (0.0, 0.0)
     return RecordingVerdict.from_diagnosis(diagnosis, start_s + shift, end_s + shift, shift)

@@ -5,8 +5,7 @@ A transducer's noise never stops: a value that stays unchanged for long is clipp
 
 from __future__ import annotations
 
-import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,32 +32,19 @@ def is_moving(values: Array) -> bool:
     return values.size > 1 and bool(np.isfinite(values).all()) and not is_constant(values)
 
 
-class Holds(NamedTuple):
-    """Samples at which a pressure is held, i.e. repeats one value for too long to be a reading."""
-
-    flags: NDArray[np.bool_]  # (n,), True for held samples
-    pending: int  # index of the first flag that later samples may still change
-
-
-def find_holds(values: Array, rate: float, before: float = math.nan) -> Holds:
-    """Find the samples at which a pressure `values` (n,) repeats one value for longer than its noise allows.
+def find_holds(values: Array, rate: float) -> NDArray[np.bool_]:
+    """Find the samples (n,) at which a pressure `values` repeats one value for longer than its noise allows.
 
     A run of equal samples is a hold if it is longer than both 1.5 s and 64 samples; a missing sample ends a run. The
-    first sample of a hold is a reading and not flagged. `rate`: sampling rate [Hz]; `before`: value of a hold just
-    before these samples, NaN if there is none. A first run of this value continues the hold: all of it is flagged.
+    first sample of a hold is a reading and not flagged. `rate`: sampling rate [Hz].
     """
     max_length = max(round(_HOLD.seconds * rate), _HOLD.samples)
     edges = np.concatenate([[0], np.flatnonzero(values[1:] != values[:-1]) + 1, [len(values)]])
     lengths = np.diff(edges)
     is_hold = lengths > max_length
-    continues = bool(len(values)) and bool(values[0] == before)
-    is_hold[0] |= continues
     flags = np.repeat(is_hold, lengths)
-    first_samples = edges[:-1][is_hold]
-    flags[first_samples[1:] if continues else first_samples] = False
-    # a last run that is no hold may grow into one: the flags after its first sample, which stays a reading, may change
-    pending = len(values) if is_hold[-1] else min(int(edges[-2]) + 1, len(values))  # min: 0 without samples
-    return Holds(flags, pending)
+    flags[edges[:-1][is_hold]] = False
+    return flags
 
 
 def describe_hold(recording: Recording) -> str | None:
@@ -72,7 +58,7 @@ def describe_hold(recording: Recording) -> str | None:
         values = recording[name]
         if len(values) <= _HOLD.samples or is_constant(values):
             continue
-        if len(holds := find_runs(find_holds(values, recording.rate).flags)):
+        if len(holds := find_runs(find_holds(values, recording.rate))):
             first, length = holds[np.argmax(holds[:, 1])]  # the longest
             # the sample before the flagged ones is the reading that they repeat
             start, stop = (float(recording.t[k]) for k in (first - 1, first + length - 1))

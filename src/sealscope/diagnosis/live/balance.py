@@ -135,16 +135,12 @@ class LiveBalance(SavedAttributes):
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
     `names` are the channels of the samples; InputError is raised if they allow no balance. The estimates do not depend
-    on how the samples are divided into calls. `pressures.PressureEstimator` explains the attributes of the class.
+    on how the samples are divided into calls. `data` is the kind of data (`Observable.data`) from which the conductance
+    is estimated.
     """
 
-    method = "volumes"
     data = VOLUMES
-    states_level = True
-    min_law_ratio = max_law_ratio = 1.0  # limits of a leak's flow beside its error, `leak_error`
-    outside_ratios: tuple[float, float, float] = LIVE.watch.outside
     block_seconds = BLOCK_SECONDS
-    has_begun = True
     SAVED = ("_precision", "_moving", "_waiting", "_n_meanings", "_rate", "_signals")
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:

@@ -303,22 +303,19 @@ class BaselineLearning:
             self.mean += difference / self.count
             self.squares += difference * (mean - self.mean)
 
-    def freeze(
-        self, version: int, end: float, hours: float, *, states_level: bool, states_litres: bool
-    ) -> WatchBaseline:
+    def freeze(self, version: int, end: float, hours: float, *, states_litres: bool) -> WatchBaseline:
         """Compute the baseline from the sums over at least `GROUP` blocks, the last of which ends at `end` [s].
 
-        `states_level`: true if the estimates have no errors that change slowly; `states_litres`: flows are in L/min.
+        `states_litres`: true if flows are in L/min.
         """
         assert self.duty_low and self.duty_high and self.low is not None and self.high is not None
         level = self.total / self.blocks
-        lpm = level * (self.flow / self.blocks) if states_level and states_litres else None
+        lpm = level * (self.flow / self.blocks) if states_litres else None
         # standard deviation between the `count` groups of blocks
         deviation, short_term = 0.0, None
         if self.count > 1:
             deviation = math.sqrt(self.squares / (self.count - 1))
-            if states_level:
-                short_term = math.sqrt(0.5 * self.square_differences / (self.count - 1))  # J. von Neumann's estimate
+            short_term = math.sqrt(0.5 * self.square_differences / (self.count - 1))  # J. von Neumann's estimate
         healthy = HealthyLevel(level, self.low, self.high, deviation, known_s=end, count=self.count)
         return WatchBaseline(
             **vars(healthy),

@@ -6,9 +6,9 @@ The result depends on the samples and their order, not on how they are divided i
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,9 +19,6 @@ from sealscope.errors import InputError
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.storage.plain_state import SavedAttributes
 
-if TYPE_CHECKING:
-    from sealscope.parameters import Rig
-
 #: Channels of an actuator to store: those by which its blocks or recordings are judged, and the oil temperature.
 CHANNELS = ("x", "theta", "omega", "q_pump", "p_A", "p_B", "p_1", "p_2", "u", "T_oil")
 _PRIORS = LIVE.samples
@@ -31,12 +28,9 @@ _MIN_STEP, _MAX_STEP = _PRIORS.follows
 _MAX_LATE_S = 60.0
 
 
-def ways_to_watch(rig: Rig) -> tuple[tuple[str, ...], ...]:
-    """Return the sets of channels by which an actuator can be watched, the best first; one may be without x."""
-    # the response of the pressures to the command needs no position x, but its model (`pressures.reduced_rig`) has a
-    # pump and one piston area, the mean of two nearly equal ones
-    has_response = rig.circuit.pump_feeds_chambers and not rig.cylinder.single_rod
-    return (*rig.circuit.watched_by, ("p_A", "p_B", "u")) if has_response else rig.circuit.watched_by
+def find_way(ways: Sequence[tuple[str, ...]], channels: Collection[str]) -> tuple[str, ...]:
+    """Return the first of the sets of channels, `ways` to watch a machine, that the `channels` contain, or ()."""
+    return next((way for way in ways if {*channels} >= {*way}), ())
 
 
 def format_ways(ways: Sequence[Sequence[str]]) -> str:
@@ -70,11 +64,10 @@ class SampleRun(NamedTuple):
 class SampleJoiner(SavedAttributes):
     """Divide the samples of an actuator into runs without a gap."""
 
-    SAVED: ClassVar = ("is_final", "names", "rate", "newest", "changed", "counters", "angle")
+    SAVED: ClassVar = ("names", "rate", "newest", "changed", "counters", "angle")
     SAVED_TYPES: ClassVar = {"names": tuple[str, ...], "counters": dict[str, int]}
 
-    ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched (`ways_to_watch`)
-    is_final: bool = False  # True if the set of channels must not be replaced any more
+    ways: tuple[tuple[str, ...], ...]  # sets of channels from which the actuator can be watched, the best first
     names: tuple[str, ...] = ()  # set of channels in use, empty before the first samples
     rate: float = 0.0  # sampling rate [Hz]
     newest: float = -math.inf  # time of the newest sample [s]
@@ -92,15 +85,15 @@ class SampleJoiner(SavedAttributes):
         self.newest = -math.inf
 
     def runs(self, samples: Recording) -> Iterator[SampleRun]:
-        """Yield the runs of samples without a gap; count dropped samples, gaps, and changes of rate or channels."""
-        names = self._choose_names(samples)
+        """Yield the runs of samples without a gap; count dropped samples, gaps, and changes of the rate.
+
+        The set of channels is the first of `ways` that the first samples have.
+        """
+        names = self.names or find_way(self.ways, samples.channels)
         if reason := _find_lack(samples, names) if names else f"samples without {format_ways(self.ways)}":
             self.count(reason, len(samples))
             return
-        if names != self.names:
-            # `changed` is not set: for another set of channels the caller begins with a new estimator
-            if self.names:
-                self.count("began anew: a position is recorded, too")
+        if not self.names:
             self.names, self.rate = names, samples.rate
         if not is_same_rate(samples.rate, self.rate):
             self.count("rate changed")
@@ -117,15 +110,6 @@ class SampleJoiner(SavedAttributes):
                     self.count("wraps of the motor angle, undone", n_wraps)
             yield SampleRun(samples.t[first:stop], channels, self.rate, has_no_gap and not self.changed)
             self.changed = False
-
-    def _choose_names(self, samples: Recording) -> tuple[str, ...]:
-        """Choose the channels by which to watch: those in use, or else the first of `ways` that is recorded, or ().
-
-        Channels in use are replaced only by a set that adds the position x, and not if `is_final`.
-        """
-        recorded = next((way for way in self.ways if samples.channels.keys() >= {*way}), ())
-        has_new_position = "x" in recorded and "x" not in self.names and not self.is_final
-        return recorded if not self.names or has_new_position else self.names
 
     def _iter_runs(self, t: Array) -> Iterator[tuple[int, int]]:
         """Yield the index range (first, last + 1) of each run of times `t` (n,) [s] without a gap.

@@ -33,9 +33,8 @@ from sealscope.diagnosis.live.estimates import (
     mean_flow,
 )
 from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, explain_rise
-from sealscope.diagnosis.live.joining import SampleJoiner, ways_to_watch
+from sealscope.diagnosis.live.joining import SampleJoiner, find_way
 from sealscope.diagnosis.live.null import StepNull
-from sealscope.diagnosis.live.pressures import PressureEstimator
 from sealscope.diagnosis.live.rise import LEVEL, STEP, LiveRise
 from sealscope.diagnosis.live.sequential import RECENT, StepDetector
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -45,7 +44,7 @@ from sealscope.errors import InputError
 from sealscope.recordings.corrections.gaps import remove_dropouts
 from sealscope.recordings.formats.times.timebase import clock_text, counts_from_1970
 from sealscope.recordings.recording import Recording
-from sealscope.storage.plain_state import require_part, restore, restore_attributes, save_attributes
+from sealscope.storage.plain_state import require_part, restore_attributes, save_attributes
 from sealscope.units import LITRE_PER_MINUTE
 
 if TYPE_CHECKING:
@@ -60,9 +59,6 @@ _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
 #: Blocks with larger numbers are refused, as their products would overflow.
 _MAX_NUMBER = 1e100
-#: Estimates a conductance for each block; there is one class for each way of watching.
-Estimator = LiveBalance | PressureEstimator
-_ESTIMATORS: dict[str, type[Estimator]] = {kind.method: kind for kind in (LiveBalance, PressureEstimator)}
 
 
 def _rate_of_certain_alarms(test: str, seconds: float) -> float:
@@ -74,10 +70,9 @@ def _rate_of_certain_alarms(test: str, seconds: float) -> float:
 
 
 def _check_false_alarm_rate(rate: float) -> None:
-    """Raise InputError unless each test, in each way of watching, has a false-alarm probability of 1e-12 to 0.05."""
+    """Raise InputError unless each test has a false-alarm probability of 1e-12 to 0.05."""
     rates = [
-        _rate_of_certain_alarms(test, blocks * kind.block_seconds)
-        for kind in _ESTIMATORS.values()
+        _rate_of_certain_alarms(test, blocks * LiveBalance.block_seconds)
         for test, blocks in ((STEP, 1), (LEVEL, GROUP))
     ]
     min_rate, max_rate = 1e-12 * max(rates), 0.05 * min(rates)
@@ -88,14 +83,15 @@ def _check_false_alarm_rate(rate: float) -> None:
 class Watch:
     """Watch one running actuator for leaks; created by the function `watch`, with a state that can be saved.
 
-    If a position is recorded, the leakage is estimated from the balance of volumes, else from the pressures' response.
+    The leakage is estimated from the balance of volumes, which needs a position. Without one, judge recordings that are
+    cut from the stream by `diagnose`, as the monitor does.
 
     Parameters
     ----------
     rig, false_alarms_per_1000_h, learn_hours : Rig, float, float
         Arguments of `watch`.
-    litres : mapping of str to bool, optional
-        Whether L/min can be stated, for each way of watching, "volumes" and "pressures"; by default found from the rig.
+    states_litres : bool, optional
+        Whether L/min can be stated; by default found from the rig.
     healthy : HealthyLevel, optional
         Argument of `watch`.
 
@@ -127,7 +123,7 @@ class Watch:
         false_alarms_per_1000_h: float,
         learn_hours: float,
         *,
-        litres: Mapping[str, bool] | None = None,
+        states_litres: bool | None = None,
         healthy: HealthyLevel | None = None,
     ) -> None:
         _check_false_alarm_rate(false_alarms_per_1000_h)
@@ -135,11 +131,9 @@ class Watch:
         if not 0.0 < learn_hours <= 1000.0:
             raise InputError(f"learn_hours must be > 0 and at most 1000 h, got {learn_hours:g}")
         self._rig, self.healthy = rig, healthy
-        if litres is None:
-            litres = {method: estimator.states_flow(rig) for method, estimator in _ESTIMATORS.items()}
-        self._litres = litres
-        self._samples = SampleJoiner(ways_to_watch(rig))
-        self._estimator: Estimator | None = None  # None until samples have arrived
+        self._states_litres = LiveBalance.states_flow(rig) if states_litres is None else states_litres
+        self._samples = SampleJoiner(rig.circuit.watched_by)
+        self._estimator: LiveBalance | None = None  # None until samples have arrived
         self.baseline: WatchBaseline | None = None
         self.leak: WatchedLeak | None = None
         self.blocks, self.baseline_version = 0, 1
@@ -160,14 +154,18 @@ class Watch:
         return json.dumps(self._rig.model_dump())
 
     @property
-    def learned_with(self) -> tuple[Rig, Mapping[str, bool], float]:
-        """Rig of the baseline, for each method True if it states L/min, and the time to learn [h]."""
-        return self._rig, self._litres, self.learn_hours
+    def learned_with(self) -> tuple[Rig, bool, float]:
+        """Rig of the baseline, True if L/min are stated, and the time to learn [h]."""
+        return self._rig, self._states_litres, self.learn_hours
 
     @property
-    def method(self) -> str:
-        """Method of watching the machine, "pressures" if samples have come without a position, else "volumes"."""
-        return "volumes" if "x" in self._samples.names or not self._samples.names else "pressures"
+    def has_begun(self) -> bool:
+        """True once samples have come that can be watched."""
+        return bool(self._samples.names)
+
+    def lacks_channels(self, samples: Recording) -> bool:
+        """Return True if `samples` have too few channels for the volume balance, such as no position."""
+        return not find_way(self._rig.circuit.watched_by, samples.channels)
 
     @property
     def counters(self) -> dict[str, int]:
@@ -176,13 +174,8 @@ class Watch:
 
     @property
     def block_seconds(self) -> float:
-        """Approximate length of a block [s]; until samples have arrived, the length for the volume balance."""
-        return LiveBalance.block_seconds if self._estimator is None else self._estimator.block_seconds
-
-    @property
-    def _states_litres(self) -> bool:
-        """True if the present method states leaks in L/min."""
-        return self._litres.get(self.method, False)
+        """Approximate length of a block [s]."""
+        return LiveBalance.block_seconds
 
     @property
     def why_no_litres(self) -> str:
@@ -224,7 +217,7 @@ class Watch:
             score = min(max(2.0 * self._detector.log_e(), 0.0), threshold * (1.0 - 1e-6))  # twice the log e-value
             test, cause = LiveRise(STEP, score), estimator.cause
             pressure, pump_flow = (float(self._compared[name].mean()) for name in ("pressure", "pump_flow"))
-            max_flow = estimator.max_law_ratio * self._detector.bound() * pressure
+            max_flow = self._detector.bound() * pressure
             bound = max_flow * (1.0 + UPPER_95 * estimator.leak_error)
         least, usual, most = self._flow_ratios()
         # mean increase of the leakage
@@ -247,10 +240,8 @@ class Watch:
 
     def _flow_ratios(self) -> tuple[float, float, float]:
         """Return the smallest, usual and largest ratio of a leak's flow to the increase of the estimated leakage."""
-        estimator = self._used_estimator
-        if self.leak is not None and self.leak.cause == OUTSIDE:
-            return estimator.outside_ratios
-        return estimator.min_law_ratio, 1.0, estimator.max_law_ratio
+        is_outside = self.leak is not None and self.leak.cause == OUTSIDE
+        return LIVE.watch.outside if is_outside else (1.0, 1.0, 1.0)
 
     def update(self, samples: Recording, *, follows: bool = True) -> list[BlockEstimate]:
         """Process the next samples; the estimates do not depend on how the samples are divided into calls.
@@ -259,8 +250,8 @@ class Watch:
         ----------
         samples : Recording
             The next samples, in SI units. A pump-controlled cylinder needs ``p_A``, ``p_B``, ``x`` and ``theta`` or
-            ``omega``; with two equal areas ``p_A``, ``p_B`` and ``u`` suffice. A valve-controlled cylinder needs
-            ``x``, ``u`` and all four pressures. Samples that cannot be used are dropped and counted (`counters`).
+            ``omega``, a valve-controlled cylinder ``x``, ``u`` and all four pressures. Samples that cannot be used are
+            dropped and counted (`counters`).
         follows : bool, default True
             False if the clock starts anew, as at the beginning of a separate file.
 
@@ -282,20 +273,13 @@ class Watch:
                     result = next(results, None)
                 if result is None:
                     break
-                if isinstance(result, NotJudged) and not result.status:  # samples before the first block
-                    self._samples.count(result.counter)
-                else:
-                    yield self.judge(result), self.leak
-            self._samples.is_final = self._used_estimator.has_begun
+                yield self.judge(result), self.leak
 
     @property
-    def _used_estimator(self) -> Estimator:
-        """Estimator of the conductance for the channels in use; a new one if a position came later."""
-        if self._estimator is None or self._estimator.method != self.method:
-            if self.method == PressureEstimator.method:
-                self._estimator = PressureEstimator(self._rig)
-            else:
-                self._estimator = LiveBalance(self._rig, self._samples.names)
+    def _used_estimator(self) -> LiveBalance:
+        """Estimator of the conductance for the channels in use."""
+        if self._estimator is None:
+            self._estimator = LiveBalance(self._rig, self._samples.names)
         return self._estimator
 
     def continue_from(self, blocks: int, baseline_version: int) -> None:
@@ -396,8 +380,9 @@ class Watch:
         self._learning.add(block.g, block.lpm, block.duty)
         hours = self._learning.blocks * self.block_seconds / 3600.0
         if self._learning.blocks >= LEARNED and hours >= self.learn_hours * (1.0 - 1e-12):  # rounding of `hours`
-            stated = {"states_level": self._used_estimator.states_level, "states_litres": self._states_litres}
-            self.baseline = self._learning.freeze(self.baseline_version, block.end, hours, **stated)
+            self.baseline = self._learning.freeze(
+                self.baseline_version, block.end, hours, states_litres=self._states_litres
+            )
             self._learning = BaselineLearning()
 
     def _test_step(self, block: BlockConductance) -> bool:
@@ -489,12 +474,10 @@ class Watch:
         """Test the mean conductance of the last `GROUP` blocks, up to `block`, and raise the alarm if it is too high.
 
         The blocks are weighted by their precisions. The mean is compared with the baseline or, before there is one,
-        with healthy recordings if the estimator states levels. Without either, nothing is tested. An error of the
-        machine's sizes scales both alike, and does not count.
+        with healthy recordings. Without either, nothing is tested. An error of the machine's sizes scales both alike,
+        and does not count.
         """
-        healthy: HealthyLevel | None = self.baseline
-        if healthy is None and self._used_estimator.states_level:
-            healthy = self.healthy
+        healthy = self.baseline or self.healthy
         if healthy is None:
             return
         has_baseline = healthy is self.baseline
@@ -593,10 +576,10 @@ class Watch:
         """Add the mean total flow and leak of `blocks` [L/min], with 95 % intervals, to an estimate.
 
         `blocks` (n,) have the fields of `BlockConductance`. The leak is the flow above that of the baseline or, after
-        an alarm, above that before the onset. It is left out if there is neither a baseline nor an alarm. The total is
-        left out if the estimator states only changes, and both flows are left out without L/min. The limits of the leak
-        are those above the highest and the lowest reference level, minus and plus a half-width, times the smallest and
-        the largest ratio of a true to the estimated leak; both at least 0.
+        an alarm, above that before the onset. It is left out if there is neither a baseline nor an alarm. Both flows
+        are left out without L/min. The limits of the leak are those above the highest and the lowest reference level,
+        minus and plus a half-width, times the smallest and the largest ratio of a true to the estimated leak; both at
+        least 0.
         """
         if not self._states_litres:
             return estimate
@@ -605,18 +588,17 @@ class Watch:
         mean_lpm = float(lpm.mean())
         # `noise`: actual over stated variance of the conductances
         errors = blocks["sd"] * lpm * math.sqrt(self._detector.noise)
-        if estimator.states_level:
-            total = mean_flow(blocks["total"] * lpm, errors)
-            offset = float(np.mean(blocks["offset"] * lpm))
-            half_width = WITHIN_95 * math.hypot(total.deviation, offset, estimator.size_error * total.value)
-            interval = max(0.0, total.value - half_width), max(0.0, total.value + half_width)
-            estimate = replace(estimate, total_lpm=total.value, total_interval_lpm=interval)
+        total = mean_flow(blocks["total"] * lpm, errors)
+        offset = float(np.mean(blocks["offset"] * lpm))
+        half_width = WITHIN_95 * math.hypot(total.deviation, offset, estimator.size_error * total.value)
+        interval = max(0.0, total.value - half_width), max(0.0, total.value + half_width)
+        estimate = replace(estimate, total_lpm=total.value, total_interval_lpm=interval)
         if self.leak is not None:
             reference, reference_sd = level_before_leak(self.leak, estimate.t), self.leak.rise_sd
             least, usual, most = self._flow_ratios()
         elif self.baseline is not None:
             reference = Interval(self.baseline.level, self.baseline.low, self.baseline.high)
-            reference_sd, least, usual, most = 0.0, 1.0, 1.0, estimator.max_law_ratio
+            reference_sd, least, usual, most = 0.0, 1.0, 1.0, 1.0
         else:
             return estimate
         leak = mean_flow((blocks["g"] - reference.value) * lpm, errors)
@@ -627,13 +609,11 @@ class Watch:
 
     def state(self) -> dict[str, Any]:
         """Return the state of the watch as plain values for JSON, for `from_state`."""
-        # an estimator for other channels than those in use is not saved, as the next samples would replace it
-        estimator = self._estimator if self._estimator is not None and self._estimator.method == self.method else None
         return {
             "version": STATE_VERSION,
             "rig": self._rig_text,
-            **save_attributes(self, ("_litres", *_SAVED)),
-            "estimator": None if estimator is None else estimator.state(),
+            **save_attributes(self, ("_states_litres", *_SAVED)),
+            "estimator": None if self._estimator is None else self._estimator.state(),
         }
 
     @classmethod
@@ -643,8 +623,8 @@ class Watch:
         if version != STATE_VERSION:
             raise InputError(f"saved state must have version {STATE_VERSION}, got {version}")
         rate, hours = (require_part(state, name, (float, int)) for name in ("false_alarms_per_1000_h", "learn_hours"))
-        litres = restore(dict[str, bool], require_part(state, "litres", Mapping), "litres")
-        watch = cls(_parse_rig(require_part(state, "rig", str)), rate, hours, litres=litres)
+        states_litres = require_part(state, "states_litres", bool)
+        watch = cls(_parse_rig(require_part(state, "rig", str)), rate, hours, states_litres=states_litres)
         restore_attributes(watch, _SAVED, state, _SAVED_TYPES)
         if (estimator := require_part(state, "estimator", (Mapping, type(None)))) is not None:
             watch._used_estimator.load_state(estimator)
@@ -683,8 +663,7 @@ def watch(
     Parameters
     ----------
     rig : Rig, str or path, default "thesis"
-        Sizes of the machine. If the position is recorded, only piston area and pump displacement are used, otherwise
-        the whole model.
+        Sizes of the machine, of which piston area and pump displacement are used.
     false_alarms_per_1000_h : float, default 1
         Largest number of false alarms of a healthy machine per 1000 operating hours.
     learn_hours : float, default 8

@@ -52,10 +52,8 @@ class WatchPriors(PriorTable):
     pause: float  # [s] longest pause across which blocks are compared
     margin: float  # pressure and flow may exceed the range of the baseline by this logarithm
     damped: float  # the pressure may fall below the range by this logarithm, as a leak lowers it
-    # least, usual and largest ratio of what a leak to the outside loses to what the volume balance, or the response of
-    # the pressures, shows of it
+    # least, usual and largest ratio of what a leak to the outside loses to what the volume balance shows of it
     outside: tuple[float, float, float]
-    outside_by_pressures: tuple[float, float, float]
     law: float  # relative standard deviation of a leak's flow by the volume balance, as its law is unknown
     group: int  # number of blocks whose mean is compared with the baseline
     recent: int  # number of blocks whose mean is stated as the present leak
@@ -64,7 +62,7 @@ class WatchPriors(PriorTable):
 
 
 class StreamRecordingPriors(PriorTable):
-    """Recordings into which the stream of a commissioned machine is cut, to be judged as a whole."""
+    """Recordings into which a stream is cut, to be judged as a whole."""
 
     gap: float  # [s] longest gap within a recording
     lengths: tuple[float, float]  # [s] shortest recording that is judged, and longest that may be asked for
@@ -82,19 +80,6 @@ class RiseExplanationPriors(PriorTable):
     outside: int  # [blocks] number since the onset after which a leak may turn out to be one to the outside
 
 
-class LiveResponse(PriorTable):
-    """Fit of a model of the pressure response to the blocks of a running machine."""
-
-    seconds: float  # [s] length of a block
-    begins: float  # [s] length of the first fit
-    # blocks until the simulated states have settled, after the start and after a gap
-    settling: int
-    resuming: int
-    described: float  # the model describes a block if its chi square exceeds its mean by fewer standard deviations
-    lost: int  # the fit starts anew after this number of successive blocks that the model does not describe
-    usual: int  # blocks over which the usual variance of the residuals is averaged
-
-
 class LivePriors(PriorTable):
     """All tables of `live/priors.toml`, the assumptions on a running machine."""
 
@@ -105,7 +90,6 @@ class LivePriors(PriorTable):
     explanation: RiseExplanationPriors
     watch: WatchPriors
     recording: StreamRecordingPriors
-    response: LiveResponse
 
 
 LIVE = read_priors("sealscope.diagnosis.live", LivePriors)

@@ -1,7 +1,8 @@
 """Cut the samples of a running actuator into recordings, to be judged like the files of a folder.
 
 Holds (standstill under load), the law of a leak, and the comparison with healthy recordings show in minutes, not in
-single blocks of some seconds. So the monitor also judges the last minutes of a commissioned machine's stream.
+single blocks of some seconds. So the monitor also judges the last minutes of a commissioned machine's stream, and those
+of any stream without a position, whose blocks show nothing.
 """
 
 from __future__ import annotations

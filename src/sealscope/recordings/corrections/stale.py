@@ -87,7 +87,7 @@ def flag_frozen_rows(recording: Recording) -> NDArray[np.bool_]:
     flags = np.zeros(len(recording), dtype=bool)
     if not all(name in recording for name in CHAMBERS):
         return flags
-    holds_a, holds_b = (find_runs(find_holds(recording[name], recording.rate).flags) for name in CHAMBERS)
+    holds_a, holds_b = (find_runs(find_holds(recording[name], recording.rate)) for name in CHAMBERS)
     begins_b, ends_b = holds_b[:, 0], holds_b.sum(axis=1)
     channels = list(recording.channels.values())
     for first, length in holds_a.tolist():

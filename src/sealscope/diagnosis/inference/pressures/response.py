@@ -2,7 +2,7 @@
 
 One call of the simulation (`reduced_rig`) gives a whole Jacobian: it simulates in parallel the parameters, and the
 parameters with each of them increased in turn. An iterated Kalman filter tracks the parameters from block to block
-(`Follower`), both live and over a recording. Over a recording all blocks are then fitted together (`fit.Joint`). What
+(`Follower`). All blocks are then fitted together (`fit.Joint`). What
 healthy recordings tell of a machine is the prior of the next (`KnownMachine`).
 Friction follows Stribeck's law, or LuGre's if Stribeck's does not explain the beginning of the recording and LuGre's
 fits better.
@@ -342,7 +342,6 @@ class Follower:
         self.variance = math.nan  # variance of the noise [Pa^2]
         self.states = np.zeros((8, SPRING + 2))  # simulated states of all simulated parameter sets, as in `Segment`
         self.last = math.nan  # command at the last sample [V], NaN at the start and after a gap
-        self.excess = 0.0  # misfit of the last block of n samples, (chi squared - n) / sqrt(2 n)
 
     @staticmethod
     def fit_start(
@@ -398,22 +397,6 @@ class Follower:
         for first in range(0, stop, length):
             self.update(recording.samples(slice(first, first + length)))
         self.covariance, self.states, self.last = covariance, states, math.nan
-
-    def at_rate(self, rig: Rig, rate: float) -> Follower:
-        """Make a filter for samples of the same machine at another `rate` [Hz] that continues as after a gap."""
-        follower = Follower(rig, rate, self.sense, self.machine.law, self.priors)
-        follower.theta, follower.covariance = self.theta, self.covariance
-        follower.variance, follower.states = self.variance, self.states
-        return follower
-
-    def interrupt(self, gap_s: float) -> None:
-        """Increase the uncertainty of the parameters after a gap of `gap_s` [s] without samples.
-
-        At most the prior variance is added. The next block starts the simulation anew (`next_segment`).
-        """
-        added_variance = np.minimum(self.priors.wander_variance(gap_s), self.priors.variance)
-        self.covariance = self.covariance + np.diag(added_variance)
-        self.last = math.nan
 
     def next_segment(self, block: Recording) -> Segment:
         """Prepare the samples of the next block for a fit; at the start or after a gap, change `last` and `states`.
@@ -481,8 +464,6 @@ class Follower:
         """
         segment = self.next_segment(block)
         fit, prior = self._fit_block(segment, block.duration)
-        chi_squared = fit.cost(self.variance, prior)
-        self.excess = (chi_squared - segment.n_samples) / math.sqrt(2.0 * max(segment.n_samples, 1.0))
         hessian, gradient = fit.newton_terms(self.variance, prior)
         self.covariance = np.asarray(np.linalg.inv(hessian))
         # one more Gauss-Newton step, which needs no simulation
