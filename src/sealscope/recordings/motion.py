@@ -99,7 +99,7 @@ def find_stuck(values: Array) -> NDArray[np.intp]:
     no_runs = np.empty((0, 2), dtype=np.intp)
     if values.size < 2 * _NEIGHBOURHOOD:
         return no_runs
-    is_same = np.diff(values) == 0
+    is_same = values[1:] == values[:-1]
     runs = find_runs(is_same)  # each is one shorter than the run of equal values
     runs = runs[runs[:, 1] >= _MIN_STUCK - 1]
     first, last = runs[:, 0], runs.sum(axis=1)  # the samples first..last are equal

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache, partial
+from itertools import count
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from sealscope.recordings.channels import COUNTS, METERS, SLOW, Array, smallest_
 from sealscope.recordings.motion import find_runs, find_stuck, is_constant
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.stretches import iter_stretches, summarize_intervals
 
 Severity = Literal["note", "warning", "fatal"]
 
@@ -28,6 +30,7 @@ SHORTEST = 226  # fewest samples of a recording, the length of db8's level-4 fil
 _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS, _GAPS = (
     RECORDINGS.clock, RECORDINGS.hum, RECORDINGS.creep, RECORDINGS.rail, RECORDINGS.possible, RECORDINGS.gaps
 )  # fmt: skip
+_LONGEST_TRANSFORM = 2**17  # most values of a Fourier transform, which stays in the processor's cache
 _MAX_TEXT = 400  # longest text taken from the provenance of a file
 #: Intervals between these numbers of sampling steps are regular; a longer one is a gap, unless a logger polls.
 _MIN_STEP, _MAX_STEP = _CLOCK.regular
@@ -137,6 +140,15 @@ def _time_findings(recording: Recording) -> list[Finding]:
         if indices.size:
             findings.append(_make_finding(recording, code, None, indices.size, int(indices[0]), text, severity))
 
+    if len(recording) < SHORTEST:
+        text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
+        too_short = [Finding("too_short", "warning", None, len(recording), None, text)]
+    else:
+        too_short = []
+    intervals = summarize_intervals(t)
+    largest_deviation = max(abs(length / step - 1.0) for length in (intervals.shortest, intervals.longest))
+    if intervals.number and largest_deviation <= min(_CLOCK.scatter, _CLOCK.rate):
+        return too_short  # no interval is long, short or out of step
     timed, untimed = np.flatnonzero(np.isfinite(t)), np.flatnonzero(~np.isfinite(t))
     steps = np.diff(t[timed])
     reversed_steps, equal_steps = np.flatnonzero(steps < 0), np.flatnonzero(steps == 0)
@@ -175,10 +187,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
             is_irregular = (steps > 0) & (steps <= max_step * step) & (np.abs(steps / step - 1.0) > _CLOCK.scatter)
             text = f"intervals scatter by {100 * scatter:.0f} % of the sampling step"
             add("irregular_sampling", timed[np.flatnonzero(is_irregular)], text)
-    if len(recording) < SHORTEST:
-        text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
-        findings.append(Finding("too_short", "warning", None, len(recording), None, text))
-    return findings
+    return findings + too_short
 
 
 def _longest_regular_step(steps: Array) -> float:
@@ -207,8 +216,8 @@ def _creep_findings(recording: Recording) -> list[Finding]:
     duration = len(recording) / recording.rate
     if duration < _CREEP.seconds or any(recording.units.get(name) != "Pa" for name in ("p_A", "p_B")):
         return []
-    mean = 0.5 * (recording["p_A"] + recording["p_B"])
-    parts = np.array_split(mean, _CREEP.parts)
+    pressures = (np.array_split(recording[name], _CREEP.parts) for name in ("p_A", "p_B"))
+    parts = (0.5 * (p_A + p_B) for p_A, p_B in zip(*pressures, strict=True))
     means = np.array([np.nanmean(part) if np.isfinite(part).any() else np.nan for part in parts])
     steps = np.diff(means)
     creep_rate = float(np.median(steps)) * _CREEP.parts / duration
@@ -249,21 +258,27 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         first = format_value(values[impossible[0]])
         text = f"{format_count(impossible.size, 'sample')} beyond what any sensor reads, first {first}"
         add("impossible", impossible.size, int(impossible[0]), text)
-    present = np.flatnonzero(np.isfinite(values) & ~is_impossible)
-    readings = values[present]
+    is_present = np.isfinite(values) & ~is_impossible
+    is_complete = bool(is_present.all())
+    readings = values if is_complete else values[is_present]
+
+    def row_of(index: int) -> int:
+        """Find the row of the reading with this index."""
+        return index if is_complete else int(np.flatnonzero(is_present)[index])
+
     if readings.size < 2:
         return findings
     if is_constant(readings):
         # a flow meter on a closed bypass reads one value; a pressure never does
         text = f"is constant at {format_value(readings[0])}"
-        add("constant", readings.size, int(present[0]), text, "note" if may_rest else "warning")
+        add("constant", readings.size, row_of(0), text, "note" if may_rest else "warning")
         return findings
     stuck = find_stuck(readings)
     may_be_clipped = is_pressure or name == "q_leak"  # q_leak at the high end only: without flow it reads 0
     for rail in find_rails(readings, unit, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {format_value(rail.value)}: clipped"
-        add("clipped", rail.samples, int(present[rail.first]), text)
+        add("clipped", rail.samples, row_of(rail.first), text)
     if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
     elif name == "omega" or name in METERS:  # a pump or a meter that stands reads 0 without noise
@@ -273,14 +288,14 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         times = _format_repetitions(len(stuck))
         text = f"is stuck {times} while it should move, first for {length / recording.rate:g} s"
         n_stuck = int(stuck[:, 1].sum())
-        add("stuck", n_stuck, int(present[start]), text, weigh_defects(n_stuck, values.size))
+        add("stuck", n_stuck, row_of(start), text, weigh_defects(n_stuck, values.size))
     # the spectrum of a channel with many missing samples would be wrong
     for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
         text = f"mains hum of {line.frequency:g} Hz, amplitude {format_value(line.amplitude, 3, is_span=True)}"
         text += f", {100 * line.power_fraction:.2g} % of the power over 20 Hz"
         text += ": is the sensor connected?" if line.power_fraction > _HUM.alone else ""
         severity: Severity = "warning" if line.power_fraction > _HUM.loud else "note"
-        add("mains_hum", readings.size, int(present[0]), text, severity)
+        add("mains_hum", readings.size, row_of(0), text, severity)
     return findings
 
 
@@ -307,7 +322,7 @@ def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] |
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
     """Flag the finite samples (n,) in `unit` whose magnitude no sensor can read (`possible` of `priors.toml`)."""
     limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
-    return np.asarray(np.isfinite(values) & (np.abs(values) > limit))
+    return np.asarray(np.isfinite(values) & ((values > limit) | (values < -limit)))
 
 
 def _row_period(present: NDArray[np.intp]) -> int:
@@ -431,27 +446,19 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
     5 Hz but outside its own peak. A line is only searched for if half the sampling rate is more than 5 Hz above it.
     """
     n = values.size
-    if n / rate < _HUM.shortest:
+    frequencies = [mains for mains in (50.0, 60.0) if mains + _HUM.around < rate / 2]
+    if n / rate < _HUM.shortest or not frequencies:
         return []
-    x = np.arange(n) - (n - 1) / 2
-    detrended = values - values.mean()
-    detrended -= x * ((x @ detrended) / (x @ x))
-    if not detrended.any():
-        return []
-    window = _hann(n)
     n_fft = fast_length(n)
-    detrended *= window
-    spectrum = np.fft.rfft(detrended, n_fft)
-    squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
     bin_width = rate / n_fft
-    # power from `hum.lowest` on (1e-9: rounding); a Hann window makes the sum over the bins 1.5 n_fft / n times larger
-    power = float(squared_amplitudes[math.ceil(_HUM.lowest / bin_width - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)
+    trend = _fit_trend(values)
+    bins = np.arange(
+        int((frequencies[0] - _HUM.around) / bin_width), int((frequencies[-1] + _HUM.around) / bin_width) + 2
+    )
+    amplitudes = np.abs(_transform_at(bins, values, trend, n_fft)) * (4.0 / (n - 1))  # 2 over the window's sum
     lines = []
-    for mains in (50.0, 60.0):
-        if mains + _HUM.around >= rate / 2:
-            continue
-        bins = np.arange(int((mains - _HUM.around) / bin_width), int((mains + _HUM.around) / bin_width) + 2)
-        distance, amplitudes = np.abs(bins * bin_width - mains), np.sqrt(squared_amplitudes[bins])
+    for mains in frequencies:
+        distance = np.abs(bins * bin_width - mains)
         # the main lobe of the window ends 2 rate / n from a line; a mains frequency varies by 0.1 Hz
         is_line = distance <= max(0.1, 0.5 * rate / n)
         is_background = (distance > max(0.5, 2.5 * rate / n)) & (distance <= _HUM.around)
@@ -461,11 +468,51 @@ def find_hum(values: Array, rate: float) -> list[HumLine]:
             and peak > _HUM.over_rest * background.max()
             and peak > _HUM.over_median * np.median(background)
         ):
-            lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / power)))
+            lines.append(HumLine(mains, peak, min(1.0, peak**2 / 2 / _fast_power(values, trend, rate, n_fft))))
     return lines
 
 
-@lru_cache(2)
-def _hann(count: int) -> Array:
-    """Return a Hann window (count,), cached because all channels of a recording share it."""
-    return np.hanning(count)
+def _fit_trend(values: Array) -> tuple[float, float]:
+    """Fit a straight line to values (n,) by least squares; return its mean and its slope [1/sample]."""
+    n = values.size
+    mean = float(values.mean())
+    moments = ((np.arange(part.start, part.stop) - (n - 1) / 2) @ (values[part] - mean) for part in iter_stretches(n))
+    return mean, float(sum(moments)) * 12.0 / (n * (n**2 - 1.0))
+
+
+def _transform_at(bins: NDArray[np.intp], values: Array, trend: tuple[float, float], n_fft: int) -> NDArray[Any]:
+    """Compute some `bins` (m,) of the Fourier transform of values (n,) without their `trend`, times a Hann window.
+
+    Zeros are added to `n_fft` values. With n_fft = P Q, the transform is the sum over r of exp(-2 pi i k r / n_fft)
+    F_r(k mod Q), where F_r is that of the Q values r, r + P, r + 2 P, ...; none is longer than `_LONGEST_TRANSFORM`.
+    """
+    n, (mean, slope) = values.size, trend
+    n_parts = next(number for number in count(1) if n_fft % number == 0 and n_fft // number <= _LONGEST_TRANSFORM)
+    length = n_fft // n_parts
+    rows = np.arange(0, n, n_parts)
+    turn = np.exp(2j * np.pi / (n - 1) * rows)  # of the window, which turns once over the n values
+    step, phase = np.exp(-2j * np.pi / n_fft * bins), np.ones(bins.size, dtype=complex)
+    places = bins % length
+    is_mirrored = places > length // 2  # a transform of real values states only one half
+    places = np.where(is_mirrored, length - places, places)
+    total = np.zeros(bins.size, dtype=complex)
+    for first in range(n_parts):
+        part = values[first::n_parts]
+        shifted = np.exp(2j * np.pi / (n - 1) * first) * turn[: part.size]
+        window = 0.5 - 0.5 * shifted.real
+        detrended = part - (mean + slope * (rows[: part.size] + (first - (n - 1) / 2)))
+        transform = np.fft.rfft(detrended * window, length)[places]
+        total += phase * np.where(is_mirrored, transform.conj(), transform)
+        phase *= step
+    return total
+
+
+def _fast_power(values: Array, trend: tuple[float, float], rate: float, n_fft: int) -> float:
+    """Compute the power of values (n,) without their `trend` at frequencies from `hum.lowest` on."""
+    n, (mean, slope) = values.size, trend
+    detrended = values - (mean + slope * (np.arange(n) - (n - 1) / 2))
+    window = np.hanning(n)
+    spectrum = np.fft.rfft(detrended * window, n_fft)
+    squared_amplitudes = (spectrum.real**2 + spectrum.imag**2) * (2.0 / window.sum()) ** 2
+    # 1e-9: rounding; a Hann window makes the sum over the bins 1.5 n_fft / n times larger
+    return float(squared_amplitudes[math.ceil(_HUM.lowest * n_fft / rate - 1e-9) :].sum()) / 2 / (1.5 * n_fft / n)

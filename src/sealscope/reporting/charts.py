@@ -91,19 +91,21 @@ class Chart(NamedTuple):
         return any(bool(np.any((line.values < low) | (line.values > high))) for line in self.lines)
 
 
-def display_values(recording: Recording, name: str, pressure_unit: str) -> tuple[str, Array]:
-    """Convert a channel of a recording to its display unit; return the unit and the values (n,).
+def display_values(
+    recording: Recording, name: str, pressure_unit: str, values: Array | None = None
+) -> tuple[str, Array]:
+    """Convert a channel of a recording, or other `values` (n,) of it, to its display unit; return the unit and these.
 
     Pressures are shown in `pressure_unit`, other channels in the unit of the log or, if it has none, temperatures in
     degC and the others as `display_unit`.
     """
-    si_unit = recording.units[name]
+    si_unit, values = recording.units[name], recording[name] if values is None else values
     unit = None if si_unit in ("Pa", COUNTS) else recording.unit_in_log(name)
     if unit is not None or si_unit == "K":
         unit = unit or "degC"
-        return unit, from_si(recording[name], unit, si_unit)
+        return unit, from_si(values, unit, si_unit)
     unit, scale = display_unit(si_unit, pressure_unit)
-    return unit, recording[name] / scale
+    return unit, values / scale
 
 
 def display_unit(unit: str, pressure_unit: str) -> tuple[str, float]:

@@ -11,6 +11,7 @@ from sealscope.paragraphs import WIDTH, paragraph
 from sealscope.recordings.channels import LONG_NAMES, Array
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.stretches import finite_range
 from sealscope.reporting.charts import display_values
 
 _BARS = "▁▂▃▄▅▆▇█"
@@ -23,10 +24,9 @@ def draw_curve(values: Array, width: int) -> str:
 
     Each character shows the middle one of the finite values in its part of the curve, or is blank if there are none.
     """
-    finite = values[np.isfinite(values)]
-    if not finite.size:
+    if (ends := finite_range(values)) is None:
         return " " * width
-    low, high = float(finite.min()), float(finite.max())
+    low, high = ends
     edges = np.linspace(0, values.size, min(width, values.size) + 1).astype(int)
     bars = []
     for begin, end in pairwise(edges):
@@ -54,10 +54,10 @@ def overview_text(name: str, recording: Recording, findings: Sequence[Finding]) 
     clock = f"{len(recording)} samples at {recording.rate:g} Hz, {recording.duration:.7g} s{start}"
     lines = [paragraph(f"{name}: {kind}{clock}", indent=2)]
     for channel, values in recording.channels.items():
-        unit, display_samples = display_values(recording, channel, recording.pressure_unit)
-        finite = display_samples[np.isfinite(display_samples)]
-        ends = f"{_format_short(finite.min())} to {_format_short(finite.max())} {unit}" if finite.size else "no values"
-        line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{ends:<28}"
+        ends = finite_range(values)
+        unit, shown_ends = display_values(recording, channel, recording.pressure_unit, np.array(ends or (np.nan,)))
+        text = f"{_format_short(shown_ends.min())} to {_format_short(shown_ends.max())} {unit}" if ends else "no values"
+        line = f"  {channel:<7}{LONG_NAMES[channel]:<24}{text:<28}"
         width = max(_MIN_CURVE_WIDTH, WIDTH - len(line))  # the rest of the line
         lines.append(line + draw_curve(values, width))
     texts = [f"{name}: {value}" for name, value in recording.remarks.items()]

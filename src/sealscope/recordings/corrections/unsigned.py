@@ -26,6 +26,7 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding, Severity
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.stretches import finite_range, iter_stretches
 
 _PRIORS = RECORDINGS.unsigned
 _MAX_ITERATIONS = 10  # most iterations of the fit; each uses the signs of the previous one
@@ -50,13 +51,15 @@ def restore_signs(recording: Recording) -> tuple[Recording, list[Finding]]:
     channels, units, findings = dict(recording.channels), dict(recording.units), list[Finding]()
     valve = channels.pop("valve", None)
     units.pop("valve", None)
-    motion = _motion(recording)
     for name, quantity in UNSIGNED.items():
-        if name not in recording or motion is None or not _moves_both_ways(motion):
+        if name not in recording:
             continue
         values = recording[name]
         is_one_way = _has_one_sign(values)
         if not is_one_way and _moves_both_ways(values):
+            continue
+        motion = _motion(recording)
+        if motion is None or not _moves_both_ways(motion):
             continue
         # a channel that stays below zero is mirrored, so that all but its noise is positive
         main_side = 1.0 if np.nansum(values) >= 0.0 else -1.0
@@ -179,8 +182,8 @@ def restore_flow(values: Array, x: Array, difference: Array, rate: float, flow_p
 
 def _has_one_sign(values: Array) -> bool:
     """Test whether a channel (n,) stays on one side of zero (`is_one_sided`)."""
-    finite = values[np.isfinite(values)]
-    return bool(finite.size) and is_one_sided(float(finite.min()), float(finite.max()))
+    ends = finite_range(values)
+    return ends is not None and is_one_sided(*ends)
 
 
 def _find_sign(recording: Recording, magnitude: Array) -> tuple[Array | None, str]:
@@ -225,7 +228,11 @@ def _moves_both_ways(values: Array) -> bool:
 
     Of the sums of its positive and of its negative values, the smaller must exceed `unsigned.least` times the larger.
     """
-    return is_two_way(*(float(np.nansum(np.maximum(signed, 0.0))) for signed in (values, -values)))
+    outward = inward = 0.0
+    for stretch in iter_stretches(values.size):
+        outward += float(np.nansum(np.maximum(values[stretch], 0.0)))
+        inward -= float(np.nansum(np.minimum(values[stretch], 0.0)))
+    return is_two_way(outward, inward)
 
 
 def _correlation(first: Array, second: Array) -> float:

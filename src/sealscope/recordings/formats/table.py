@@ -180,7 +180,7 @@ def build_fields(
 
 def convert_columns(
     choice: ColumnMap,
-    columns: Mapping[int, NDArray[Any]],
+    columns: dict[int, NDArray[Any]],
     kind: str,
     request: Request,
     notes: Sequence[str] = (),
@@ -191,7 +191,8 @@ def convert_columns(
 ) -> RecordingFields:
     """Convert the columns that were read from a table to the fields of a recording.
 
-    - `columns`: column -> values (n,), doubles or, for the time, datetime64; `notes`: lines for the history.
+    - `columns`: column -> values (n,), doubles or, for the time, datetime64; it loses the columns that are converted,
+      so that a long log is not held twice. `notes`: lines for the history.
     - `kind`, `remarks`, `description`: as for `build_fields`.
     - `state`: state of the time column after the previous part of a text log, which is updated; None for a whole log.
 
@@ -267,13 +268,14 @@ def _describe_clock(base: TimeBase, name: str) -> dict[str, Any]:
 
 
 def _convert_channels(
-    choice: ColumnMap, columns: Mapping[int, NDArray[Any]]
+    choice: ColumnMap, columns: dict[int, NDArray[Any]]
 ) -> tuple[dict[str, Array], dict[str, str], dict[str, str]]:
-    """Convert the chosen channels of a table, column -> values (n,), to SI units or counts.
+    """Convert the chosen channels of a table, column -> values (n,), to SI units or counts; drop columns after use.
 
     Returns channel -> values (n,), channel -> unit, and channel -> unit in the log where this differs.
     """
     channels, units, log_units = {}, {}, {}
+    n_uses = Counter(column for formula in choice.channels.values() for column in formula.columns)
     for name, formula in choice.channels.items():
         unit = formula.unit or COUNTS
         units[name] = COUNTS if unit == COUNTS else CHANNEL_UNITS[name]
@@ -282,6 +284,10 @@ def _convert_channels(
         channels[name] = to_si(formula.values(columns), unit, units[name], name=name)
         if not any(channels[name] is cells for cells in columns.values()):  # not an array of the caller
             channels[name].setflags(write=False)  # so that the recording does not copy it
+        for column in formula.columns:
+            n_uses[column] -= 1
+            if not n_uses[column]:
+                del columns[column]
     return channels, units, log_units
 
 

@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from importlib.util import find_spec
-from itertools import accumulate, chain, pairwise
+from itertools import chain, pairwise
 from math import inf, isnan
 from os import SEEK_CUR
 from pathlib import Path
@@ -41,6 +41,7 @@ from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.preamble import scope_start
 from sealscope.recordings.formats.headings.proposal import is_time
 from sealscope.recordings.formats.table import (
+    MAX_VALUES,
     Clock,
     RecordingFields,
     Series,
@@ -117,9 +118,9 @@ def read_text_parts(path: Path, request: Request, every: float, rows: float | No
             return
     log = _Log(path, layout, kinds=choice.columns, date=choice.date, wordy=choice.wordy)
 
-    def make_part(blocks: list[_Block], state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
+    def make_part(rows: _Rows, state: TimeState, more_notes: Sequence[str] = ()) -> RecordingFields:
         """Convert a part of the log to fields; update `state`, that of the time column after the previous part."""
-        columns, notes = log.join_blocks(blocks)
+        columns, notes = log.take_columns(rows)
         notes = [*layout.notes, *notes, *more_notes]
         return convert_columns(
             choice, columns, layout.kind, request, notes, remarks=layout.remarks, description=description, state=state
@@ -130,14 +131,14 @@ def read_text_parts(path: Path, request: Request, every: float, rows: float | No
     first = next(blocks, None)
     is_reversed = first is not None and choice.time is not None and is_falling(first.columns[choice.time])
     if first is not None and min(every, inf if rows is None else rows) < inf and not is_reversed:
-        # convert a copy of the first block to know its rate (`join_blocks` empties it); then forget its last time
-        rows_per_part = max(1, round(every * make_part([first[:]], state).rate)) if rows is None else rows
+        # convert the first block to know its rate; then forget its last time
+        rows_per_part = max(1, round(every * make_part(_Rows.from_block(first), state).rate)) if rows is None else rows
         state = TimeState(state.head, state.rate, state.resolution)
-    pending: list[_Block] = []
-    for part_blocks in _split_blocks([] if first is None else chain([first], blocks), rows_per_part):
-        if pending:
+    pending = _Rows()
+    for part in log.collect_rows([] if first is None else chain([first], blocks), rows_per_part):
+        if len(pending):
             yield make_part(pending, state)
-        pending = part_blocks
+        pending = part
     # the last part notes the lines that were left out of the whole log
     yield make_part(pending, state, log.describe_text_lines())
 
@@ -161,7 +162,7 @@ def _read_several_clocks(path: Path, layout: Layout, time_columns: Sequence[int]
         kinds_by_column = {columns[index]: kind for index, kind in kinds.items()}
         time_kinds = {time_of_column[column]: "time" for column in kinds_by_column if time_columns}
         log = _Log(path, layout, kinds_by_column | time_kinds, None if time_columns else date)
-        cells, notes = log.join_blocks([*log.iter_blocks()])
+        cells, notes = log.take_columns(next(log.collect_rows(log.iter_blocks(), inf), _Rows()))
         cells_by_column.update(cells)
         notes_on_times = [f"{len(time_kinds)} columns of times, one for each channel"] if time_columns else []
         return [*layout.notes, *notes, *log.describe_text_lines(), *notes_on_times]
@@ -189,26 +190,6 @@ def _find_channel_times(labels: Sequence[Label]) -> list[int]:
     have_one_name = len({names[column] for column in times}) == 1
     have_channels = all(next_time - time > 1 for time, next_time in pairwise([*times, len(labels)]))
     return times if len(times) > 1 and have_one_name and have_channels else []
-
-
-def _split_blocks(blocks: Iterable[_Block], size: float) -> Iterator[list[_Block]]:
-    """Regroup a log's blocks, divided where necessary, into lists with `size` rows in all; the last may have fewer.
-
-    If `size` is inf, all blocks are in a single list.
-    """
-    group: list[_Block] = []
-    missing_rows = size
-    for block in blocks:
-        remaining_block = block
-        while len(remaining_block) >= missing_rows:
-            yield [*group, remaining_block[: int(missing_rows)]]
-            remaining_block = remaining_block[int(missing_rows) :]
-            group, missing_rows = [], size
-        if len(remaining_block):
-            group.append(remaining_block)
-            missing_rows -= len(remaining_block)
-    if group:
-        yield group
 
 
 def read_layout(path: Path) -> Layout:
@@ -249,6 +230,46 @@ class _Block:
         return _Block({column: cells[rows] for column, cells in self.columns.items()}, word_rows, first_words)
 
 
+@dataclass
+class _Rows:
+    """Rows of a text log, collected from its blocks in arrays with room for more, so that no value is held twice."""
+
+    columns: dict[int, NDArray[Any]] = field(default_factory=dict)  # column -> values (m,), the first `count` in use
+    word_rows: dict[int, list[int]] = field(default_factory=dict)  # column -> rows with a word for a number
+    first_words: dict[int, str] = field(default_factory=dict)  # column -> the first of them with its place, or ""
+    count: int = 0
+
+    @classmethod
+    def from_block(cls, block: _Block) -> _Rows:
+        """Collect the rows of a single block."""
+        rows = cls()
+        rows.append(block, len(block))
+        return rows
+
+    def __len__(self) -> int:
+        return self.count
+
+    def append(self, block: _Block, room: int) -> None:
+        """Add the rows of a block; arrays that are full are copied into arrays with room for `room` rows."""
+        stop = self.count + len(block)
+        for column, cells in block.columns.items():
+            values = self.columns.get(column)
+            if values is None or values.size < stop or values.dtype != cells.dtype:
+                longer = np.empty(max(room, stop), cells.dtype)
+                if values is not None and values.dtype == cells.dtype:
+                    longer[: self.count] = values[: self.count]
+                elif values is not None:  # rows before the first stamp were read as numbers
+                    longer[: self.count] = np.datetime64("NaT")
+                self.columns[column] = values = longer
+            values[self.count : stop] = cells
+        for column, indices in block.word_rows.items():
+            if indices.size:
+                if column not in self.word_rows:
+                    self.first_words[column] = block.first_words.get(column, "")
+                self.word_rows.setdefault(column, []).extend((indices + self.count).tolist())
+        self.count = stop
+
+
 class _Log:
     """Reader of the rows of a text log, block by block; a word is a text in place of a number or a time stamp."""
 
@@ -264,11 +285,12 @@ class _Log:
         self.path, self.layout, self.kinds, self.date, self.wordy = path, layout, kinds, date, wordy
         self.min_cells = max(kinds) + 1  # fewest cells that a row must have
         self.n_rows = self.n_repeated = self.n_text_lines = 0  # rows, repeated heading lines, lines of text until now
+        self.n_bytes, self.file_size = 0, path.stat().st_size  # bytes of these rows; of the file
         self.first_text_line = ""  # the first line of text with its place, for messages
         is_delimited = layout.encoding in ("utf-8", "utf-8-sig", "cp1252") and layout.delimiter != " "
         is_numeric = not layout.cell_units and not layout.prefixed and "texts" not in kinds.values()
         self.uses_arrow = (
-            is_delimited and is_numeric and path.stat().st_size >= _MIN_ARROW_SIZE and find_spec("pyarrow") is not None
+            is_delimited and is_numeric and self.file_size >= _MIN_ARROW_SIZE and find_spec("pyarrow") is not None
         )
         self.null_values = ["", "NaN"]  # texts that pyarrow reads as missing
         self.has_stamps: bool | None = None  # True if the time column contains date stamps; None before its first cell
@@ -289,8 +311,29 @@ class _Log:
                 rows, line_numbers = self._split_rows(first_line, content[:end], is_cut)
                 self._count_rows(len(rows))
                 block = self._parse_rows(rows, line_numbers, is_cut) if rows else None
+            self.n_bytes += end
             if block is not None:
                 yield block
+
+    def collect_rows(self, blocks: Iterable[_Block], size: float) -> Iterator[_Rows]:
+        """Collect the rows of blocks, divided where necessary, in parts of `size` rows; the last may have fewer.
+
+        If `size` is inf, all rows are in a single part.
+        """
+        part = _Rows()
+        for block in blocks:
+            # rows of the whole log, if those that follow are as long
+            n_expected = min(round(1.02 * self.n_rows * self.file_size / self.n_bytes), MAX_VALUES // len(self.kinds))
+            room, remaining_block = int(min(size, n_expected)), block
+            while len(part) + len(remaining_block) >= size:
+                n_missing = int(size) - len(part)
+                part.append(remaining_block[:n_missing], room)
+                yield part
+                part, remaining_block = _Rows(), remaining_block[n_missing:]
+            if len(remaining_block):
+                part.append(remaining_block, room)
+        if len(part):
+            yield part
 
     def _iter_line_blocks(self) -> Iterator[tuple[int, bytes, int, bool]]:
         """Yield the log in blocks of lines: (number of the first line, from 1; bytes; end; is_cut).
@@ -568,41 +611,31 @@ class _Log:
             return order
         return is_day_first(dates)
 
-    def join_blocks(self, blocks: list[_Block]) -> tuple[dict[int, NDArray[Any]], list[str]]:
-        """Join blocks of the log to whole columns, column -> values (n,); also return lines for the history.
+    def take_columns(self, rows: _Rows) -> tuple[dict[int, NDArray[Any]], list[str]]:
+        """Take the columns of `rows`, column -> values (n,), which empties it; also return lines for the history.
 
-        Rows with a word as the time are left out, and `blocks` are emptied. Raises InputError if the log has had too
-        many words until now.
+        Rows with a word as the time are left out. Raises InputError if the log has had too many words until now.
         """
         labels = self.layout.labels
         notes: list[str] = []
         columns: dict[int, NDArray[Any]] = {}
-        starts = [0, *accumulate(map(len, blocks))]
         last_column = [*self.kinds][-1]  # the time, if there is one
-        word_rows = {
-            column: [
-                start + index
-                for start, block in zip(starts, blocks, strict=False)
-                for index in block.word_rows.get(column, ())
-            ]
-            for column in self.kinds
-        }
-        for column, indices in word_rows.items():  # frees each column's blocks before the next is joined
-            blocks_with_words = (block for block in blocks if len(block.word_rows.get(column, ())))
-            first = next((block.first_words.get(column, "") for block in blocks_with_words), "")
-            if indices and column not in self.wordy and self.n_words[column] > MAX_WORD_FRACTION * self.n_rows:
-                is_stamp_column, first_word = self.has_stamps and self.kinds[column] == "time", self.first_words[column]
+        for column, kind in self.kinds.items():
+            n_words = len(rows.word_rows.get(column, ()))
+            if n_words and column not in self.wordy and self.n_words[column] > MAX_WORD_FRACTION * self.n_rows:
+                is_stamp_column, first_word = self.has_stamps and kind == "time", self.first_words[column]
                 raise InputError(f"{_STAMP_RULE if is_stamp_column else 'a sample must be a number'}, got {first_word}")
-            if indices:
-                cells_text = f"{format_count(len(indices), 'cell')} without a number read as missing"
+            if n_words:
+                first = rows.first_words[column]
+                cells_text = f"{format_count(n_words, 'cell')} without a number read as missing"
                 notes.append(f"column {labels[column].whole}: {cells_text}" + (f", first {first}" if first else ""))
-            parts = [block.columns.pop(column) for block in blocks] or [np.empty(0)]
-            if self.has_stamps and self.kinds[column] == "time":  # blocks before the first stamp were read as numbers
-                parts = [np.full(part.shape, "NaT", "M8[ns]") if part.dtype.kind == "f" else part for part in parts]
-            cells = np.concatenate(parts)
+            cells = rows.columns.pop(column, np.empty(0))
+            if self.has_stamps and kind == "time" and cells.dtype.kind == "f":  # all rows are before the first stamp
+                cells = np.full(cells.size, "NaT", "M8[ns]")
+            cells.resize(len(rows), refcheck=False)  # gives the rest back, and copies nothing
             # rows with a word in place of the time belong to a summary
-            if word_rows[last_column] and self.kinds[last_column] == "time":
-                cells = np.delete(cells, word_rows[last_column])
+            if self.kinds[last_column] == "time" and (summary_rows := rows.word_rows.get(last_column)):
+                cells = np.delete(cells, summary_rows)
             cells.setflags(write=False)  # so that the recording does not copy it
             columns[column] = cells
         notes += [self.order_note] if self.order_note else []

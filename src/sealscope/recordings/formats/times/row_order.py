@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import Array
 from sealscope.recordings.priors import RECORDINGS
+from sealscope.recordings.stretches import summarize_intervals
 
 _PRIORS = RECORDINGS.clock
 _HOUR, _DAY = 3600.0, 86400.0  # [s]
@@ -122,10 +123,14 @@ def order_rows(
         The times do not step back, unless more than the fraction `clock.late` (`priors.toml`) of the rows step back and
         cannot be sorted; then only the wraps are undone.
     """
+    may_leap = any(wrap.step > 0.0 for wrap in wraps)
+    intervals = summarize_intervals(t)
+    if intervals.shortest >= 0.0 and intervals.longest < _PRIORS.leap and not may_leap:
+        return OrderedRows(t, None, (), ())
     timed = np.flatnonzero(np.isfinite(t))
     times = t[timed]
     steps = np.diff(times)
-    if not steps.size or (steps.min() >= 0.0 and steps.max() < _PRIORS.leap and not any(w.step > 0.0 for w in wraps)):
+    if not steps.size or (steps.min() >= 0.0 and steps.max() < _PRIORS.leap and not may_leap):
         return OrderedRows(t, None, (), ())
     rising = steps[steps > 0.0]
     if not rising.size:

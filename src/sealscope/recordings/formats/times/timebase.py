@@ -19,6 +19,7 @@ from sealscope.recordings.channels import Array
 from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.formats.times import row_order
 from sealscope.recordings.formats.times.row_order import ClockEvent, OrderedRows, Wrap, order_rows
+from sealscope.recordings.stretches import iter_stretches, summarize_intervals, take_finite
 from sealscope.units import to_si
 
 #: Date such as 05/06/2024 or 05-06-24, in which the day or the month comes first.
@@ -276,13 +277,17 @@ def nominal_rate(t: Array) -> float:
     rounding of the times. For times that do not increase throughout or are uneven (`_MAX_ROUNDING`), the median of the
     positive intervals is used instead. Raises InputError if no interval is positive.
     """
-    steps = np.diff(t)
+    intervals = summarize_intervals(t)
     span = float(t[-1] - t[0])
-    if steps.size and np.isfinite(span) and steps.min() > 0:
-        mean = span / steps.size
-        max_deviation = float(np.abs(t - t[0] - mean * np.arange(t.size)).max())
+    if intervals.number and np.isfinite(span) and intervals.shortest > 0:
+        mean = span / intervals.number
+        max_deviation = max(
+            float(np.abs(t[part] - t[0] - mean * np.arange(part.start, part.stop)).max())
+            for part in iter_stretches(t.size)
+        )
         if max_deviation < _MAX_ROUNDING * mean:  # by rounding, which may shift both ends of the span
             return _shortest_decimal(1.0 / mean, max(_MIN_SLACK, min(2 * max_deviation / span, _MAX_SLACK)))
+    steps = np.diff(t)
     steps = steps[np.isfinite(steps) & (steps > 0)]
     if not steps.size:
         raise InputError("time must increase between some samples")
@@ -355,7 +360,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
     `unit`: may state an origin, as in `days since 1899-12-30`; None if it is to be guessed from the numbers of the
     log's first part, which `state` keeps. Raises InputError if no number is finite.
     """
-    finite = values[np.isfinite(values)]
+    finite = take_finite(values)
     if not finite.size:
         raise InputError("time must have a number in some row, got none")
     first = float(finite[0])
@@ -371,7 +376,7 @@ def _convert_numbers(values: Array, unit: str | None, name: str, state: TimeStat
             start = f"{first:g} {unit}"
         return _Seconds(seconds, {"start": start}, [], (), np.nan)
     seconds = to_si(values, unit, "s", name="time")
-    epoch = float(seconds[np.isfinite(values)][0])
+    epoch = float(seconds[np.argmax(np.isfinite(values))])
     if epoch >= _MIN_EPOCH:
         # the difference is taken before the conversion, which would round such large times
         return _Seconds(to_si(values - first, unit, "s"), {"start_epoch_s": epoch}, [], (), np.nan)
@@ -473,16 +478,17 @@ def time_base(
             notes.extend([note] if note not in notes else [])
             return t
 
-        shares_stamps = seconds.t.size > 1 and 2 * np.count_nonzero(np.diff(seconds.t)) < seconds.t.size - 1
+        intervals = summarize_intervals(seconds.t)
+        shares_stamps = 2 * intervals.n_changes < intervals.number
         has_stated_rate = stated_rate is not None and shares_stamps
         ordered = order_rows(
             seconds.t, channels, seconds.wraps, seconds.reading, None if has_stated_rate or continues else space
         )
         ordered = _continue_times(ordered, state.last_seconds) if continues else ordered
         t = ordered.t
-        known = np.flatnonzero(np.isfinite(t))
-        if known.size:
-            last = int(known[-1])
+        is_known = np.isfinite(t)
+        if is_known.any():
+            last = t.size - 1 - int(np.argmax(is_known[::-1]))
             state.last_time = values[last if ordered.rows is None else ordered.rows[last]]
             state.last_seconds = float(t[last])
         t = t if ordered.breaks or has_stated_rate else space(t)
@@ -525,13 +531,13 @@ def _space_shared_times(t: Array, state: TimeState) -> tuple[float, Array] | Non
     samples per clock step on average, or if a step's number of samples differs from this average by more than one. A
     part of a log too short to show this gets the clock step and the rate of the earlier parts from `state`.
     """
+    intervals = summarize_intervals(t)
+    can_show = t.size >= _MIN_SHARED and intervals.n_changes >= 3
+    if not np.isfinite(t).all() or intervals.shortest < 0 or (can_show and 2 * intervals.n_changes > intervals.number):
+        return None
     steps = np.diff(t)
     changes = np.flatnonzero(steps)  # indices of the last samples before the time changes
-    if not np.isfinite(t).all() or (steps < 0).any():
-        return None
-    if t.size >= _MIN_SHARED and changes.size >= 3:
-        if 2 * changes.size > steps.size:
-            return None
+    if can_show:
         resolution = float(steps[changes].min())
         n_steps = np.round(steps[changes][1:] / resolution)  # of the coarse clock, between changes of the time
         n_samples = np.diff(changes)
