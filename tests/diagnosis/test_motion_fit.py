@@ -43,15 +43,17 @@ def test_errors_are_those_of_fits_without_one_group_each(n_groups: int) -> None:
     whole = np.linalg.lstsq(design, values, rcond=None)[0]
     others = [np.linalg.lstsq(design[merged != k], values[merged != k], rcond=None)[0] for k in range(merged[-1] + 1)]
     expected = np.sqrt((1.0 - 1.0 / len(others)) * ((np.array(others) - whole) ** 2).sum(axis=0))
-    assert jackknife_errors(design, values, [2, 0], groups) == pytest.approx(expected[[2, 0]])
+    found = jackknife_errors(stack_equations(design, values), np.ones(600), [2, 0], groups)
+    assert found == pytest.approx(expected[[2, 0]])
 
 
 def test_a_coefficient_that_one_group_alone_determines_has_no_error() -> None:
     design, values = np.random.default_rng(2).normal(size=(2, 200, 3))
     parts = equal_parts(200)
     design[parts > 0, 2] = 0.0
-    assert np.isfinite(jackknife_errors(design, values[:, 0], [0, 1, 2], parts)).tolist() == [True, True, False]
-    assert np.isinf(jackknife_errors(design, values[:, 0], [0], np.zeros(200, dtype=int))).all()
+    equations, weight = stack_equations(design, values[:, 0]), np.ones(200)
+    assert np.isfinite(jackknife_errors(equations, weight, [0, 1, 2], parts)).tolist() == [True, True, False]
+    assert np.isinf(jackknife_errors(equations, weight, [0], np.zeros(200, dtype=int))).all()
 
 
 def record(position: np.ndarray, drift_A: float = 0.0, way: np.ndarray | None = None) -> Recording:

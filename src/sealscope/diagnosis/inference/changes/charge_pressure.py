@@ -29,6 +29,8 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     GROUPS,
     equal_parts,
     jackknife_errors,
+    part_quantiles,
+    part_sizes,
     solve_weighted,
     stack_equations,
 )
@@ -38,7 +40,7 @@ from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import TINY, average_over
 from sealscope.units import P_ATM
 
@@ -66,8 +68,7 @@ def turned_angle(recording: Recording, flow_channel: str) -> Array:
     return np.asarray(np.diff(drive) if flow_channel == "theta" else drive[1:] / recording.rate)
 
 
-@np.errstate(all="ignore")
-def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
+def estimate_low_drifts(recording: Recording) -> Mapping[str, Estimate]:
     """Estimate the drifts [Pa/s] of the lowest pressures of the chambers, by their names "A" and "B".
 
     In a closed circuit a chamber that carries no load is at the charge pressure. Samples count if they are within
@@ -76,8 +77,14 @@ def estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     no sample counts, as shut valves may enclose any pressure. A chamber is left out if its lowest pressure exceeds that
     of the other chamber by `charge.near` or more, if at most the fraction `charge.share` of the samples of a turning
     pump counts, or if these do not determine the drift (`_fit_drift`). The result is empty for a recording shorter than
-    `MIN_SAMPLES`, and if a pressure, or both angle and speed of the pump, are not recorded.
+    `MIN_SAMPLES`, and if a pressure, or both angle and speed of the pump, are not recorded. It is cached.
     """
+    return compute_once(recording, ("low drifts",), _estimate_low_drifts)
+
+
+@np.errstate(all="ignore")
+def _estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
+    """Estimate the drifts of the lowest pressures of the chambers (`estimate_low_drifts`)."""
     flow_channel = flow_source(recording.channels)
     if len(recording) < MIN_SAMPLES or flow_channel not in PUMP or not {"p_A", "p_B"} <= set(recording.channels):
         return {}
@@ -188,9 +195,8 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
     varying = regressors[rows][:, np.ptp(regressors[rows], axis=0) > 0.0]  # a constant one cannot be told from level
     design = np.column_stack([time, np.ones(len(rows)), varying])
     equations = stack_equations(design, values)
-    weight = np.zeros(len(rows))  # at first 1 for the lowest samples of each part of the recording, else 0
-    for part in np.array_split(np.arange(len(rows)), GROUPS):
-        weight[part] = values[part] <= np.quantile(values[part], BEGIN)
+    # at first 1 for the lowest samples of each part of the recording, else 0
+    weight = (values <= np.repeat(part_quantiles(values, BEGIN), part_sizes(len(rows)))).astype(float)
     for _ in range(ITERATIONS):
         coefficients = solve_weighted(equations, weight)
         residual = values - design @ coefficients
@@ -200,7 +206,7 @@ def _fit_drift(t: Array, pressure: Array, regressors: Array, rows: NDArray[np.in
         weight = np.where(residual > 0.0, ABOVE, 1.0) / np.hypot(1.0, residual / scale)
     slope = 0  # index of the column of the time, whose coefficient is the drift
     parts = equal_parts(len(rows))
-    (jackknife_error,) = jackknife_errors(design * weight[:, None], values * weight, [slope], parts)
+    (jackknife_error,) = jackknife_errors(equations, weight, [slope], parts)
     drift = Estimate(float(coefficients[slope]), float(np.hypot(jackknife_error, _envelope_error(time, residual))))
     is_determined = abs(drift.value) * np.ptp(time) < CHANGES.charge.range * CHANGES.charge.near
     return drift if is_determined and np.isfinite(drift).all() else None
@@ -215,10 +221,9 @@ def _envelope_error(time: Array, residual: Array) -> float:
 
         error^2 = (sum (r_k - mean of r)^2 / (n - 2)) / sum (t_k - mean of t)^2.
     """
-    parts = np.array_split(np.arange(len(residual)), GROUPS)
-    levels = np.array([np.quantile(residual[part], BEGIN) for part in parts])
-    times = np.array([time[part].mean() for part in parts])
-    return float(levels.std() / np.sqrt(len(parts) - 2) / max(float(times.std()), TINY))
+    levels, sizes = part_quantiles(residual, BEGIN), part_sizes(len(residual))
+    times = np.add.reduceat(time, np.cumsum(sizes) - sizes) / sizes
+    return float(levels.std() / np.sqrt(GROUPS - 2) / max(float(times.std()), TINY))
 
 
 def compare_low_drifts(

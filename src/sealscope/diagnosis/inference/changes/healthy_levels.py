@@ -35,7 +35,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     fit_robustly,
     select_motion,
 )
-from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_octaves
+from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
 from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable
@@ -215,11 +215,8 @@ def _estimate_levels(recording: Recording) -> Summary | None:
         difference = estimate_connected_difference(recording, turned_angle(recording, flow_channel))
         if difference is not None and np.isfinite(difference).all():
             levels |= dict(zip(ZERO_KEYS, difference, strict=True))
-    spectra = {
-        name: np.stack(octaves)
-        for name, pair in PAIRS.items()
-        if (octaves := compute_octaves(recording, pair)) is not None
-    }
+    all_octaves = zip(PAIRS, compute_all_octaves(recording, list(PAIRS.values())), strict=True)
+    spectra = {name: np.stack(octaves) for name, octaves in all_octaves if octaves is not None}
     return {**levels, **spectra} or None
 
 

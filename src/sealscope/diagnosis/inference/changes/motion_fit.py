@@ -15,15 +15,15 @@ Ann. Statist. 9 (1981) 586 (the jackknife).
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import qr
 from scipy.linalg.lapack import dpotrf, dpotrs
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.levels import find_motion_channel
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
@@ -122,28 +122,78 @@ def _hat_functions(position: Array, n_knots: int) -> Array:
     return np.asarray(hats[:, hats.any(axis=0)])
 
 
-def stack_equations(design: Array, values: Array) -> Array:
-    """Stack the columns of a design matrix (n, m) and the values (n,) as rows (m + 1, n), for `solve_weighted`."""
-    return np.ascontiguousarray(np.vstack([design.T, values]))
+class Equations(NamedTuple):
+    """Rows of a linear regression, without the elements that are 0, as most of a hat function are.
+
+    `values`, `columns` (n, k): elements of each of n rows, and their columns in increasing order, with elements 0 in
+    place of missing ones; `n_columns`: number of columns, of which the last one is the left side.
+    """
+
+    values: Array
+    columns: NDArray[np.intp]
+    n_columns: int
 
 
-def solve_weighted(equations: Array, weight: Array) -> Array:
+def stack_equations(design: Array, values: Array) -> Equations:
+    """Make the rows of a regression of `values` (n,) on the columns of `design` (n, m), for `solve_weighted`."""
+    rows = np.column_stack([design, values])
+    is_stored = rows != 0.0
+    n_stored = int(is_stored.sum(axis=1).max(initial=1))
+    # a stable sort keeps the order of the columns within the stored elements of a row, which come first
+    columns = np.sort(np.argsort(~is_stored, axis=1, kind="stable")[:, :n_stored], axis=1)
+    return Equations(np.take_along_axis(rows, columns, axis=1), columns, rows.shape[1])
+
+
+@kernel
+def _sum_products(rows: Any, weight: Any, edges: Any, products: Any) -> None:
+    """Write the products of the columns of weighted `rows` (`sum_products`) to `products` (p, m, m)."""
+    values, columns, size = rows.values, rows.columns, rows.n_columns
+    n_stored = values.shape[1]
+    for part in range(len(edges) - 1):
+        sums = products[part]
+        for i in range(size):
+            for j in range(size):
+                sums[i, j] = 0.0
+        for row in range(edges[part], edges[part + 1]):
+            square = weight[row] * weight[row]
+            for k in range(n_stored):
+                i, value = columns[row, k], square * values[row, k]
+                for m in range(k + 1):
+                    sums[i, columns[row, m]] += value * values[row, m]
+        for i in range(size):
+            for j in range(i):
+                sums[j, i] = sums[i, j]
+
+
+def sum_products(equations: Equations, weight: Array, edges: NDArray[np.intp]) -> Array:
+    """Sum the products of the m columns of weighted equations with each other over p parts of the rows, (p, m, m).
+
+    `weight` (n,): factors of the rows; `edges` (p + 1,): index of the first row of each part, and past the last row.
+    """
+    size = equations.n_columns
+    products = np.empty((len(edges) - 1, size, size))
+    _sum_products(equations, weight, edges, products)
+    return products
+
+
+def solve_weighted(equations: Equations, weight: Array) -> Array:
     """Solve a weighted least-squares problem; return the coefficients c (m,).
 
-    They minimise sum((weight (values - design c))^2); if several do, c is the shortest of them. `equations` (m + 1, n):
-    columns of the design and values (`stack_equations`), with n > m; `weight` (n,): factors of the rows. The normal
-    equations, with columns of unit length, give c unless the design is nearly singular (`MIN_PIVOT`); then a QR
-    decomposition does.
+    They minimise sum((weight (values - design c))^2); if several do, c is the shortest of them. `equations`: n rows of
+    the design and the values (`stack_equations`), with n > m; `weight` (n,): factors of the rows. The normal equations,
+    with columns of unit length, give c unless the design is nearly singular (`MIN_PIVOT`); then a QR decomposition
+    does.
     """
-    weighted = equations * weight
-    products = weighted @ weighted.T
+    products = sum_products(equations, weight, np.array([0, len(weight)]))[0]
     length = np.sqrt(np.diag(products)[:-1])
     if (length > 0.0).all():
         normal = products[:-1, :-1] / np.outer(length, length)
         factor, info = dpotrf(normal, lower=True)
         if info == 0 and np.diag(factor).min() > MIN_PIVOT:
             return np.asarray(dpotrs(factor, products[:-1, -1] / length, lower=True)[0] / length)
-    _, triangle = qr(weighted.T, mode="raw", overwrite_a=True, check_finite=False)
+    rows = np.zeros((len(weight), equations.n_columns))
+    np.put_along_axis(rows, equations.columns, equations.values * weight[:, None], axis=1)
+    _, triangle = qr(rows, mode="raw", overwrite_a=True, check_finite=False)
     # R of the design and, in the last column, the values multiplied by Q^T
     solution = np.linalg.lstsq(triangle[:-1, :-1], triangle[:-1, -1], rcond=np.finfo(float).eps * len(weight))
     return np.asarray(solution[0])
@@ -168,7 +218,7 @@ def fit_robustly(design: Array, values: Array, columns: Sequence[int], groups: N
             residual = np.abs(values - design @ coefficients)
         fits.append((float(np.median(residual)), coefficients, _robust_weight(residual)))
     _, coefficients, weight = min(fits, key=lambda fit: fit[0])
-    errors = jackknife_errors(design * weight[:, None], values * weight, columns, groups)
+    errors = jackknife_errors(equations, weight, columns, groups)
     # With u = residual / scale and w = 1/(1 + u^2), the robust coefficients make the sum of psi(u) times the row of the
     # design zero, where psi = u w^2. Its slope is 4 w^3 - 3 w^2, with the fixed weights of the jackknife w^2. The
     # errors are larger by the ratio of the means of both, at most by 10.
@@ -183,12 +233,25 @@ def _robust_weight(residual: Array) -> Array:
     return np.asarray(1.0 / (1.0 + (residual / scale) ** 2))
 
 
+def part_sizes(n_rows: int) -> NDArray[np.intp]:
+    """Return the sizes of `GROUPS` consecutive parts of `n_rows` rows, equal or, of the first parts, larger by 1."""
+    return n_rows // GROUPS + (np.arange(GROUPS) < n_rows % GROUPS)
+
+
+def part_quantiles(values: Array, quantile: float) -> Array:
+    """Compute the `quantile` of each of `GROUPS` consecutive parts (`part_sizes`) of n >= `GROUPS` values (n,)."""
+    size, n_larger = divmod(len(values), GROUPS)
+    first_smaller = n_larger * (size + 1)
+    larger, smaller = values[:first_smaller].reshape(n_larger, size + 1), values[first_smaller:].reshape(-1, size)
+    return np.concatenate([np.quantile(part, quantile, axis=1) for part in (larger, smaller) if part.size])
+
+
 def equal_parts(n_rows: int) -> NDArray[np.intp]:
     """Assign `n_rows` rows to `GROUPS` parts of equal size, in the order of time; return the part of each row, (n,)."""
     return np.arange(n_rows) * GROUPS // n_rows
 
 
-def jackknife_errors(design: Array, values: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> Array:
+def jackknife_errors(equations: Equations, weight: Array, columns: Sequence[int], groups: NDArray[np.intp]) -> Array:
     """Compute standard errors of some coefficients of a weighted least-squares fit by leaving out groups of rows.
 
     With P groups, the coefficient c from all rows, and c_k from all rows but those of group k,
@@ -196,28 +259,28 @@ def jackknife_errors(design: Array, values: Array, columns: Sequence[int], group
         error^2 = (P - 1) / P sum over groups of (c_k - c)^2.
 
     Residuals may be correlated within a group. An error is infinite if the coefficient is not determined by all rows,
-    or by all but those of one group. `design` (n, m), `values` (n,): the rows in the order of time, multiplied by the
-    weights of the fit; `columns`: indices of the coefficients; `groups` (n,): number of each row's group, from 0, in
-    increasing order. More than `GROUPS` groups are merged with their neighbours.
+    or by all but those of one group. `equations`, `weight` (n,): the rows in the order of time, and their
+    weights in the fit (`solve_weighted`); `columns`: indices of the coefficients; `groups` (n,): number of each row's
+    group, from 0, in increasing order. More than `GROUPS` groups are merged with their neighbours.
     """
     n_groups = min(int(groups[-1]) + 1, GROUPS)
     if n_groups < 2:
         return np.full(len(columns), np.inf)
     # first row of each of `n_groups` merged groups
     edges = np.searchsorted(groups * n_groups // (groups[-1] + 1), np.arange(n_groups + 1))
-    parts = [slice(*ends) for ends in itertools.pairwise(edges)]
-    scale = np.maximum(np.sqrt((design**2).sum(axis=0)), TINY)
-    normalised = design / scale
-    matrices = np.array([normalised[part].T @ normalised[part] for part in parts])
-    moments = np.array([normalised[part].T @ values[part] for part in parts])
-    # normal equations without each of the groups in turn, and last those of all rows
-    matrices, moments = (
-        np.concatenate([[sums.sum(axis=0)] - sums, [sums.sum(axis=0)]]) for sums in (matrices, moments)
-    )
+    products = sum_products(equations, weight, edges)
+    scale = np.maximum(np.sqrt(np.einsum("kii->i", products)), TINY)  # of each column over all rows
+    scale[-1] = 1.0  # the values
+    products /= np.outer(scale, scale)
+    # products without each of the groups in turn, and last those of all rows
+    total = products.sum(axis=0)
+    without_group = np.concatenate([total - products, total[None]])
+    matrices, moments = without_group[:, :-1, :-1], without_group[:, :-1, -1]
     eigenvalues, vectors = np.linalg.eigh(matrices)
     is_free = eigenvalues < FREE * eigenvalues[:, -1:]  # combinations of coefficients that the rows do not determine
     inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
-    coefficients = np.einsum("kij,kj,klj,kl->ki", vectors, inverse, vectors, moments, optimize=True) / scale
+    rotated = inverse * (vectors.swapaxes(1, 2) @ moments[:, :, None])[:, :, 0]
+    coefficients = (vectors @ rotated[:, :, None])[:, :, 0] / scale[:-1]
     # a coefficient is undetermined if it takes part, beyond rounding, in a free combination
     is_undetermined = np.einsum("kij,kj->ki", vectors**2, is_free.astype(float)).max(axis=0) > np.sqrt(FREE)
     errors = np.sqrt((n_groups - 1.0) / n_groups * ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0))

@@ -26,7 +26,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,25 +76,35 @@ class Octaves(NamedTuple):
 
 
 def compute_octaves(recording: Recording, pair: tuple[str, str] = CHAMBERS) -> Octaves | None:
-    """Compute the log amplitudes of both channels of a `pair` in octaves of frequency, and the phase between them.
+    """Compute the octaves of a `pair` of channels (`compute_all_octaves`), None if the recording does not allow it."""
+    return compute_all_octaves(recording, [pair])[0]
+
+
+def compute_all_octaves(recording: Recording, pairs: Sequence[tuple[str, str]]) -> list[Octaves | None]:
+    """Compute, for several pairs, the log amplitudes of both channels in octaves of frequency, and their phase.
 
     The power in an octave is a high quantile (`octaves.busy` of `priors.toml`) over windows of time, since a machine
-    may often rest; the phase is that of the sum over all windows. Return None if a channel is not recorded, if the
-    recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all windows have missing
-    samples.
+    may often rest; the phase is that of the sum over all windows. The result is None for a pair if a channel is not
+    recorded, if the recording is too short or its sampling rate too low for `MIN_OCTAVES` octaves, or if all windows
+    have missing samples.
     """
     priors = CHANGES.octaves
-    if not set(pair) <= set(recording.channels):
-        return None
     length = round(priors.seconds * recording.rate)  # samples in a window
     highest = min(priors.highest, priors.share * recording.rate)
     n_octaves = int(np.log2(max(highest / priors.lowest, 1.0)))
-    if n_octaves < MIN_OCTAVES or len(recording) < length:
-        return None
-    powers = _octave_powers(recording, pair, length, _octave_edges(n_octaves))
-    if powers is None:
-        return None
-    powers_A, powers_B, cross_powers = powers
+    recorded = [pair for pair in pairs if set(pair) <= set(recording.channels)]
+    if not recorded or n_octaves < MIN_OCTAVES or len(recording) < length:
+        return [None] * len(pairs)
+    powers = _octave_powers(recording, recorded, length, _octave_edges(n_octaves))
+    by_pair = {pair: _reduce_powers(pair, *sums) for pair, sums in powers.items()}
+    return [by_pair.get(pair) for pair in pairs]
+
+
+def _reduce_powers(
+    pair: tuple[str, str], powers_A: Array, powers_B: Array, cross_powers: NDArray[np.complex128]
+) -> Octaves | None:
+    """Compute the octaves of a pair of channels from its powers in windows (`_octave_powers`); None if not finite."""
+    priors = CHANGES.octaves
     min_A, min_B = (MIN_POWER[channel] for channel in pair)
     log_A = 0.5 * np.log(np.quantile(powers_A, priors.busy, axis=0) + min_A)
     log_B = 0.5 * np.log(np.quantile(powers_B, priors.busy, axis=0) + min_B)
@@ -114,34 +124,50 @@ def _octave_edges(count: int) -> Array:
     return edges
 
 
-def _octave_powers(
-    recording: Recording, pair: tuple[str, str], length: int, edges: Array
-) -> tuple[Array, Array, NDArray[np.complex128]] | None:
-    """Compute powers and cross-power of a pair of channels A and B in half-overlapping Hann windows, in octaves.
+#: Powers of A and of B, and their cross-power, in w windows and k octaves, (w, k) each.
+_Powers = tuple[Array, Array, NDArray[np.complex128]]
 
-    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. The results are sums of abs(A)^2,
-    abs(B)^2 and A B* over the lines of each octave, (windows, k) each. Windows with missing samples are left out; None
-    if no window is left.
+
+def _octave_powers(
+    recording: Recording, pairs: Sequence[tuple[str, str]], length: int, edges: Array
+) -> dict[tuple[str, str], _Powers]:
+    """Compute powers and cross-power of pairs of channels A and B in half-overlapping Hann windows, in octaves.
+
+    `length`: samples of a window; `edges` (k + 1,): limits of the octaves [Hz]. The results for each pair are sums of
+    abs(A)^2, abs(B)^2 and A B* over the lines of each octave. Windows with missing samples are left out, and a pair
+    without any other window, too.
     """
     from scipy.ndimage import median_filter
 
+    names = sorted({name for pair in pairs for name in pair})
     # the median of three removes single wrong samples
-    values = np.stack([median_filter(recording[name], 3, mode="nearest") for name in pair])
+    windows = {
+        name: np.lib.stride_tricks.sliding_window_view(median_filter(recording[name], 3, mode="nearest"), length)
+        for name in names
+    }
     first_lines = np.searchsorted(np.fft.rfftfreq(length, 1.0 / recording.rate), edges)
-    hann, powers = np.hanning(length), []
-    windows = np.lib.stride_tricks.sliding_window_view(values, length, axis=1)[:, :: max(length // 2, 1)]
-    n_together = max(1, MAX_TOGETHER // length)
-    for start in range(0, windows.shape[1], n_together):
-        parts = windows[:, start : start + n_together]
-        parts = parts[:, np.isfinite(parts).all(axis=(0, 2))]
-        spectra_A, spectra_B = np.fft.rfft((parts - parts.mean(axis=2, keepdims=True)) * hann)
-        products = np.stack([np.abs(spectra_A) ** 2, np.abs(spectra_B) ** 2, spectra_A * spectra_B.conj()])
+    hann, n_together, step = np.hanning(length), max(1, MAX_TOGETHER // length), max(length // 2, 1)
+    n_windows = -(-len(next(iter(windows.values()))) // step)  # rounded up
+
+    def sum_lines(products: NDArray[Any]) -> NDArray[Any]:
+        """Sum products (windows, lines) over the lines of each octave."""
         # lines are 1 / `octaves.seconds` apart, the width of the lowest octave: every octave has a line
-        powers.append(np.add.reduceat(products[..., : first_lines[-1]], first_lines[:-1], axis=2))
-    powers_A, powers_B, cross_powers = np.concatenate(powers, axis=1)
-    if not len(powers_A):
-        return None
-    return powers_A.real, powers_B.real, cross_powers
+        return np.asarray(np.add.reduceat(products[:, : first_lines[-1]], first_lines[:-1], axis=1))
+
+    sums: dict[tuple[str, str], list[_Powers]] = {pair: [] for pair in pairs}
+    for start in range(0, n_windows, n_together):
+        spectra, powers, is_known = {}, {}, {}
+        for name in names:
+            parts = windows[name][start * step : (start + n_together) * step : step]
+            is_known[name] = np.isfinite(parts).all(axis=1)
+            spectra[name] = np.fft.rfft((parts - parts.mean(axis=1, keepdims=True)) * hann)
+            powers[name] = sum_lines(np.abs(spectra[name]) ** 2)
+        for A, B in pairs:
+            known = is_known[A] & is_known[B]
+            cross_powers = sum_lines(spectra[A] * spectra[B].conj())
+            sums[A, B].append((powers[A][known], powers[B][known], cross_powers[known]))
+    joined = {pair: tuple(np.concatenate(parts) for parts in zip(*sums[pair], strict=True)) for pair in pairs}
+    return {pair: (A, B, cross) for pair, (A, B, cross) in joined.items() if len(A)}
 
 
 def compare_spectra(judged: Mapping[str, Octaves], healthy: Sequence[Mapping[str, Octaves]]) -> Observable | None:

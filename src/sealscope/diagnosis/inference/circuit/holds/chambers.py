@@ -29,16 +29,15 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, estimate_hold_offsets
+from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, estimate_hold_offsets, small_difference_factor
 from sealscope.diagnosis.inference.circuit.holds.leaks import (
     BOTH,
     NEITHER,
@@ -130,15 +129,11 @@ class HeldChambers:
         """Samples of all holds, one after the other, for compiled functions."""
         return HoldSamples.from_holds(self.holds)
 
-    def _join(self, values: Iterable[NDArray[Any]]) -> NDArray[Any]:
-        """Join values of each hold, (..., n) for n samples, to those of the N samples of all holds, (..., N)."""
-        return np.concatenate(list(values), axis=-1)
-
     @cached_property
     def _regressions(self) -> dict[SideSupplies, OilRegression]:
         """Regressions that estimate the oil's properties, one for each possible choice of the sides' supplies."""
         return {
-            supplies: build_regression(self.holds, self._closed_flags(supplies), self.sides, self.n_readings)
+            supplies: build_regression(self._samples, self._closed_flags(supplies), self.sides, self.n_readings)
             for supplies in (NEITHER, self._refillable_sides, BOTH, self._unloaded_open)
         }
 
@@ -166,7 +161,7 @@ class HeldChambers:
     @cached_property
     def _unloaded_open(self) -> SideSupplies:
         """Supplies of A and B if the side with the lower mean pressure is open; a check valve refills the other."""
-        means = [np.mean(np.concatenate([getattr(hold, side) for hold in self.holds])) for side in ("p_A", "p_B")]
+        means = [pressure.mean() for pressure in (self._samples.p_A, self._samples.p_B)]
         return (SideSupply.CHECK, SideSupply.OPEN) if means[0] > means[1] else (SideSupply.OPEN, SideSupply.CHECK)
 
     def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
@@ -180,14 +175,19 @@ class HeldChambers:
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
-            is_A = supplies[0] is SideSupply.OPEN
-            above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank) for hold in self.holds]
-            excess = [max(float(flags.mean()) - prior.above, 0.0) for flags in above]  # in each hold
-            return math.log(prior.open) - sum(excess) / prior.above
+            return self._open_log_prior
         log_prior = math.log1p(-prior.open)
         if drains and supplies == BOTH:
             log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank) ** 2
         return log_prior
+
+    @cached_property
+    def _open_log_prior(self) -> float:
+        """Log prior of an open unloaded side (`_supply_log_prior`)."""
+        prior, is_A = INFERENCE.held_oil, self._unloaded_open[0] is SideSupply.OPEN
+        above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank) for hold in self.holds]
+        excess = [max(float(flags.mean()) - prior.above, 0.0) for flags in above]  # in each hold
+        return math.log(prior.open) - sum(excess) / prior.above
 
     def _is_closed(self, hold: LockedHold, p: Array, back_pressure: float = 0.0) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
@@ -200,9 +200,10 @@ class HeldChambers:
         return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved + back_pressure)
 
     @cached_property
-    def _above_charge(self) -> list[NDArray[np.bool_]]:
-        """Flags (2, n) of the samples of each hold in which A (row 0) or B (row 1) is above the charge pressure."""
-        return [np.array([self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)]) for hold in self.holds]
+    def _above_charge(self) -> NDArray[np.bool_]:
+        """Flags (2, N) of the samples of all holds in which A (row 0) or B (row 1) is above the charge pressure."""
+        flags = [[self._is_closed(hold, p) for p in (hold.p_A, hold.p_B)] for hold in self.holds]
+        return np.concatenate(flags, axis=1)
 
     @cached_property
     def _possible_supplies(self) -> list[SideSupplies]:
@@ -217,8 +218,8 @@ class HeldChambers:
             possible.append(self._unloaded_open)
         return [NEITHER, *possible]
 
-    def _closed_flags(self, supplies: SideSupplies) -> list[NDArray[np.bool_]]:
-        """Flag the samples in which A (row 0) or B (row 1) is closed, (2, n) for each hold of n samples.
+    def _closed_flags(self, supplies: SideSupplies) -> NDArray[np.bool_]:
+        """Flag the samples of all holds in which A (row 0) or B (row 1) is closed, (2, N).
 
         A side is always closed without a supply, never if it is open, and above the charge pressure if a check valve
         refills it.
@@ -226,37 +227,58 @@ class HeldChambers:
         is_shut, has_check = (
             np.array([[supply is kind] for supply in supplies]) for kind in (SideSupply.SHUT, SideSupply.CHECK)
         )
-        return [is_shut | (has_check & flags) for flags in self._above_charge]
+        return np.asarray(is_shut | (has_check & self._above_charge))
 
     @cached_property
     def _closed_samples(self) -> dict[SideSupplies, NDArray[np.bool_]]:
         """Flags (2, N) of the samples of all holds in which A or B is closed, by the supplies of A and B."""
-        return {supplies: self._join(self._closed_flags(supplies)) for supplies in self._regressions}
+        return {supplies: self._closed_flags(supplies) for supplies in self._regressions}
+
+    @cached_property
+    def _closed_shares(self) -> dict[SideSupplies, float]:
+        """Fraction of samples, over both sides and all holds, in which a side is closed, by the supplies of A and B."""
+        return {supplies: float(flags.mean()) for supplies, flags in self._closed_samples.items()}
 
     def _closed_share(self, supplies: SideSupplies) -> float:
-        """Compute the fraction of samples, over both sides and all holds, in which a side is closed.
+        """Return the fraction of samples in which a side is closed (`_closed_shares`), above 0.
 
         While a side is not closed, its readings are constant and fit any leak: the variance of all readings is too
         small by this factor.
         """
-        share = float(self._closed_samples[supplies].mean())
-        return max(share, 1.0 / self.n_readings)  # above 0, since its logarithm is used
+        return max(self._closed_shares[supplies], 1.0 / self.n_readings)  # above 0, since its logarithm is used
 
     def _hold_offsets(self, offsets: Array) -> tuple[Array, Array, NDArray[np.bool_]]:
         """Estimate the sensor offset in each of H holds for g offsets of the recording, (g, H) each.
 
         See `estimate_hold_offsets`.
         """
-        last_A, last_B = np.array([hold.last_pressures for hold in self.holds]).T
+        last_A, last_B = self._last_pressures
         return estimate_hold_offsets(last_A, last_B, offsets[:, None])
+
+    @cached_property
+    def _last_pressures(self) -> Array:
+        """Pressures of A (row 0) and B (row 1) at the end of each of H holds [Pa] (`LockedHold.last_pressures`)."""
+        return np.array([hold.last_pressures for hold in self.holds]).T
+
+    def driving_pressure(self, offset: float) -> Array:
+        """Compute p_A - p_B [Pa] at each of N samples minus its hold's offset, given the recording's `offset` [Pa].
+
+        Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
+        exceed that of the large difference before. In such holds d is multiplied by the `small_difference_factor` of
+        `held_oil.resolved`.
+        """
+        (offsets,), _, (is_equalised,) = self._hold_offsets(np.array([offset]))
+        difference = self._samples.difference - np.repeat(offsets, self._samples.sizes)
+        factor = small_difference_factor(difference, INFERENCE.held_oil.resolved)
+        return np.asarray(np.where(np.repeat(is_equalised, self._samples.sizes), difference * factor, difference))
 
     def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
         """Compute the flow past the piston in the holds for a `leak` with a coefficient of 1.
 
         With the exponent e and dp = p_A - p_B - z, it is sign(dp) |dp|^e times the `growth_factor`. The sensor offset z
-        in a hold may differ from the recording's (`LockedHold.driving_pressure`).
+        in a hold may differ from the recording's (`driving_pressure`).
         """
-        difference = self._join(hold.driving_pressure(leak.offset) for hold in self.holds)
+        difference = self.driving_pressure(leak.offset)
         flow = np.sign(difference) * np.abs(difference) ** leak.exponent
         flow *= growth_factor(self._samples.t, leak.growth, leak.onset, self.end)
         return self._while_closed(np.array([flow, -flow]), leak.supplies)
@@ -269,13 +291,14 @@ class HeldChambers:
         """Subtract the sensor offset from p_A - p_B = `difference` (n,) [Pa] at times `t` (n,) [s] of the recording.
 
         It is the `offset` [Pa] of the recording or, from the start of a hold to the end of its rest, that of the hold
-        (`LockedHold.offset_in_hold`). Pressures that a leak has equalised then differ by 0.
+        (`_hold_offsets`). Pressures that a leak has equalised then differ by 0.
         """
         prior, offsets = INFERENCE.held_oil, np.full(len(t), offset)
-        for hold in self.holds:
+        hold_offsets = self._hold_offsets(np.array([offset]))[0][0]
+        for hold, hold_offset in zip(self.holds, hold_offsets, strict=True):
             # `hold.t` leaves out the end of the rest, in which the valves open and over which the flow was averaged
             begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
-            offsets[(t >= begin) & (t <= end)] = hold.offset_in_hold(offset)[0]
+            offsets[(t >= begin) & (t <= end)] = hold_offset
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
@@ -284,7 +307,7 @@ class HeldChambers:
         It is the gauge pressure of the side, at least 0, and 0 while the side is not closed: its supply, in `supplies`,
         then replaces or takes the oil.
         """
-        pressure = self._join(hold.p_A if is_A else hold.p_B for hold in self.holds)
+        pressure = self._samples.p_A if is_A else self._samples.p_B
         return self._while_closed(flow_of_side(np.maximum(pressure - P_ATM, 0.0), is_A), supplies)
 
     def _unit_pump_leak(self, is_A: bool) -> UnitLeak:
@@ -294,8 +317,9 @@ class HeldChambers:
         """
         sign = 1.0 if is_A else -1.0
         # 0: the offset of the recording is not known here
-        differences = (hold.difference - hold.offset_in_hold(0.0)[0] for hold in self.holds)
-        return UnitLeak(flow_of_side(np.maximum(sign * self._join(differences), 0.0), is_A))
+        offsets = self._hold_offsets(np.zeros(1))[0][0]
+        difference = self._samples.difference - np.repeat(offsets, self._samples.sizes)
+        return UnitLeak(flow_of_side(np.maximum(sign * difference, 0.0), is_A))
 
     @cached_property
     def _variances_without_leak(self) -> dict[SideSupplies, float]:
@@ -314,7 +338,7 @@ class HeldChambers:
         """Compute the log prior of a leak's supplies and sensor offset, up to a constant.
 
         A hold in which a leak has equalised the pressures adds the squared deviation of its offset from the
-        recording's, in standard deviations (`LockedHold.offset_in_hold`).
+        recording's, in standard deviations (`_hold_offsets`).
         """
         costs = self._offset_costs(np.array([leak.offset]))
         return self._supply_log_priors[leak.supplies] - 0.5 * float(costs[0])
@@ -339,9 +363,9 @@ class HeldChambers:
                     s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
         """
         start_flows, integrals = [0.0], [0.0]
-        for hold in self.holds:
-            is_after = hold.t >= leak.onset
-            unit_flow = np.where(is_after, np.abs(hold.driving_pressure(leak.offset)) ** leak.exponent, 0.0)
+        pressures = np.split(self.driving_pressure(leak.offset), self._samples.begin[1:-1])
+        for hold, pressure in zip(self.holds, pressures, strict=True):
+            unit_flow = np.where(hold.t >= leak.onset, np.abs(pressure) ** leak.exponent, 0.0)
             start_flows.append(float(unit_flow[: hold.edges[1]].max()))
             integrals.append(float(np.trapezoid(unit_flow, hold.t)))
         time_error: float = INFERENCE.held_oil.settles

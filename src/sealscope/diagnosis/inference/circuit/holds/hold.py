@@ -65,39 +65,10 @@ class LockedHold:
         settling = slice(self.edges[0], self.edges[1])
         return float(self.p_A[settling].mean()) > float(self.p_B[settling].mean())
 
-    def centre(self, readings: Array, is_A: bool) -> Array:
-        """Subtract the mean over the hold from `readings` (k, ...) of side A, or of side B if `is_A` is False.
-
-        The first reading of the side with the higher pressure becomes 0 and does not count in the mean, since the
-        valves may still be shutting.
-        """
-        first = int(self.is_A_loaded == is_A)  # first reading that counts: 1 on the side with the higher pressure
-        centred = np.asarray(readings - readings[first:].mean(axis=0))
-        centred[:first] = 0.0
-        return centred
-
     @cached_property
     def last_pressures(self) -> tuple[float, float]:
         """Mean pressures of A and B [Pa] in the last interval."""
         return float(self.p_A[self.edges[-2] :].mean()), float(self.p_B[self.edges[-2] :].mean())
-
-    def offset_in_hold(self, offset: float) -> tuple[float, float, bool]:
-        """Estimate the sensor offset [Pa] in this hold, given the recording's `offset` (`estimate_hold_offsets`)."""
-        hold_offset, cost, is_equalised = estimate_hold_offsets(*self.last_pressures, offset)
-        return float(hold_offset), float(cost), bool(is_equalised)
-
-    def driving_pressure(self, offset: float) -> Array:
-        """Compute p_A - p_B [Pa] at each sample (n,) minus the hold's offset, given the recording's `offset` [Pa].
-
-        Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
-        exceed that of the large difference before. In such holds d is multiplied by the `small_difference_factor` of
-        `held_oil.resolved`.
-        """
-        offset_here, _, is_equalised = self.offset_in_hold(offset)
-        difference = np.asarray(self.difference - offset_here)
-        if is_equalised:
-            difference *= small_difference_factor(difference, INFERENCE.held_oil.resolved)
-        return difference
 
     def steepest_time(self) -> float:
         """Find the start [s] of the window in which p_A - p_B changes most.

@@ -7,7 +7,6 @@ has leaked. The logarithms of compressibility and free air, and the dead volumes
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -15,8 +14,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold
-from sealscope.diagnosis.inference.circuit.holds.onset_sums import N_REGRESSORS, FitWorkspace, OnsetPriors, fit_oil
+from sealscope.diagnosis.inference.circuit.holds.onset_sums import (
+    N_REGRESSORS,
+    FitWorkspace,
+    HoldSamples,
+    OnsetPriors,
+    fit_oil,
+)
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
@@ -142,48 +146,55 @@ class LeakRegression(NamedTuple):
 
 
 def build_regression(
-    holds: Sequence[LockedHold], flags: Sequence[NDArray[np.bool_]], sides: CylinderSides, n_readings: float
+    samples: HoldSamples, is_closed: NDArray[np.bool_], sides: CylinderSides, n_readings: float
 ) -> OilRegression:
     """Build the regression of displaced volumes on the oil's properties from all holds (`OilRegression`).
 
     The rows are the readings (sample means) of each hold, side A before side B, relative to their mean over the hold.
 
-    `flags` (2, n), for each hold of n samples: true in samples in which A (row 0) or B (row 1) is closed, so that
-    displacement and compression of that side count; `n_readings`: effective number of independent readings.
+    `is_closed` (2, N): true in `samples` in which A (row 0) or B (row 1) is closed, so that displacement and
+    compression of that side count; `n_readings`: effective number of independent readings.
     """
     prior, stroke = INFERENCE.held_oil, sides.high - sides.low
-    displaced, strained, aired = list[Array](), list[Array](), list[Array]()
-    for hold, is_closed in zip(holds, flags, strict=True):
-        # A grows with the position, and B shrinks
-        for index, area, p in ((0, sides.area_A, hold.p_A), (1, -sides.area_B, hold.p_B)):
-            stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
-            volumes = np.zeros(3)  # volume in the stroke, dead volumes of A and B
-            volumes[0] = abs(area) * abs(float(hold.x.mean()) - stroke_end)
-            volumes[1 + index] = abs(area) * prior.dead * stroke
-            # changes while the side is closed, as displaced and compressed volumes count only then
-            courses = (hold.mean(_sum_changes(values, is_closed[index])) for values in (hold.x, p, 1.0 / p))
-            moved, compressed_by, expanded_by = courses
-            for columns, values in (
-                (displaced, -area * moved),
-                (strained, np.outer(compressed_by, prior.compressibility * volumes)),
-                (aired, np.outer(expanded_by, -prior.air * P_ATM * volumes)),  # Boyle's law
-            ):
-                columns.append(hold.centre(values, is_A=index == 0))
-    strained_volumes, aired_volumes = np.vstack(strained), np.vstack(aired)
-    compressed = (strained_volumes + aired_volumes).sum(axis=1)
+    counts = np.diff(samples.first_edge) - 1  # readings of one side in each hold
+    positions = np.add.reduceat(samples.x, samples.begin[:-1]) / samples.sizes  # mean of each hold
+    # rows of side A: those of a hold begin after the readings of both sides of the holds before it
+    rows_of_A = np.arange(counts.sum()) + np.repeat(np.cumsum(counts) - counts, counts)
+    n_rows = 2 * len(rows_of_A)
+    displaced, strained, aired = np.empty(n_rows), np.empty((n_rows, 3)), np.empty((n_rows, 3))
+    # A grows with the position, and B shrinks
+    for index, area, p in ((0, sides.area_A, samples.p_A), (1, -sides.area_B, samples.p_B)):
+        stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
+        volumes = np.zeros((len(positions), 3))  # of each hold: volume in the stroke, dead volumes of A and B
+        volumes[:, 0] = abs(area) * np.abs(positions - stroke_end)
+        volumes[:, 1 + index] = abs(area) * prior.dead * stroke
+        volumes = np.repeat(volumes, counts, axis=0)
+        # changes while the side is closed, as displaced and compressed volumes count only then
+        moved, compressed_by, expanded_by = (
+            samples.readings(_sum_changes(values, is_closed[index], samples)) for values in (samples.x, p, 1.0 / p)
+        )
+        rows = rows_of_A + index * np.repeat(counts, counts)
+        displaced[rows] = samples.centre(-area * moved, is_A=index == 0)
+        strained[rows] = samples.centre(prior.compressibility * volumes * compressed_by[:, None], is_A=index == 0)
+        # Boyle's law
+        aired[rows] = samples.centre(-prior.air * P_ATM * volumes * expanded_by[:, None], is_A=index == 0)
+    compressed = (strained + aired).sum(axis=1)
     misfit_variance = prior.misfit**2 * float(compressed @ compressed) / len(compressed)
     return OilRegression(
-        np.concatenate(displaced),
-        strained_volumes,
-        aired_volumes,
+        displaced,
+        strained,
+        aired,
         inflation=max(len(compressed) / n_readings, 1.0),
         misfit_variance=max(misfit_variance, float(np.finfo(float).tiny)),
     )
 
 
-def _sum_changes(values: Array, is_closed: NDArray[np.bool_]) -> Array:
-    """Sum the changes of `values` (n,) from sample to sample that happen while the side is closed (`is_closed`)."""
-    return np.cumsum(np.diff(values, prepend=values[0]) * is_closed)
+def _sum_changes(values: Array, is_closed: NDArray[np.bool_], samples: HoldSamples) -> Array:
+    """Sum the changes of `values` (N,) from sample to sample of a hold that happen while the side is closed, (N,)."""
+    changes = np.diff(values, prepend=values[0]) * is_closed
+    changes[samples.begin[:-1]] = 0.0
+    course = np.cumsum(changes)
+    return np.asarray(course - np.repeat(course[samples.begin[:-1]], samples.sizes))
 
 
 def fit_leak(regression: OilRegression, sums: Array, n_readings: float) -> LeakRegression:

@@ -41,7 +41,8 @@ _TINY = float(np.finfo(float).tiny)
 class HoldSamples(NamedTuple):
     """Samples of all holds, one after the other, for compiled functions.
 
-    - `t`, `difference` (N,): time [s] and recorded p_A - p_B [Pa] of the samples of H holds.
+    - `t`, `p_A`, `p_B`, `x`, `difference` (N,): time [s], absolute pressures [Pa], position [m] and recorded p_A - p_B
+      [Pa] of the samples of H holds.
     - `begin` (H + 1,): index of the first sample of each hold, and N.
     - `edges` (E,), `first_edge` (H + 1,): indices of the samples that bound the readings of all holds, and of the first
       of these edges of each hold.
@@ -49,6 +50,9 @@ class HoldSamples(NamedTuple):
     """
 
     t: Any
+    p_A: Any
+    p_B: Any
+    x: Any
     difference: Any
     begin: Any
     edges: Any
@@ -62,12 +66,41 @@ class HoldSamples(NamedTuple):
         edges = [hold.edges + first for hold, first in zip(holds, begin.tolist(), strict=False)]
         return cls(
             np.concatenate([hold.t for hold in holds]),
+            np.concatenate([hold.p_A for hold in holds]),
+            np.concatenate([hold.p_B for hold in holds]),
+            np.concatenate([hold.x for hold in holds]),
             np.concatenate([hold.difference for hold in holds]),
             begin,
             np.concatenate(edges),
             np.cumsum([0, *(len(bounds) for bounds in edges)]),
             np.array([hold.is_A_loaded for hold in holds]),
         )
+
+    @property
+    def sizes(self) -> NDArray[np.intp]:
+        """Number of samples of each hold, (H,)."""
+        return np.asarray(np.diff(self.begin))
+
+    def readings(self, values: Array) -> Array:
+        """Average `values` (N,) of the samples to the r readings of one side of all holds, (r,)."""
+        is_within_hold = np.ones(len(self.edges) - 1, dtype=bool)
+        is_within_hold[self.first_edge[1:-1] - 1] = False  # from the last edge of a hold to the first of the next
+        starts, sizes = self.edges[:-1][is_within_hold], np.diff(self.edges)[is_within_hold]
+        return np.asarray(np.add.reduceat(values, starts) / sizes)
+
+    def centre(self, readings: Array, is_A: bool) -> Array:
+        """Subtract the mean over each hold from `readings` (r, ...) of side A, or of side B if `is_A` is False.
+
+        In a hold, the first reading of the side with the higher pressure becomes 0 and does not count in the mean,
+        since the valves may still be shutting.
+        """
+        counts = np.diff(self.first_edge) - 1  # readings of each hold
+        first = np.cumsum(counts) - counts
+        is_counted = np.ones(len(readings), dtype=bool)
+        is_counted[first[self.is_A_loaded == is_A]] = False
+        weights = is_counted.astype(float).reshape(-1, *[1] * (readings.ndim - 1))
+        means = np.add.reduceat(readings * weights, first) / np.add.reduceat(weights, first)
+        return np.asarray((readings - np.repeat(means, counts, axis=0)) * weights)
 
 
 class OnsetPriors(NamedTuple):
@@ -96,7 +129,9 @@ class Workspace(NamedTuple):
     - `columns` (2, N): readings of one side; `later`, `here` (2, 9): products (`_add_products`).
     - `sums` (o, 8), `squares` (o,): results for each onset; `per_leak` (o, 4), `with_column` (o, 5), `energies` (o,).
     - `basis` (7, 5), `gram` (5, 5), `masked`, `factor` (4, 4), `scale`, `lowest`, `limits`, `remainder` (5,),
-      `without_leak` (4,): parts of a fit.
+      `without_leak` (4,): parts of a fit; `is_solved` (o,): flags of onsets whose least squares are found;
+      `cases`, `n_solved` (16,): cases of properties at their limits, in the order in which they are tried, and the
+      number of onsets whose least squares each has found.
     """
 
     flows: Any
@@ -118,6 +153,9 @@ class Workspace(NamedTuple):
     limits: Any
     remainder: Any
     without_leak: Any
+    is_solved: Any
+    cases: Any
+    n_solved: Any
 
     @classmethod
     def with_sizes(cls, n_samples: int, n_onsets: int) -> Workspace:
@@ -126,7 +164,8 @@ class Workspace(NamedTuple):
         shapes: list[tuple[int, ...]] = [(4, n_samples), (8, n_samples + 1), (2, n_samples)]
         shapes += [(2, N_REGRESSORS + 2)] * 2 + [(n_onsets, N_REGRESSORS + 1), (n_onsets,), (n_onsets, n)]
         shapes += [(n_onsets, k), (n_onsets,), (N_REGRESSORS, k), (k, k), (n, n), (n, n), *[(k,)] * 4, (n,)]
-        return cls._make(np.empty(shape) for shape in shapes)
+        cases, n_solved = np.arange(len(_FREE)), np.zeros(len(_FREE), dtype=np.intp)
+        return cls._make([*map(np.empty, shapes), np.empty(n_onsets, dtype=bool), cases, n_solved])
 
 
 @large_law
@@ -147,7 +186,7 @@ def _fill_column(samples: Any, hold: int, volume: Any, sums: Any, onset: float, 
     """Write the readings of one side of a hold for a leak since `onset` [s], less their mean, to `column` (k,).
 
     `volume`, `sums`: as by `_integrate`. A sample at t shows the volume V(t) - V(onset) that has left since the onset,
-    0 before it. See `LockedHold.centre` for the mean.
+    0 before it. See `HoldSamples.centre` for the mean.
     """
     begin, end = samples.begin[hold], samples.begin[hold + 1]
     edge, last_edge = samples.first_edge[hold], samples.first_edge[hold + 1] - 1
@@ -324,12 +363,15 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
 
     `sums` (o, 8): products by `_sum_over_onsets`; `variance`: variance of a reading, which weights the priors. The
     least squares within the limits of the properties are the smallest of 16 cases: some properties are at their limits,
-    and the others are free and within them.
+    and the others are free and within them. If the squares do not fall either where a property leaves its limit, no
+    other case has less, as the squares are convex. The case that ends the search at the most onsets is the first of the
+    next fit.
     """
     n_onsets = len(sums)
     basis, gram, masked, factor, squares = work.basis, work.gram, work.masked, work.factor, work.squares
     scale, lowest, limits, remainder = work.scale, work.lowest, work.limits, work.remainder
     without_leak, per_leak, with_column, energies = work.without_leak, work.per_leak, work.with_column, work.energies
+    is_solved = work.is_solved
     for a in range(N_OIL + 1):
         limits[a], scale[a] = 0.0, 1.0
     _fill_basis(limits, limits, 0, basis)  # `limits`: at first no changes, and no fixed properties
@@ -346,8 +388,12 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
             for i in range(N_REGRESSORS):
                 with_column[o, a] += sums[o, i] * basis[i, a] / scale[a]
     for o in range(n_onsets):
-        squares[o] = np.inf
-    for case in range(len(_FREE)):
+        squares[o], is_solved[o] = np.inf, False
+    largest, n_left = 0.0, n_onsets  # the largest energy so far, and the number of onsets with other cases to try
+    for k in range(len(_FREE)):
+        if n_left == 0:
+            break
+        case, n_before = work.cases[k], n_left
         total = gram[N_OIL, N_OIL]
         for a in range(N_OIL):
             limits[a] = 0.0 if _FREE[case, a] else lowest[a]
@@ -361,8 +407,9 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
         _solve(factor, without_leak)  # changes of the free properties without a leak
         for a in range(N_OIL):
             total -= limits[a] * (gram[a, N_OIL] + remainder[a]) + remainder[a] * without_leak[a]
-        largest = 0.0
         for o in range(n_onsets):
+            if is_solved[o]:
+                continue
             energies[o] = sums[o, N_REGRESSORS]
             for a in range(N_OIL):
                 per_leak[o, a] = with_column[o, a] if _FREE[case, a] else 0.0
@@ -371,18 +418,35 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
                 energies[o] -= with_column[o, a] * per_leak[o, a]
             largest = max(largest, energies[o])
         for o in range(n_onsets):
+            if is_solved[o]:
+                continue
             moment = with_column[o, N_OIL]
             for a in range(N_OIL):
                 moment -= limits[a] * with_column[o, a] + remainder[a] * per_leak[o, a]
             moment = max(moment, 0.0)  # the coefficient of a leak is not negative
             # a leak that no reading shows, such as one after the last hold, has the coefficient 0
             leak = moment / energies[o] if energies[o] > _MIN_ENERGY * max(largest, _TINY) else 0.0
-            is_within = True
+            is_within, is_least = True, True
             for a in range(N_OIL):
-                change = without_leak[a] - leak * per_leak[o, a]
-                is_within = is_within and (not _FREE[case, a] or change >= (1.0 + ROUNDING) * lowest[a])
+                if _FREE[case, a]:
+                    is_within = is_within and without_leak[a] - leak * per_leak[o, a] >= (1.0 + ROUNDING) * lowest[a]
+                else:  # half the derivative of the squares by this property, at its limit
+                    slope = leak * with_column[o, a] - remainder[a]
+                    for b in range(N_OIL):
+                        if _FREE[case, b]:
+                            slope += gram[a, b] * (without_leak[b] - leak * per_leak[o, b])
+                    is_least = is_least and slope >= 0.0
             if is_within:
                 squares[o] = min(squares[o], max(total - leak * moment, 0.0))
+            if is_within and is_least:
+                is_solved[o] = True
+                n_left -= 1
+        n_solved = n_before - n_left
+        rank = k  # among the cases tried so far, by the number of onsets
+        while rank > 0 and work.n_solved[rank - 1] < n_solved:
+            work.cases[rank], work.n_solved[rank] = work.cases[rank - 1], work.n_solved[rank - 1]
+            rank -= 1
+        work.cases[rank], work.n_solved[rank] = case, n_solved
 
 
 @large_law
@@ -473,7 +537,7 @@ def score_offsets(
     """Compute the log likelihood of a leak past the piston for each of g sensor offsets and o onsets, (g, o).
 
     `offsets`, `is_equalised` (g, H): the sensor offset of each hold [Pa], and true if a leak has equalised its
-    pressures (`LockedHold.offset_in_hold`); `exponent`: of the leak's law; `resolved`: as for
+    pressures (`estimate_hold_offsets`); `exponent`: of the leak's law; `resolved`: as for
     `small_difference_factor`; `is_closed` (2, N): true while A, B are closed; `onsets`, `regressors`: as for
     `sum_onset_products`. The law of the flow is that of `HeldChambers._unit_piston_leak`.
     """
