@@ -124,7 +124,7 @@ def colour(random, n, step, memory):
 
 
 def record(random, plant, logger):
-    """Record a simulated hold as the logger does."""
+    """Record a simulated hold as the logger does; return it with the leak's flow and the travel over time."""
     t_plant, s, p, far_p, T, flow = simulate(plant, logger["seconds"])
     t = np.arange(int(logger["seconds"] * logger["rate"])) / logger["rate"]
     travel = np.interp(t, t_plant, s)
@@ -148,9 +148,15 @@ def record(random, plant, logger):
     if plant["thermal"] != "unlogged" and random.random() < (1.0 if plant["thermal"] == "logged" else 0.7):
         values["T_oil"] = np.round(10.0 * (320.0 + np.interp(t, t_plant, T))) / 10.0
     units = {name: "m" if name == "x" else "K" if name == "T_oil" else "Pa" for name in values}
-    settled = plant["settle"] * -np.expm1(-t_plant[-1] / plant["settle_time"])
-    speed = 0.0 if plant["stop"] else float(s[-1] - s[0] - settled) / float(t_plant[-1])
-    return ss.Recording(t, values, units, rate=logger["rate"]), float(np.mean(flow)), speed
+    sunk = s - (0.0 if plant["stop"] else plant["settle"]) * -np.expm1(-t_plant / plant["settle_time"])
+    return ss.Recording(t, values, units, rate=logger["rate"]), (t_plant, flow, sunk)
+
+
+def truths(course, start, end):
+    """Compute mean flow and mean speed, without what settles, between two times of a simulated `course`."""
+    t, flow, sunk = course
+    volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * np.diff(t))])
+    return [float(np.diff(np.interp([start, end], t, values))[0]) / (end - start) for values in (volume, sunk)]
 
 
 def run_test(seed, first):
@@ -159,7 +165,8 @@ def run_test(seed, first):
     plant, logger = draw_plant(random), draw_logger(random)
     while plant["stop"] and simulate(plant, logger["seconds"])[2][-1] < 0.3 * plant["p"]:
         plant["creep"], plant["swing"] = 0.3 * plant["creep"], 0.5 * plant["swing"]  # else the chamber empties
-    recording, flow, speed = record(random, plant, logger)
+    recording, course = record(random, plant, logger)
+    flow, speed = truths(course, 0.0, course[0][-1])
     area = plant[plant["loaded"]]
     limit = (flow if flow > 0.0 else log_uniform(random, 0.05, 2.0) * MM_MIN * area) * log_uniform(random, 0.25, 4.0)
     areas = (f"{plant['A']} m^2", f"{plant['B']} m^2")
@@ -173,6 +180,7 @@ def run_test(seed, first):
     except Exception as error:
         return {"seed": seed, "error": f"{type(error).__name__}: {error}", "plant": plant, "logger": logger}
     seconds = time.process_time() - begin
+    flow, speed = truths(course, result.start_s, result.end_s)
     unlogged = plant["thermal"] == "unlogged"
     true_creep = (speed if unlogged else flow / area if not plant["stop"] else 0.0) / MM_MIN
     if plant["far"] == "locked" and not plant["stop"]:

@@ -21,17 +21,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.hold.readings import Readings, average_parts, read_channel, smooth_course
+from sealscope.diagnosis.hold.readings import (
+    N_PARTS,
+    Readings,
+    average_parts,
+    read_channel,
+    sample_course,
+    smooth_course,
+)
 from sealscope.diagnosis.hold.regression import (
     Alternative,
     Column,
     Mixture,
     RateFit,
     fit_rate,
-    pool_mixtures,
+    pool_fits,
 )
 from sealscope.diagnosis.hold.result import HoldCurve
 from sealscope.diagnosis.hold.set_up import SetUp
+from sealscope.diagnosis.inference.circuit.holds.hold import estimate_hold_offsets, small_difference_factor
 from sealscope.diagnosis.inference.circuit.holds.oil import relative_compression
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
 from sealscope.diagnosis.inference.onset import WITHIN_95
@@ -46,6 +54,9 @@ from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
 LOWEST = 2e4
 #: Ratio of the highest to the lowest pressure difference of a hold, above which the law of the leak counts.
 STEADY_PRESSURE = 1.02
+#: Start of the last part of a hold, over its duration, and the smallest difference of pressures that it resolves, in
+#: standard deviations of the noise of parts.
+LAST_PART, RESOLVED = 0.97, 4.0
 #: Degree of the polynomial that smooths a logged temperature.
 SMOOTH_DEGREE = 3
 #: Time constants [durations of the hold] of the exponentials that such a smooth course has as well, and the number of
@@ -55,12 +66,23 @@ COURSE_TIMES, MIN_PASSAGES = (0.2,), 24
 AT_STOP = 3.0
 #: Error of the change of a rounded temperature over a hold, in steps.
 ROUNDED = 0.15
-#: Standard deviation of the logarithm of a time constant within a step of its grid.
-GRID_DEVIATION = 0.3
+#: Standard deviation of the logarithm of a time constant within a step of its grid, and a step of a derivative by it.
+GRID_DEVIATION, SLIGHTLY = 0.3, 1.05
 #: Least bend of a travel [mm] that is fitted.
 LEAST_BEND = 1e-6
 #: Millimetres of a metre.
 _MM = 1e3
+
+
+class LeakClock(NamedTuple):
+    """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean rate 1.
+
+    `spare` (m,): how much of it is due to the sensors' offset in a hold whose pressures a leak has equalised.
+    """
+
+    weight: float
+    minutes: Array
+    spare: Array | None = None
 
 
 class LeakEstimate(NamedTuple):
@@ -72,13 +94,13 @@ class LeakEstimate(NamedTuple):
     fit: RateFit | None = None
 
 
-def _exponential(t: Array, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
-    """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`, at times `t`.
+def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
+    """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`.
 
     The second column is its derivative by the logarithm of the time constant, which the grid of these leaves open.
     """
-    course = np.expm1(-t / time)
-    slope = (t / time) * np.exp(-t / time)
+    course = readings.decay(time) - 1.0
+    slope = (readings.decay(time * SLIGHTLY) - readings.decay(time / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
     return Column(course, mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
 
 
@@ -93,12 +115,6 @@ def _fit_course(
 
     coefficients = np.linalg.lstsq(weights[:, None] * basis(z), weights * values, rcond=None)[0]
     return lambda z: np.asarray(basis(z) @ coefficients)
-
-
-def _bend(t: Array, course: Array) -> Array:
-    """Subtract from a `course` at times `t` the chord between its ends: what is left has no mean speed."""
-    chord = course[0] + float(course[-1] - course[0]) * (t - t[0]) / float(t[-1] - t[0])
-    return np.asarray(course - chord)
 
 
 class HeldLoad:
@@ -169,12 +185,12 @@ class HeldLoad:
         p = self._channel(f"p_{self.loaded}")
         return None if p is None else float(np.mean(p))
 
-    def _settling(self, t: Array, sizes: Sequence[float]) -> list[Alternative]:
-        """List what may settle after the valve has shut, at times `t` [s]; `sizes`: deviations of its amplitude."""
+    def _settling(self, readings: Readings, sizes: Sequence[float]) -> list[Alternative]:
+        """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude."""
         prior = HOLD.settling
         times = [time for time in prior.times if time <= prior.longest * self.duration]
         weight = prior.present / max(len(times) * len(sizes), 1)
-        terms = [_exponential(t, time, size) for time in times for size in sizes]
+        terms = [_exponential(readings, time, size) for time in times for size in sizes]
         return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
 
     def _thermal_columns(self, t: Array) -> list[Column]:
@@ -193,21 +209,23 @@ class HeldLoad:
         self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
         travel = scale * (course(t / self.duration) - course(np.zeros(1)))
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
-        return [Column(travel, 1.0, uncertainty), *self._misfit(t, travel, HOLD.cooling.misfit)]
+        size = HOLD.cooling.misfit * float(np.ptp(travel))
+        misfit = self._misfit(t, t, size) + [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]
+        return [Column(travel, 1.0, uncertainty), *(misfit if size > HOLD.cooling.misfit * LEAST_BEND else ())]
 
-    def _misfit(self, t: Array, travel: Array, share: float) -> list[Column]:
-        """Build the slope and bends, a `share` of it, that a correction by `travel` [mm] leaves at times `t` [s]."""
-        size = share * float(np.ptp(travel))
-        if size < share * LEAST_BEND:
-            return []
-        z = 2.0 * t / self.duration - 1.0
-        courses = z, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # slope and bends (Legendre polynomials)
-        return [Column(course, 0.0, size) for course in courses]
+    def _misfit(self, t: Array, course: Array, size: float) -> list[Column]:
+        """Build the slope, of a standard deviation `size` [mm], and bends that a correction leaves at times `t` [s].
 
-    def _cooling(self, t: Array) -> list[Alternative]:
-        """List the alternatives for the travel [mm] due to oil that nobody logs, at times `t`."""
+        `course` (m,): what the correction depends on, such as a pressure or the time; the bends are polynomials of it.
+        """
+        z = 2.0 * (course - course.min()) / (float(np.ptp(course)) or 1.0) - 1.0
+        courses = 2.0 * t / self.duration - 1.0, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # Legendre polynomials
+        return [Column(values, 0.0, size) for values in courses]
+
+    def _cooling(self, readings: Readings) -> list[Alternative]:
+        """List the alternatives for the travel [mm] due to oil that nobody logs, in `readings`."""
         prior, set_up = HOLD.cooling, self.set_up
-        if self._thermal_columns(t):
+        if self._thermal_columns(readings.t):
             return [Alternative(1.0)]
         sizes = [(0.0, size) for size in prior.sizes]
         if set_up.oil_course == "steady":
@@ -220,7 +238,7 @@ class HeldLoad:
             sizes = [((1.0 if set_up.oil_course == "falling" else -1.0) * mean * excess, deviation * excess)]
         factor = prior.expansion * self.column[0]
         weight = 1.0 / (len(sizes) * len(prior.times))
-        terms = [_exponential(t, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
+        terms = [_exponential(readings, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
         return [Alternative(weight, term) for term in terms]
 
     @property
@@ -230,62 +248,94 @@ class HeldLoad:
             return 0.0
         return HOLD.cooling.steady if self.set_up.oil_course == "steady" else max(HOLD.cooling.sizes)
 
-    def _clocks(self, t: Array) -> list[tuple[float, Array]]:
-        """List the time [min] weighted by the laws of a leak, at times `t` [s]: (prior probability, clock)."""
+    def _clocks(self, readings: Readings) -> list[LeakClock]:
+        """List the clocks of the laws of a leak, as `readings` see them."""
         p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
         if p is None:
-            return [(1.0, t / 60.0)]
-        clocks = []
-        differences = (
-            [p - P_ATM] if other is None else [p - other, p - P_ATM]
-        )  # past the piston, or out of the cylinder
+            return [LeakClock(1.0, readings.t / 60.0)]
+        # past the piston, or out of the cylinder
+        differences = [p - P_ATM] if other is None else [p - other, p - P_ATM]
         courses = [smooth_course(self.t, difference) for difference in differences]
-        courses = [(part_t, np.maximum(course, 1e-3 * float(np.abs(course).max()))) for part_t, course in courses]
         if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
-            return [(1.0, t / 60.0)]
-        for part_t, course in courses:
+            return [LeakClock(1.0, readings.t / 60.0)]
+        clocks = []
+        for k, (part_t, course) in enumerate(courses):
+            driving = course
+            if k == 0 and other is not None:
+                # what is left of the difference after a leak has equalised the pressures is an error of the sensors
+                last = self.t >= self.duration * LAST_PART
+                offset, _, is_equalised = estimate_hold_offsets(float(p[last].mean()), float(other[last].mean()), 0.0)
+                if is_equalised:
+                    noise = float(np.std(p[last] - other[last])) / math.sqrt(max(len(p) / N_PARTS, 1.0))
+                    driving = (course - offset) * small_difference_factor(course - offset, RESOLVED * noise)
             for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
-                flow = course**exponent / float(np.mean(course**exponent))
-                steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(part_t)
-                weighted = flow[0] * part_t[0] + np.concatenate([[0.0], np.cumsum(steps)])
-                clocks.append((weight / len(courses), np.interp(t, part_t, weighted) / 60.0))
+                minutes = self._weigh_time(readings, part_t, driving, exponent)
+                spare = None if driving is course else minutes - self._weigh_time(readings, part_t, course, exponent)
+                clocks.append(LeakClock(weight / len(differences), minutes, spare))
         return clocks
+
+    def _weigh_time(self, readings: Readings, t: Array, difference: Array, exponent: float) -> Array:
+        """Compute the time [min] of `readings` weighted by a power of a pressure `difference` at `t`, mean weight 1."""
+        flow = np.sign(difference) * np.abs(difference) ** exponent
+        steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(t)
+        volume = flow[0] * t[0] + np.concatenate([[0.0], np.cumsum(steps)])
+        total = float(volume[-1] + flow[-1] * (self.duration - t[-1]))
+        return sample_course(readings, t, volume) * (self.duration / 60.0 / (total or 1.0))
 
     @cached_property
     def creep(self) -> RateFit | None:
         """Speed at which the piston sinks [mm/min], with what settles fitted; None without a position."""
         if self.travel is None:
             return None
-        t, stopped = self._travel_readings.t, HOLD.settling.stopped
-        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._pressure_bends(t)]
+        readings, stopped = self._travel_readings, HOLD.settling.stopped
+        t = readings.t
+        base = [Column(t / 60.0), Column(np.ones_like(t)), *self._pressure_bends()]
+        resting = [Alternative(stopped)]
         if logged := self._thermal_columns(t):
-            thermal = [Alternative(stopped), Alternative(1.0 - stopped, tuple(logged))]
+            thermal = [Alternative(1.0 - stopped, tuple(logged))]
         elif self.set_up.oil_course:
-            thermal = self._cooling(t)
+            thermal = [Alternative((1.0 - stopped) * weight, columns) for weight, columns in self._cooling(readings)]
         else:
-            thermal = [Alternative(stopped)]
-            for weight, columns in self._cooling(t):
-                bends = tuple(column._replace(values=_bend(t, column.values)) for column in columns)
+            thermal, resting = resting, []
+            ends = Readings(np.array([0.0, self.duration]), np.zeros(2), np.zeros(2), 0.0)
+            for (weight, columns), (_, at_ends) in zip(self._cooling(readings), self._cooling(ends), strict=True):
+                bends = tuple(
+                    column._replace(values=self._bend(t, column.values, float(np.diff(end.values)[0])))
+                    for column, end in zip(columns, at_ends, strict=True)
+                )
                 thermal.append(Alternative((1.0 - stopped) * weight, bends))
-        alternatives = [self._settling(t, HOLD.settling.travel), thermal]
-        fit = fit_rate(self._travel_readings, base, alternatives, self.duration)
-        bent = HOLD.cooling.misfit * float(np.ptp(_bend(t, fit.fit))) / (self.duration / 60.0)
+        settling = self._settling(readings, HOLD.settling.travel)
+        fits = [fit_rate(readings, base, [settling, terms], self.duration) for terms in (thermal, resting) if terms]
+        logs = [fit.log_evidence for fit in fits]
+        if resting:  # a piston on its stop follows no temperature, and does not creep
+            logs[1] -= 0.5 * (fits[1].rate.mean / fits[1].rate.deviation) ** 2
+        fit = pool_fits(fits, logs)
+        change = float(fit.fit[-1] - fit.fit[0]) * self.duration / float(t[-1] - t[0])
+        bend = float(np.ptp(self._bend(t, fit.fit, change)))
+        bent = HOLD.cooling.misfit * bend / (self.duration / 60.0)
         return fit._replace(rate=fit.rate.add_error(math.hypot(self.rounding, bent)))
 
-    def _pressure_bends(self, t: Array) -> list[Column]:
-        """Build the bends [mm] of the travel by pressures that change, compression and laws of a leak, at times `t`."""
-        bends, clocks = [], self._clocks(t)
-        if len(clocks) == 1:
-            return []
-        for side in (self.loaded, self.unloaded):
+    def _pressure_bends(self) -> list[Column]:
+        """Build the bends [mm] of the travel by pressures that change: compression, and laws of a leak."""
+        readings = self._travel_readings
+        columns = []
+        for side, mean in ((self.loaded, 1.0), (self.unloaded, 0.0)):
             if (p := self._pressure(side)) is None:
                 continue
             part_t, course = smooth_course(self.t, p)
-            compression = relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
-            bends.append(_bend(t, self.column[0] * np.interp(t, part_t, compression)))
-        speed = float(np.ptp(self._travel_readings.values)) / (self.duration / 60.0)
-        bends += [_bend(t, speed * clock) for _, clock in clocks[:: len(EXPONENTS)]]
-        return [Column(bend, 0.0, 1.0) for bend in bends if np.ptp(bend) > LEAST_BEND]
+            compression = self.column[0] * relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
+            values = sample_course(readings, part_t, compression)
+            columns.append(Column(self._bend(readings.t, values, float(compression[-1] - compression[0])), mean, 1.0))
+        clocks = self._clocks(readings)
+        speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
+        for k, clock in enumerate(clocks):
+            if len(clocks) > 1 and k % len(EXPONENTS) != 1:  # the law between is nearly their mean
+                columns.append(Column(speed * self._bend(readings.t, clock.minutes, self.duration / 60.0), 0.0, 1.0))
+        return [column for column in columns if np.ptp(column.values) > LEAST_BEND]
+
+    def _bend(self, t: Array, course: Array, change: float) -> Array:
+        """Subtract from a `course` at times `t` [s] a line with its `change` over the hold: no mean speed is left."""
+        return np.asarray(course - change * t / self.duration)
 
     @cached_property
     def _travel_readings(self) -> Readings:
@@ -298,7 +348,9 @@ class HeldLoad:
         middle = float(np.mean(p)) + np.array([-0.5, 0.5]) * BAR
         slope = length * float(np.diff(relative_compression(middle).sum(axis=0))[0]) / BAR
         compression = length * relative_compression(readings.values).sum(axis=0)
-        return readings, Readings(readings.t, compression, slope * readings.loose, slope * readings.quantum)
+        return readings, readings._replace(
+            values=compression, loose=slope * readings.loose, quantum=slope * readings.quantum
+        )
 
     @cached_property
     def gain(self) -> Mixture | None:
@@ -313,7 +365,8 @@ class HeldLoad:
         # oil that cools in a closed chamber loses pressure
         base += [column._replace(values=-column.values) for column in self._thermal_columns(t)]
         sizes = [_MM * length * strain for strain in HOLD.settling.strain]
-        fit = fit_rate(compression, base, [self._settling(t, sizes), self._cooling(t)], self.duration)
+        alternatives = [self._settling(compression, sizes), self._cooling(compression)]
+        fit = fit_rate(compression, base, alternatives, self.duration)
         return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
 
     @cached_property
@@ -341,9 +394,11 @@ class HeldLoad:
         readings = read_channel(self.t, meter, ML_PER_MINUTE)
         scale = float(np.abs(readings.values).max()) or ML_PER_MINUTE
         t = readings.t
-        scaled = Readings(t, readings.values / scale, readings.loose / scale, readings.quantum / scale)
+        scaled = readings._replace(
+            values=readings.values / scale, loose=readings.loose / scale, quantum=readings.quantum / scale
+        )
         level = Column(np.ones_like(t))
-        fit = fit_rate(scaled, [level], [self._settling(t, (0.1, 1.0))], self.duration, from_first=False)
+        fit = fit_rate(scaled, [level], [self._settling(readings, (0.1, 1.0))], self.duration, from_first=False)
         return fit.rate.scale(scale).add_error(INFERENCE.size.meter * abs(fit.rate.mean) * scale)
 
     def _leak_by_travel(self) -> LeakEstimate:
@@ -356,11 +411,10 @@ class HeldLoad:
             widths = (oil.deviation, oil.air_deviation)
             part_t, course = smooth_course(self.t, p)
             for compression, width in zip(relative_compression(np.maximum(course, LOWEST)), widths, strict=True):
-                column = length * (np.interp(readings.t, part_t, compression) - compression[0])
-                base += [
-                    Column(column, 1.0, math.hypot(deviation, width)),
-                    *self._misfit(readings.t, column, oil.misfit),
-                ]
+                column = length * sample_course(readings, part_t, compression - compression[0])
+                base.append(Column(column, 1.0, math.hypot(deviation, width)))
+                if np.ptp(column) > LEAST_BEND:
+                    base += self._misfit(readings.t, column, oil.misfit * float(np.ptp(column)))
         fit = self._fit_laws(readings, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
@@ -397,18 +451,18 @@ class HeldLoad:
         """Fit the rate [mm/min] under each law of a leak, with temperature and settling, and pool the laws."""
         t = readings.t
         base = [*base, *self._thermal_columns(t)]
-        alternatives = [self._settling(t, sizes), self._cooling(t)]
+        alternatives = [self._settling(readings, sizes), self._cooling(readings)]
         fits, logs = [], []
         speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
-        for weight, clock in self._clocks(t):
-            law = self._misfit(t, _bend(t, speed * clock), INFERENCE.held_oil.misfit)
-            fits.append(fit_rate(readings, [Column(clock), *base, *law], alternatives, self.duration))
-            logs.append(math.log(weight) + fits[-1].log_evidence)
-        weights = np.exp(np.array(logs) - max(logs))
-        weights /= weights.sum()
-        best = fits[int(weights.argmax())]
-        rate = pool_mixtures([fit.rate for fit in fits], weights)
-        return best._replace(rate=rate.add_error(self.rounding))
+        for clock in self._clocks(readings):
+            law = [] if clock.spare is None else [Column(speed * clock.spare, 0.0, 1.0)]
+            bend = float(np.ptp(speed * self._bend(t, clock.minutes, self.duration / 60.0)))
+            if bend > LEAST_BEND:
+                law += self._misfit(t, clock.minutes, INFERENCE.held_oil.misfit * bend)
+            fits.append(fit_rate(readings, [Column(clock.minutes), *base, *law], alternatives, self.duration))
+            logs.append(math.log(clock.weight) + fits[-1].log_evidence)
+        fit = pool_fits(fits, logs)
+        return fit._replace(rate=fit.rate.add_error(self.rounding))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
         """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""

@@ -7,6 +7,7 @@ otherwise only that it is within a step: its readings are these passages, and bo
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,8 @@ N_BETWEEN = 10
 #: Degree of the polynomial, time constants of the exponentials [durations of the hold] of a smooth course, and largest
 #: correlation of neighbouring residuals about it.
 SMOOTH_DEGREE, SMOOTH_TIMES, MAX_CORRELATION = 4, (0.02, 0.06, 0.2), 0.3
+#: Largest residual of such a course, root mean square over the noise of the means.
+MAX_MISFIT = 1.5
 #: Largest number of bins in which holds are sought.
 MAX_BINS = 20_000
 
@@ -36,13 +39,22 @@ class Readings(NamedTuple):
     """Readings of a channel in a hold.
 
     `t` (m,) [s]: times since the hold's start; `values` (m,); `loose` (m,): standard deviation of readings that are
-    only known to be within a step of the encoder, 0 for others; `quantum`: size of that step, 0 for means.
+    only known to be within a step of the encoder, 0 for others; `quantum`: size of that step, 0 for means; `step`
+    [s], `n_samples`: time between the samples of a mean, and their number on average.
     """
 
     t: Array
     values: Array
     loose: Array
     quantum: float
+    step: float = 0.0
+    n_samples: float = 1.0
+
+    def decay(self, time: float) -> Array:
+        """Compute exp(-t/time) as the readings see it: means are averaged over their samples."""
+        u = 0.5 * self.step / time
+        factor = math.sinh(self.n_samples * u) / (self.n_samples * math.sinh(u)) if u > 0.0 else 1.0
+        return np.asarray(np.exp(-self.t / time) * factor)
 
 
 def average_parts(t: Array, values: Array, n_parts: int) -> tuple[Array, Array]:
@@ -54,6 +66,14 @@ def average_parts(t: Array, values: Array, n_parts: int) -> tuple[Array, Array]:
     sums = (np.bincount(part, weights=series, minlength=n_parts) for series in (t - t[0], values - values[0]))
     times, means = (total[has_samples] / counts[has_samples] for total in sums)
     return times + t[0], means + values[0]
+
+
+def sample_course(readings: Readings, t: Array, course: Array) -> Array:
+    """Compute a course, known at fine times `t` (k,), as the readings (m,) see it: as means of parts, or at times."""
+    if readings.quantum:
+        return np.asarray(np.interp(readings.t, t, course))
+    part_t, means = average_parts(t, course, HOLD.noise.nodes)
+    return np.asarray(np.interp(readings.t, part_t, means))
 
 
 def read_channel(t: Array, values: Array, least_step: float) -> Readings:
@@ -71,7 +91,8 @@ def read_channel(t: Array, values: Array, least_step: float) -> Readings:
     if is_same.mean() > SHARE_AT_STEP and np.count_nonzero(np.diff(code)) <= HOLD.noise.nodes:
         return _read_passages(t, fine_t, position, float(values.min()), quantum)
     mean_t, means = average_parts(t, values, HOLD.noise.nodes)
-    return Readings(mean_t, means, np.zeros(len(means)), 0.0)
+    step = float(t[-1] - t[0]) / max(len(t) - 1, 1)
+    return Readings(mean_t, means, np.zeros(len(means)), 0.0, step, len(t) / len(means))
 
 
 def _read_passages(t: Array, fine_t: Array, position: Array, origin: float, quantum: float) -> Readings:
@@ -111,22 +132,28 @@ def _read_passages(t: Array, fine_t: Array, position: Array, origin: float, quan
 
 
 def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
-    """Average samples (n,) over parts of a hold, and smooth the means unless they wander; return times and values.
+    """Average samples (n,) over fine parts of a hold, and smooth the means unless they wander; return times and values.
 
     The noise of a pressure that serves as a regressor would hide its effect. The smooth course is a polynomial with
-    exponentials; means whose residuals are correlated are left as they are.
+    exponentials; it is taken where what it leaves, averaged to readings, is white and no larger than their noise.
     """
-    part_t, means = average_parts(t, values, HOLD.noise.nodes)
+    part_t, means = average_parts(t, values, N_PARTS)
+    size = max(len(means) // HOLD.noise.nodes, 1)
     if len(means) <= 2 * (SMOOTH_DEGREE + 1 + len(SMOOTH_TIMES)):
         return part_t, means
     z = (part_t - part_t[0]) / (part_t[-1] - part_t[0])
     powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, SMOOTH_DEGREE)
     basis = np.column_stack([powers, *(np.exp(-z / time) for time in SMOOTH_TIMES)])
-    smooth = basis @ np.linalg.lstsq(basis, means, rcond=None)[0]
-    residual = means - smooth
-    power = float(residual @ residual)
-    is_white = float(residual[1:] @ residual[:-1]) < MAX_CORRELATION * power
-    return part_t, smooth if is_white else means
+    starts = np.arange(0, len(means) - size + 1, size)
+    noise = 1.4826 * float(np.median(np.abs(np.diff(np.add.reduceat(means, starts) / size, 2)))) / 6.0**0.5
+    for n_columns in (1, 2, basis.shape[1]):  # the simplest course that suffices
+        smooth = basis[:, :n_columns] @ np.linalg.lstsq(basis[:, :n_columns], means, rcond=None)[0]
+        residual = np.add.reduceat(means - smooth, starts) / size
+        power = float(residual @ residual)
+        is_white = float(residual[1:] @ residual[:-1]) < MAX_CORRELATION * power
+        if is_white and power < len(residual) * (MAX_MISFIT * noise) ** 2:
+            return part_t, smooth
+    return part_t, means
 
 
 def find_held_parts(t: Array, x: Array | None, p: Array | None) -> list[tuple[int, int]]:

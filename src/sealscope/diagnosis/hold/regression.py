@@ -165,6 +165,14 @@ class RateFit(NamedTuple):
     log_evidence: float
 
 
+def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
+    """Pool fits (k,) whose logarithms of probability are `logs` (k,): the most probable, with the rates of all."""
+    weights = np.exp(np.array(logs) - max(logs))
+    weights /= weights.sum()
+    rate = pool_mixtures([fit.rate for fit in fits], weights)
+    return fits[int(weights.argmax())]._replace(rate=rate)
+
+
 def fit_rate(
     readings: Readings, base: Sequence[Column], alternatives: Sequence[Sequence[Alternative]], duration: float,
     *, from_first: bool = True,
