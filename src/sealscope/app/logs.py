@@ -9,15 +9,17 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from sealscope.app.session import SessionMachine
 from sealscope.app.tables import Source, cache_folder, reduce_extremes
+from sealscope.diagnosis.channel_checks import ChannelCheck, check_channels
 from sealscope.diagnosis.commissioned.duty import measure_duty
 from sealscope.diagnosis.commissioned.machine import read_by_map
 from sealscope.diagnosis.flow_curves import FlowCurves, compute_flow_curves
+from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.errors import SealscopeError, UnreadableFile
 from sealscope.parameters import Rig
 from sealscope.recordings.files import iter_columns
@@ -26,7 +28,6 @@ from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import proposed_map
 from sealscope.recordings.joining import start_seconds
-from sealscope.recordings.quality import inspect
 from sealscope.recordings.recording import Array, Recording
 from sealscope.reporting.charts import display_values
 from sealscope.storage.atomic import atomic_write
@@ -35,8 +36,10 @@ from sealscope.units import LITRE_PER_MINUTE
 
 #: Rows of a text log that are read at a time, for its first picture.
 PART_ROWS = 30_000
-#: Points of a small picture, and format of the stored rows.
-_PICTURE, _VERSION = 64, 2
+#: Points of a small picture, and format of the stored rows and tables.
+_PICTURE, VERSION = 64, 3
+#: Chambers, each with a balance of its own behind a servo valve.
+_SIDES: tuple[Literal["A", "B"], ...] = ("A", "B")
 _ZONE = re.compile(r"(?:Z|[+-]\d\d:?\d\d)$")
 
 
@@ -70,7 +73,7 @@ def describe_log(path: Path, machines: Sequence[SessionMachine]) -> dict[str, An
     """
     try:
         maps = [(m.channel_map, m.rate) for m in machines if m.map or m.rate]
-        stamp = json.dumps([_VERSION, file_stamp(path), maps], sort_keys=True)
+        stamp = json.dumps([VERSION, file_stamp(path), maps], sort_keys=True)
         stored = cache_folder() / "rows" / f"{sha256(stamp.encode('utf-8', 'surrogateescape')).hexdigest()[:32]}.json"
         with suppress(OSError, ValueError):
             return json.loads(stored.read_text(encoding="utf-8"))  # type: ignore[no-any-return]
@@ -86,12 +89,16 @@ def describe_log(path: Path, machines: Sequence[SessionMachine]) -> dict[str, An
         return {"state": "unreadable", "error": f"cannot read, got {type(error).__name__}: {error}"[:500]}
 
 
-def describe_recording(recording: Recording, name: str) -> dict[str, Any]:
-    """Describe a recording as plain values: start, length, rate, channels, findings, small picture and duty."""
+def describe_recording(recording: Recording, name: str, *, with_places: bool = False) -> dict[str, Any]:
+    """Describe a recording as plain values: start, length, rate, channels, findings, small picture and duty.
+
+    `with_places`: also the times of all places at which a defect was found.
+    """
     start = str(recording.provenance.get("start", ""))
     findings = [
         {"severity": finding.severity, "text": finding.text, "channel": finding.channel, "t": finding.first_t}
-        for finding in inspect(recording)
+        | ({"places": finding.places} if with_places else {})
+        for finding in inspect_recording(recording).findings
     ]
     row = {
         "state": "read",
@@ -170,44 +177,59 @@ def channels_source(read: Callable[[], Recording]) -> Source:
 def balance_source(read: Callable[[], Recording], rig: Rig | None) -> Source:
     """Make the source of a table of a recording's volume balance: volumes [L] since the first sample.
 
-    Without true flows, the volumes are fractions [%] of what the pump delivers in a minute.
+    Without true flows, the volumes are fractions [%] of what the pump delivers in a minute. The details hold the checks
+    of the channels as well, and `groups`: the columns of each chamber behind a servo valve, elsewhere one group.
     """
 
     def iter_parts() -> Iterator[tuple[Sequence[str], Mapping[str, Any], Array, Sequence[Array]]]:
-        curves = compute_flow_curves(read(), rig)
-        if curves is None:
-            raise UnreadableFile("its channels allow no balance of volumes: it needs pressures, position and pump flow")
-        duration = max(float(curves.t[-1] - curves.t[0]), 1e-9)
-        mean = float(np.abs(np.diff(curves.delivered)).sum()) / duration  # [m^3/s]
-        scale = 1.0 / (60.0 * LITRE_PER_MINUTE) if curves.states_flow else 100.0 / 60.0 / max(mean, 1e-30)
-        details = {
-            "unit": "L/min" if curves.states_flow else "% of the pump's flow",
-            "source": curves.source,
-            "blocks": np.round(curves.blocks, 4).tolist(),
-            "delay": curves.delay,
-            "offset": curves.offset,
-            "closure": _closure(curves),
+        recording = read()
+        balances = [curves for side in _SIDES if (curves := compute_flow_curves(recording, rig, side)) is not None]
+        first = balances[0] if balances else None
+        details: dict[str, Any] = {"checks": [_as_lists(check) for check in check_channels(recording, rig, first)]}
+        if first is None:
+            problem = "its channels allow no balance of volumes: it needs pressures, position and pump flow"
+            yield [], to_plain(details | {"groups": [], "problem": problem}), np.empty(0), []
+            return
+        duration = max(float(first.t[-1] - first.t[0]), 1e-9)
+        mean = float(np.abs(np.diff(first.delivered)).sum()) / duration  # [m^3/s]
+        scale = 1.0 / (60.0 * LITRE_PER_MINUTE) if first.states_flow else 100.0 / 60.0 / max(mean, 1e-30)
+        groups, columns = list[dict[str, Any]](), list[Array]()
+        for side, curves in zip(_SIDES, balances, strict=False):
+            names = [curves.source, *curves.parts]
+            moved_by = next((name for name in ("piston", "valve") if name in curves.parts), None)
+            group = {"names": names, "first": len(columns), "chamber": side if len(balances) > 1 else ""}
+            leaked = abs(float(scale * curves.parts["leakage"][-1])) if "leakage" in curves.parts else 0.0
+            groups.append(group | {"moved_by": moved_by, "closure": _closure(curves, moved_by), "leaked": leaked})
+            columns += [scale * values for values in (curves.delivered, *curves.parts.values())]
+        details |= {
+            "unit": "L/min" if first.states_flow else "% of the pump's flow",
+            "volume_unit": "L" if first.states_flow else "% of a minute's flow",
+            "blocks": np.round(first.blocks, 4).tolist(),
+            "groups": groups,
         }
-        names = [curves.source, *curves.parts]
-        yield (
-            names,
-            to_plain(details),
-            curves.t,
-            [scale * values for values in (curves.delivered, *curves.parts.values())],
-        )
+        yield [name for group in groups for name in group["names"]], to_plain(details), first.t, columns
 
     return iter_parts
 
 
-def _closure(curves: FlowCurves) -> float | None:
-    """Compute the range of the volume that does not move the piston, over that of the delivered one.
+def _closure(curves: FlowCurves, moved_by: str | None) -> float | None:
+    """Compute the range of what the part `moved_by` and the leakage leave, over that of the left side of the balance.
 
-    None behind a servo valve, where the piston is the only measured volume.
+    The part is the piston's volume or, behind a servo valve, that of the valve; None for a held load, without either.
     """
-    if "piston" not in curves.parts:
-        return None
     extent = float(np.ptp(curves.delivered))
-    return float(np.ptp(curves.delivered - curves.parts["piston"])) / extent if extent > 0.0 else None
+    if moved_by is None or not extent > 0.0:
+        return None
+    return float(np.ptp(curves.delivered - curves.parts[moved_by] - curves.parts.get("leakage", 0.0))) / extent
+
+
+def _as_lists(check: ChannelCheck) -> dict[str, Any]:
+    """Convert a check to plain values, its curves to lists of five digits."""
+    curves = [
+        curve._asdict() | {axis: [float(f"{value:.5g}") for value in getattr(curve, axis)] for axis in ("x", "y")}
+        for curve in check.curves
+    ]
+    return check._asdict() | {"curves": curves}
 
 
 def is_hidden(name: str) -> bool:

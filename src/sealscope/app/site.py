@@ -302,7 +302,7 @@ _READERS: dict[str, Callable[[Workbench, _Query], Any]] = {
     },
     "learnt": lambda bench, query: bench.learnt(query("machine")),
     "verdict": lambda bench, query: {"verdict": bench.verdict(query("machine"), query("file"))},
-    "trend": lambda bench, query: bench.trend(query("machine")),
+    "trend": lambda bench, query: bench.trend(query("machine"), recorded=query("kind") == "recorded"),
     "hold": lambda bench, query: {"results": bench.describe_hold(query("machine"), query("file"))},
     "limit": _say_limit,
     "script": lambda bench, query: write_script(bench, query("screen"), query("machine"), query("file")),

@@ -6,6 +6,7 @@ The page (`site`) asks an instance for plain values; `replay` uses one without a
 from __future__ import annotations
 
 import itertools
+import math
 import re
 import threading
 import time
@@ -16,6 +17,7 @@ from typing import Any
 
 from sealscope.app.jobs import Job, JobQueue
 from sealscope.app.logs import (
+    VERSION,
     balance_source,
     channels_source,
     columns_source,
@@ -37,6 +39,7 @@ from sealscope.app.session import (
     SessionMachine,
 )
 from sealscope.app.tables import MappedTable, Source, TableCache, mean_rates
+from sealscope.app.words import cover_duty, format_date, format_duty, format_length
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine, commission
 from sealscope.diagnosis.commissioned.machine_file import read_machine, write_machine
 from sealscope.diagnosis.diagnose import diagnose
@@ -58,7 +61,7 @@ from sealscope.reporting.schematic import build_circuit, draw_circuit
 from sealscope.reporting.trend.page import write_trend_page
 from sealscope.storage.folders import make_folder
 from sealscope.storage.plain_values import to_plain
-from sealscope.units import LITRE_PER_MINUTE, parse_quantity
+from sealscope.units import BAR, LITRE_PER_MINUTE, parse_quantity
 
 #: How often the folders of logs are listed anew [s].
 _LIST_S = 2.0
@@ -85,15 +88,13 @@ def areas_of(bore: str, rod: str | None, rods: str) -> tuple[str, ...]:
 
     Area = pi / 4 (bore^2 - rod^2) on a side with a rod.
     """
-    from math import pi
-
     diameter, inner = (
         parse_quantity(bore, "m", name="bore"),
         0.0 if rod is None else parse_quantity(rod, "m", name="rod"),
     )
     if not 0.0 <= inner < diameter:
         raise InputError(f"a rod must be thinner than the bore, got {rod} in {bore}")
-    areas = [0.25e6 * pi * (diameter**2 - (inner**2 if side in rods else 0.0)) for side in "AB"]
+    areas = [0.25e6 * math.pi * (diameter**2 - (inner**2 if side in rods else 0.0)) for side in "AB"]
     texts = [f"{area:.5g} mm^2" for area in areas]
     return (texts[0],) if texts[0] == texts[1] else tuple(texts)
 
@@ -167,7 +168,10 @@ class Workbench:
 
     def _set_row(self, key: str, row: dict[str, Any]) -> None:
         self.note_change()
-        self._rows[key] = row | {"version": self.version}
+        words = {"date": format_date(row)}
+        if row["state"] == "read":
+            words |= {"length": format_length(row["seconds"]), "duty_words": format_duty(row)}
+        self._rows[key] = row | words | {"version": self.version}
 
     def _describe(self, job: Job, keys: Sequence[str]) -> None:
         """Describe logs, one after the other."""
@@ -194,19 +198,17 @@ class Workbench:
             version = self.version
             rows = [row for row in self._rows.values() if row["version"] > since]
             keys = list(self._rows)
+            read = [row for row in self._rows.values() if row["state"] == "read"]
         return {
             "version": version,
             "folder": str(self.folder.folder),
-            "machines": [asdict(machine) | self._say_machine(machine) for machine in session.machine],
+            "machines": [asdict(machine) | {"cover": cover_duty(read, machine.healthy)} for machine in session.machine],
             "sources": list(session.sources),
             "keys": keys,
             "rows": rows,
             "problems": self._problems,
             "jobs": [job.as_dict() for queue in (self.reading, self.work) for job in queue.jobs()],
         }
-
-    def _say_machine(self, machine: SessionMachine) -> dict[str, Any]:
-        return {"known": machine.name in self._machines or self._file_of(machine).exists()}
 
     def open_paths(self, paths: Sequence[str]) -> None:
         """Add folders or logs by their paths, which are taken from the session's folder; ~ is the user's."""
@@ -380,7 +382,7 @@ class Workbench:
         """Open a table of a log: its "columns", the "channels" of a machine, or its "balance" of flows or "volumes"."""
         path = self.find_log(key)
         machine = self.folder.read().find_machine(name) if name else SessionMachine(name="machine")
-        stamp = f"{'balance' if kind == 'volumes' else kind}|{file_stamp(path)}"
+        stamp = f"{VERSION}|{'balance' if kind == 'volumes' else kind}|{file_stamp(path)}"
 
         def read() -> Recording:
             return read_for(machine, path)
@@ -412,8 +414,10 @@ class Workbench:
     ) -> dict[str, Any]:
         """Return a window of a table (`MappedTable.window`), of the flows in a balance as means, with its headings."""
         table = self.table(kind, key, name)
-        state: dict[str, Any] = {"names": table.names, "about": table.details, "complete": table.complete}
+        state: dict[str, Any] = {"names": table.names, "complete": table.complete}
         state |= {"error": table.error, "count": table.count}
+        if not indices:  # what is asked for once, before the first window
+            state["about"] = table.details
         if any(not 0 <= index < len(table.names) for index in indices):  # as of a map that has changed
             text = f"a column must be one of {len(table.names)}, got {max(indices)}"
             return {"t": [], "lines": [], "first": 0.0, "last": 0.0} | state | {"error": table.error or text}
@@ -426,7 +430,9 @@ class Workbench:
         machine = self.folder.read().find_machine(name)
         recording = read_for(machine, self.find_log(key))
         columns = recording.provenance.get("columns")
-        row = describe_recording(recording, Path(key).name)
+        row = describe_recording(recording, Path(key).name, with_places=True)
+        for finding in row["findings"]:
+            finding["places"] = finding["places"] or [t for t in [finding["t"]] if t is not None]
         row["units"] = {
             channel: recording.unit_in_log(channel) or recording.units[channel] for channel in recording.channels
         }
@@ -513,12 +519,21 @@ class Workbench:
         if machine is None:
             return {"known": False}
         summary = machine.summary
+        smallest, count, size, half = summary.smallest, len(machine.healthy), "not known", ""
+        if smallest is not None:
+            share = f"{100.0 * smallest.share:.2g} % of the pump’s flow"
+            size = share if smallest.lpm is None else f"{1000.0 * smallest.lpm:.2g} mL/min, {share}"
+            half = "More healthy days alone do not halve this: twice the load does."
+            if smallest.halved_by is not None:
+                half = f"{smallest.halved_by * count} healthy days instead of {count} would halve this."
         problems = {recording.file: list(recording.about.get("wrong", ())) for recording in machine.healthy}
         return {  # type: ignore[no-any-return]
             "known": True,
             "file": self._file_of(self.folder.read().find_machine(name)).name,
             "text": str(machine),
             "smallest": to_plain(summary.smallest),
+            "size": size,
+            "half": half,
             "count": len(machine.healthy),
             "problems": {file: texts for file, texts in problems.items() if texts},
             "left_out": list(machine.left_out),
@@ -648,35 +663,64 @@ class Workbench:
 
         return self.work.submit("estimate the trend", ", ".join(names), work)
 
-    def trend(self, name: str) -> dict[str, Any]:
-        """Return the trend of a machine and its recorded leaks as plain values; `known` is False without a trend."""
+    def trend(self, name: str, *, recorded: bool = False) -> dict[str, Any]:
+        """Return the trend of a machine as its screen draws it; `known` is False before it is estimated.
+
+        `recorded`: the leaks as the verdicts state them, in place of the estimates at reference oil and pressure.
+        Points with time, value, interval, bound and label; unit; the limit and what it is made of; the result in words.
+        """
         stated = self.folder.read().find_machine(name)
         with self._lock:
             result = self._trends.get(name)
             starts = {key: row.get("start_s") or row.get("changed_s") for key, row in self._rows.items()}
-        recorded = [
-            {"file": v.file, "start": starts.get(v.file), "verdict": v.verdict, "leak": v.leak_lpm}
-            | {"bound": v.bound_lpm}
-            for v in stated.verdicts
-        ]
-        if result is None:
-            return {"known": False, "recorded": recorded, "repairs": list(stated.repairs)}
-        points = [
-            {"file": p.file, "start": p.start, "value": p.value, "low": p.low, "high": p.high, "note": p.note}
-            for p in result.points
-        ]
-        figures: dict[str, Any] = {
-            "unit": result.unit,
-            "limit": result.limit,
-            "verdict": result.verdict,
-            "reason": result.reason,
-        }
-        figures |= {"next": result.next_check, "state": result.state, "pressure": result.pressure}
-        repairs = [*stated.repairs]
-        found = [p.start for p in result.repairs]
+        allowed, total, healthy = self._limit_of(stated), None, None
+        if result is not None and result.wear is not None and result.limit is not None:
+            total, healthy = result.limit, result.wear.healthy.value
+        unit = "L/min" if recorded or result is None else result.unit
+        limit, words = (allowed if recorded or result is None else total), ""
+        if healthy is not None and total is not None:
+            parts = f"{total:.3g} at reference pressure = {healthy:.3g} of the healthy days + {total - healthy:.3g}"
+            words = f"limit {limit:.3g}, the rise that is allowed: {parts}" if recorded else f"limit {parts} allowed"
+        points: list[dict[str, Any]] = []
+        if recorded:
+            for v in stated.verdicts:
+                size = v.verdict if v.bound_lpm is None else f"below {v.bound_lpm:.3g} L/min"
+                size = size if v.leak_lpm is None else f"{v.leak_lpm:.3g} L/min"
+                point = {
+                    "t": starts.get(v.file),
+                    "value": v.leak_lpm,
+                    "bound": v.bound_lpm,
+                    "leak": v.verdict == "leak",
+                }
+                points.append(point | {"label": f"{v.file}: {size}"})
+        elif result is not None:
+            pressure, leak_above = (
+                result.pressure,
+                total if result.verdict == "leak" and total is not None else math.inf,
+            )
+            unit += "" if pressure is None else f" at {pressure / BAR:.3g} bar"
+            points = [
+                {"t": p.start, "value": p.value, "low": p.low, "high": p.high, "bound": None}
+                | {"leak": p.low is not None and p.low > leak_above, "label": f"{p.file}: {p.value:.3g} {result.unit}"}
+                for p in result.points
+                if p.value is not None
+            ]
+        leaking = [Path(v.file).name for v in stated.verdicts if v.verdict == "leak"]
+        text = "Not estimated yet." if result is None else f"{result.verdict}: {result.reason}."
+        if leaking:
+            text = f"Judged a leak by itself: {', '.join(leaking)}; see Verdict. The trend compares means: {text}"
+        elif result is not None:
+            text += f" {result.next_check}"
+        found = [] if result is None else [p.start for p in result.repairs]
+        remarks = [] if result is None else [f"{p.file}: {p.note}" for p in result.points if p.note]
         return to_plain(  # type: ignore[no-any-return]
-            {"known": True, "points": points, "recorded": recorded, "repairs": repairs, "seen": found} | figures
+            {"known": result is not None, "unit": unit, "limit": limit, "limit_words": words, "points": points}
+            | {"words": text, "remarks": remarks, "repairs": list(stated.repairs), "seen": found}
         )
+
+    def _limit_of(self, stated: SessionMachine) -> float | None:
+        """Convert the stated repair limit of a machine to L/min; None without one, or if its area is not known."""
+        return None if stated.limit is None else self.limit_lpm(stated.limit, stated.name)["lpm"]
 
     def write_trend(self, name: str) -> str:
         """Write the page of a machine's trend; return its name."""

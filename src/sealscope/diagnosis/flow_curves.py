@@ -8,8 +8,9 @@ the workbench, which draws them beside the signals.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,8 @@ from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array, Recording
 
+#: Chamber in the name of a term, such as that of "compliance A over the stroke".
+_SIDE = re.compile(r"\b[AB]\b")
 #: Part of the balance that a term belongs to, by the kind of its coefficient; others are `other`.
 _PARTS = {"motion": "piston", "compliance": "compression", "air": "compression", "edge": "valve", "piston": "leakage"}
 
@@ -49,8 +52,9 @@ class FlowCurves(NamedTuple):
     source : {"pump", "piston", "creep"}
         Which of these it is.
     parts : mapping of str to array of float, shape (n,)
-        Volumes of the terms since the first sample [m^3]: "piston", "valve", "compression", "leakage" and "other",
-        as far as the balance has them, and "residual". Their sum is `delivered`.
+        Volumes of the terms since the first sample [m^3]: "piston", "valve", "compression A", "compression B",
+        "compression" of the oil elsewhere, "leakage" and "other", as far as the balance has them, and "residual". Their
+        sum is `delivered`.
     blocks : array of float, shape (k, 3)
         Begin and end [s] of each block, and the fraction of the information on the leakage that it carries.
     states_flow : bool
@@ -71,17 +75,23 @@ class FlowCurves(NamedTuple):
     offset: float
 
 
-def compute_flow_curves(recording: Recording, rig: Rig | None = None) -> FlowCurves | None:
+def compute_flow_curves(
+    recording: Recording, rig: Rig | None = None, chamber: Literal["A", "B"] = "A"
+) -> FlowCurves | None:
     """Compute the volume balance of a recording as curves over time; None if its channels allow no balance.
 
-    `rig` states the machine's sizes, as for `sealscope.diagnose`.
+    `rig` states the machine's sizes, as for `sealscope.diagnose`. Behind a servo valve each `chamber` has a balance;
+    elsewhere there is one of both, which is that of "A", and None for "B".
     """
     part = inspect_recording(recording).part
     detector = VolumeBalance(assumed_rig(rig, recording)[0])
     with limit_threads(), np.errstate(all="ignore"):
         if detector.usable(part) is not None or (balance := detector.balance(part)) is None:
             return None
-        equation, roles, blocks = balance.equations[0], balance.columns[0], balance.blocks
+        number, by_piston = "AB".index(chamber), len(balance.equations) > 1
+        if number >= len(balance.equations):
+            return None
+        equation, roles, blocks = balance.equations[number], balance.columns[number], balance.blocks
         needed = {name for term in equation.terms for name in term.needs} | set(part.channels)
         samples = bridged_samples(part, needed)
         samples = {name: values for name, values in samples.items() if name not in (HOLE, CLIPPED_DIFFERENCE)}
@@ -98,7 +108,7 @@ def compute_flow_curves(recording: Recording, rig: Rig | None = None) -> FlowCur
         )
         history = balance.total_history.mean
         fitted = [column for column in roles.nuisance if column != roles.leak]
-        gram = blocks.gram[:, 0]
+        gram = blocks.gram[:, number]
         matrix = gram[:, fitted][:, :, fitted].sum(axis=0)
         right = (gram[:, fitted, roles.left] - gram[:, fitted, roles.leak] * history[:, None]).sum(axis=0)
         coefficients = dict(zip(fitted, solve(matrix, right), strict=True))
@@ -111,6 +121,10 @@ def compute_flow_curves(recording: Recording, rig: Rig | None = None) -> FlowCur
             else:
                 continue
             name = _PARTS.get(term.drift, "other")
+            if name == "compression" and (side := _SIDE.search(term.name)):
+                name = f"compression {side[0]}"
+            elif name == "other" and by_piston:  # what passes a servo valve at its null
+                name = "valve"
             increments[name] = increments.get(name, 0.0) + np.nan_to_num(values)
         left = np.nan_to_num(equation.left(signals))
         explained = np.sum(list(increments.values()), axis=0)
@@ -122,7 +136,6 @@ def compute_flow_curves(recording: Recording, rig: Rig | None = None) -> FlowCur
         information = np.maximum(balance.leak.precision.sum(axis=0), 0.0)
         running = balance.running_blocks
         shares = information / max(float(information.sum()), np.finfo(float).tiny)
-        by_piston = len(balance.equations) > 1
         return FlowCurves(
             part.t,
             _accumulate(scale * left),

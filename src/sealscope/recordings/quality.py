@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from itertools import count
 from typing import Any, Literal, NamedTuple
@@ -32,6 +32,7 @@ _CLOCK, _HUM, _CREEP, _RAIL, _SENSOR_LIMITS, _GAPS = (
 )  # fmt: skip
 _LONGEST_TRANSFORM = 2**17  # most values of a Fourier transform, which stays in the processor's cache
 _MAX_TEXT = 400  # longest text taken from the provenance of a file
+_MAX_PLACES = 200  # most places that a finding lists
 #: Intervals between these numbers of sampling steps are regular; a longer one is a gap, unless a logger polls.
 _MIN_STEP, _MAX_STEP = _CLOCK.regular
 
@@ -52,6 +53,14 @@ class Finding:
     count: int  # number of samples or intervals
     first_t: float | None  # time of the first [s], None if it has none
     text: str  # description in words
+    #: Times of the first places at which it was found [s], at most 200; empty for a defect of the whole recording.
+    places: tuple[float, ...] = field(default=(), compare=False, repr=False)
+
+
+def locate_rows(t: Array, rows: NDArray[Any]) -> tuple[float, ...]:
+    """Return the times [s] of the first of the `rows` for `Finding.places`; `t` (n,): times of all rows."""
+    times = t[rows[:_MAX_PLACES]]
+    return tuple(times[np.isfinite(times)].tolist())
 
 
 @checked_call
@@ -99,11 +108,17 @@ def weigh_defects(count: float, total: int) -> Severity:
 
 
 def _make_finding(
-    recording: Recording, code: str, channel: str | None, count: int, first: int, text: str, severity: Severity
-) -> Finding:
-    """Make a finding on `count` samples; its time is that of the sample with index `first`, None if unknown."""
+    recording: Recording, code: str, channel: str | None, count: int, rows: NDArray[Any] | int, text: str,
+    severity: Severity,
+) -> Finding:  # fmt: skip
+    """Make a finding on `count` samples, at the `rows` (k,), or of the whole recording from a row on.
+
+    Its time is that of the first row, None if that is unknown.
+    """
+    first = rows if isinstance(rows, int) else int(rows[0])
     t = float(recording.t[first]) if first < recording.t.size else np.nan
-    return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text)
+    places = () if isinstance(rows, int) else locate_rows(recording.t, rows)
+    return Finding(code, severity, channel, count, t if np.isfinite(t) else None, text, places)
 
 
 def _reading_findings(recording: Recording) -> list[Finding]:
@@ -138,7 +153,7 @@ def _time_findings(recording: Recording) -> list[Finding]:
     def add(code: str, indices: NDArray[Any], text: str, severity: Severity = "warning") -> None:
         """Add a finding on the samples or intervals `indices`, if there are any."""
         if indices.size:
-            findings.append(_make_finding(recording, code, None, indices.size, int(indices[0]), text, severity))
+            findings.append(_make_finding(recording, code, None, indices.size, indices, text, severity))
 
     if len(recording) < SHORTEST:
         text = f"{format_count(len(recording), 'sample')}; the slowest detail needs {SHORTEST}"
@@ -237,9 +252,9 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
     findings = list[Finding]()
     format_value = partial(recording.format_value, name)
 
-    def add(code: str, count: int, first: int, text: str, severity: Severity = "warning") -> None:
-        """Add a finding on `count` samples, the first at index `first`."""
-        findings.append(_make_finding(recording, code, name, count, first, f"{name}: {text}", severity))
+    def add(code: str, count: int, rows: NDArray[Any] | int, text: str, severity: Severity = "warning") -> None:
+        """Add a finding on `count` samples (`_make_finding`)."""
+        findings.append(_make_finding(recording, code, name, count, rows, f"{name}: {text}", severity))
 
     unit = recording.units[name]
     is_pressure = name.startswith("p_")
@@ -251,56 +266,55 @@ def _channel_findings(recording: Recording, name: str, values: Array) -> list[Fi
         add(*missing, weigh_defects(missing[1], values.size))
     infinite = np.flatnonzero(np.isinf(values))
     if infinite.size:
-        add("infinite", infinite.size, int(infinite[0]), f"{format_count(infinite.size, 'infinite sample')}")
+        add("infinite", infinite.size, infinite, f"{format_count(infinite.size, 'infinite sample')}")
     is_impossible = flag_impossible(values, unit)
     impossible = np.flatnonzero(is_impossible)
     if impossible.size:
         first = format_value(values[impossible[0]])
         text = f"{format_count(impossible.size, 'sample')} beyond what any sensor reads, first {first}"
-        add("impossible", impossible.size, int(impossible[0]), text)
+        add("impossible", impossible.size, impossible, text)
     is_present = np.isfinite(values) & ~is_impossible
     is_complete = bool(is_present.all())
     readings = values if is_complete else values[is_present]
 
-    def row_of(index: int) -> int:
-        """Find the row of the reading with this index."""
-        return index if is_complete else int(np.flatnonzero(is_present)[index])
+    def rows_of(indices: NDArray[np.intp]) -> NDArray[np.intp]:
+        """Find the rows of the readings with these indices."""
+        return indices if is_complete else np.flatnonzero(is_present)[indices]
 
     if readings.size < 2:
         return findings
     if is_constant(readings):
         # a flow meter on a closed bypass reads one value; a pressure never does
         text = f"is constant at {format_value(readings[0])}"
-        add("constant", readings.size, row_of(0), text, "note" if may_rest else "warning")
+        add("constant", readings.size, int(np.argmax(is_present)), text, "note" if may_rest else "warning")
         return findings
     stuck = find_stuck(readings)
     may_be_clipped = is_pressure or name == "q_leak"  # q_leak at the high end only: without flow it reads 0
     for rail in find_rails(readings, unit, stuck, low_end=is_pressure) if may_be_clipped else ():
         n_clipped = format_count(rail.samples, "sample")
         text = f"{n_clipped} at the {rail.side} end, {format_value(rail.value)}: clipped"
-        add("clipped", rail.samples, row_of(rail.first), text)
+        add("clipped", rail.samples, rows_of(rail.first), text)
     if is_pressure:  # runs at the smallest or largest value are reported as clipped
         stuck = stuck[(readings[stuck[:, 0]] > readings.min()) & (readings[stuck[:, 0]] < readings.max())]
     elif name == "omega" or name in METERS:  # a pump or a meter that stands reads 0 without noise
         stuck = stuck[readings[stuck[:, 0]] != 0.0]
     if stuck.size and not may_rest:
-        start, length = map(int, stuck[0])
         times = _format_repetitions(len(stuck))
-        text = f"is stuck {times} while it should move, first for {length / recording.rate:g} s"
+        text = f"is stuck {times} while it should move, first for {int(stuck[0, 1]) / recording.rate:g} s"
         n_stuck = int(stuck[:, 1].sum())
-        add("stuck", n_stuck, row_of(start), text, weigh_defects(n_stuck, values.size))
+        add("stuck", n_stuck, rows_of(stuck[:, 0]), text, weigh_defects(n_stuck, values.size))
     # the spectrum of a channel with many missing samples would be wrong
     for line in find_hum(readings, recording.rate) if readings.size > 0.9 * values.size else ():
         text = f"mains hum of {line.frequency:g} Hz, amplitude {format_value(line.amplitude, 3, is_span=True)}"
         text += f", {100 * line.power_fraction:.2g} % of the power over 20 Hz"
         text += ": is the sensor connected?" if line.power_fraction > _HUM.alone else ""
         severity: Severity = "warning" if line.power_fraction > _HUM.loud else "note"
-        add("mains_hum", readings.size, row_of(0), text, severity)
+        add("mains_hum", readings.size, int(np.argmax(is_present)), text, severity)
     return findings
 
 
-def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] | None:
-    """Describe the missing samples of a channel (n,): (code, number, first index, text); None if there are none.
+def _describe_missing(values: Array, rate: float) -> tuple[str, int, NDArray[Any] | int, str] | None:
+    """Describe the missing samples of a channel (n,): (code, number, rows, text); None if there are none.
 
     The code is "mixed_rate" for a channel with a value on every k-th row only, else "missing".
     """
@@ -308,15 +322,15 @@ def _describe_missing(values: Array, rate: float) -> tuple[str, int, int, str] |
     if not is_missing.any():
         return None
     runs = find_runs(is_missing)
-    n_missing, first = int(np.count_nonzero(is_missing)), int(runs[0, 0])
+    n_missing = int(np.count_nonzero(is_missing))
     period = _row_period(np.flatnonzero(~is_missing))
     if period:
         text = f"has a value on every {_format_ordinal(period)} row only ({rate / period:g} Hz among {rate:g} Hz)"
-        return "mixed_rate", n_missing, first, text
+        return "mixed_rate", n_missing, int(runs[0, 0]), text
     if n_missing == values.size:
         return "missing", n_missing, 0, "has no values at all"
     text = f"{format_count(n_missing, 'sample')} missing in {format_count(len(runs), 'stretch')}"
-    return "missing", n_missing, first, f"{text}, the longest {runs[:, 1].max() / rate:g} s"
+    return "missing", n_missing, runs[:, 0], f"{text}, the longest {runs[:, 1].max() / rate:g} s"
 
 
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
@@ -367,7 +381,7 @@ class Rail(NamedTuple):
     side: str  # "low" or "high"
     value: float
     samples: int  # number of samples with this value
-    first: int  # index of the first of them
+    first: NDArray[np.intp]  # index of the first sample of each run of them, (k,)
 
 
 def is_mostly_clipped(values: Array, unit: str) -> bool:
@@ -414,7 +428,7 @@ def find_rails(values: Array, unit: str, stuck: NDArray[np.intp] | None = None, 
         is_crowded = counts[index] >= _RAIL.samples and counts[index] > _RAIL.crowd * counts[nearest].max()
         is_entered_by_jump = length >= 3 and jump > (_RAIL.long_jump if length >= _RAIL.run else _RAIL.jump) * quantum
         if (is_crowded and is_entered_by_jump) or (stuck_values == distinct[index]).any():
-            rails.append(Rail(side, float(distinct[index]), int(counts[index]), int(runs[0, 0])))
+            rails.append(Rail(side, float(distinct[index]), int(counts[index]), runs[:, 0]))
     return rails
 
 

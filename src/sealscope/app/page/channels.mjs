@@ -1,12 +1,10 @@
 // The screen of the channels: every column drawn, given a place in the machine's drawing, and checked.
-import { app, ask, attempt, drawn, ensureMachine, fillSelect, go, machineNow, make, miniature, refresh, rowsRead, tell } from "./main.mjs";
-import { Linked, Trace } from "./charts.mjs";
+import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, miniature, refresh, tell } from "./main.mjs";
+import { Linked, Trace, checkPlot, settled } from "./charts.mjs";
 let link = new Linked();
 let columns = [];
 let proposal = { map: {}, groups: [], problem: "" };
-let held = null;
-let seen = { channels: [] };
-let drawnFor = "";
+let held = null, seen = { channels: [] }, drawnFor = "", counted = "";
 
 export async function show() {
   const file = app.file;
@@ -15,33 +13,39 @@ export async function show() {
   if (!file || !app.rows.has(file)) { byId("channel-state").textContent = "Open a log first."; return; }
   const machine = await ensureMachine();
   fillSizes(machine);
-  byId("channel-state").textContent = "Reading …";
-  await Promise.all([loadColumns(file, machine), loadProposal(file, machine)]);
+  counted = "reading …";
+  update();
+  const query = { file, machine: machine.name };
+  const [read, proposed] = await Promise.all([loadColumns(query), ask("proposal", query).catch((error) => ({ map: {}, groups: [], problem: error.message }))]);
+  if (app.file !== file || app.machine !== machine.name) return; // another log was chosen meanwhile
+  [columns, proposal] = [read, proposed];
+  showGroups();
   showColumns();
   await showMap();
 }
 
-export function update() { fillSelect(byId("channel-file"), app.keys.map((key) => [key, app.rows.get(key)?.name || key]), app.file); }
-
-async function loadColumns(file, machine) {
-  const query = { table: "columns", file, machine: machine.name, columns: "", pixels: 150 };
-  const first = await ask("window", query);
-  columns = [];
-  if (!first.names.length) throw new Error(first.error || "no columns could be read");
-  const data = await ask("window", { ...query, columns: first.names.map((name, k) => k).join(",") });
-  columns = data.names.map((name, index) => ({ name, index, line: data.lines[index] }));
-  byId("channel-state").textContent = data.complete ? `${data.count} rows, ${columns.length} columns` : `${data.count} rows so far`;
-  if (!data.complete && !data.error) {
-    setTimeout(async () => {
-      if (app.file !== file || app.screen !== "channels") return;
-      await loadColumns(file, machine);
-      showColumns();
-    }, 500);
-  }
+export function update() {
+  fillSelect(byId("channel-file"), app.keys.map((key) => [key, app.rows.get(key)?.name || key]), app.file);
+  byId("channel-state").textContent = `${app.rows.get(app.file)?.date || ""}, ${counted}`;
 }
 
-async function loadProposal(file, machine) {
-  proposal = await ask("proposal", { file, machine: machine.name }).catch((error) => ({ map: {}, groups: [], problem: error.message }));
+async function loadColumns({ file, machine }) {
+  const query = { table: "columns", file, machine, pixels: 150 };
+  const first = await ask("window", { ...query, columns: "" });
+  if (!first.names.length) throw new Error(first.error || "no columns could be read");
+  const data = await ask("window", { ...query, columns: first.names.map((name, k) => k).join(",") });
+  counted = `${data.count} rows${data.complete ? `, ${data.names.length} columns` : " so far"}`;
+  update();
+  if (!data.complete && !data.error) {
+    setTimeout(async () => {
+      const isShown = () => app.file === file && app.screen === "channels", more = isShown() && (await loadColumns({ file, machine }));
+      if (more && isShown()) { columns = more; showColumns(); }
+    }, 500);
+  }
+  return data.names.map((name, index) => ({ name, index, line: data.lines[index] }));
+}
+
+function showGroups() {
   const others = proposal.groups.filter((group) => !app.machines.some((known) => known.map.group === group));
   byId("groups").hidden = !others.length;
   byId("groups").replaceChildren(
@@ -181,36 +185,41 @@ async function draw() {
   link = new Linked();
   const place = byId("check-charts");
   place.replaceChildren();
+  byId("compared").replaceChildren();
   const base = { file: app.file, machine: machine.name };
   const head = await ask("window", { ...base, table: "channels", columns: "", pixels: 10 });
+  if (now !== drawnFor) return;
   const groups = {};
   head.names.forEach((name, column) => (groups[/\[(.*)\]$/.exec(name)?.[1] || ""] ||= []).push({ name: bare(name), column }));
   const tones = { p_A: "--side-a", p_B: "--side-b", p_1: "--d1", p_2: "--d4", x: "--piston", omega: "--d3", theta: "--d2", u: "--d4", T_oil: "--oil" };
-  const marks = seen.findings.filter((finding) => finding.t !== null).map((finding) => ({ t: finding.t, label: finding.text.slice(0, 40), channel: finding.channel }));
+  const marks = seen.findings.flatMap((finding) => finding.places.map((t, k) => ({ t, label: k ? "" : finding.text.slice(0, 40), channel: finding.channel })));
   const query = (table, wanted) => (begin, end, pixels) => ask("window", { ...base, table, columns: wanted.join(","), pixels, ...(begin === null ? {} : { from: begin, to: end }) });
-  const slot = make("div");
-  place.append(slot);
+  const volumes = make("div"), checks = make("div", { class: "checks-drawn" }, make("p", { class: "quiet", text: "Comparing the channels …" }));
+  place.append(checks, volumes);
   for (const [unit, members] of Object.entries(groups)) {
     const lines = members.map((member, k) => ({ name: member.name, colour: tones[member.name] || "--ink", column: k }));
     new Trace(place, link, { title: members.map((member) => member.name).join(", "), unit, lines, fetch: query("channels", members.map((member) => member.column)), marks: marks.filter((mark) => members.some((member) => member.name === mark.channel) || mark.channel === null), height: 150 });
   }
   if (!head.names.length) place.append(make("p", { class: "quiet", text: head.error || "Nothing to draw." }));
+  const list = byId("compared"), say = (text, kind) => list.append(make("li", { class: kind || "fine", text }));
   try {
-    let volumes = { names: [], error: "" };
-    while (!volumes.complete && !volumes.error && drawnFor === now) {
-      volumes = await ask("window", { ...base, table: "volumes", columns: "", pixels: 10 });
-      if (!volumes.complete) await new Promise((later) => setTimeout(later, 400));
-    }
+    const { about, error } = await settled({ ...base, table: "balance" }, () => drawnFor === now);
     if (drawnFor !== now) return;
-    if (volumes.names.length && volumes.about.closure !== undefined) {
-      const piston = volumes.names.indexOf("piston");
-      const lines = [{ name: volumes.names[0], colour: "--total", column: 0, width: 2 }, ...(piston > 0 ? [{ name: "piston", colour: "--side-b", column: 1, dash: [6, 4] }] : [])];
-      const unit = volumes.about.unit.startsWith("L") ? "L" : "% of a minute’s flow";
-      byId("checks").append(make("li", { class: volumes.about.closure < 0.05 ? "fine" : "warning", text: `Volumes: what the ${volumes.names[0]} delivers and what moves the piston close within ${Number((100 * volumes.about.closure).toPrecision(2))} % of the largest volume.` }));
-      if (volumes.about.delay) byId("checks").append(make("li", { text: `Delay: the position lags the flow by ${Number((1000 * volumes.about.delay.value).toPrecision(2))} ms.` }));
-      new Trace(slot, link, { title: "Volume of the pump against that of the piston: they must close", unit, lines, fetch: query("volumes", piston > 0 ? [0, piston] : [0]), height: 200 });
-    } else if (volumes.error) byId("checks").append(make("li", { class: "warning", text: volumes.error }));
-  } catch (error) { byId("checks").append(make("li", { class: "warning", text: error.message })); }
+    checks.replaceChildren();
+    if (error || about.problem) say(error || about.problem, "warning");
+    for (const check of about.checks || []) {
+      const plot = checkPlot(check);
+      if (plot) checks.append(plot);
+      if (!plot || check.severity) say(check.text, check.severity);
+    }
+    for (const { chamber, names, first, moved_by: moved, closure, leaked } of about.groups || []) {
+      if (closure === null) continue;
+      const where = chamber ? ` of chamber ${chamber}` : "", title = `Volume${where}: ${names[0]} and ${moved} must close`;
+      say(`${title}; they do within ${Number((100 * closure).toPrecision(2))} % of the largest volume, beside ${litres(leaked)} ${about.volume_unit} that leaks.`, closure < 0.05 ? "fine" : "warning");
+      const lines = [{ name: names[0], colour: "--total", column: 0, width: 2 }, { name: moved, colour: "--side-b", column: 1, dash: [6, 4] }];
+      new Trace(volumes, link, { title, unit: about.volume_unit, lines, fetch: query("volumes", [first, first + names.indexOf(moved)]), height: 200 });
+    }
+  } catch (error) { say(error.message, "warning"); }
 }
 
 function fillSizes(machine) {
@@ -218,6 +227,7 @@ function fillSizes(machine) {
   for (const name of ["name", "bore", "rod", "rods", "displacement", "limit", "rate"]) if (document.activeElement !== fields[name]) fields[name].value = machine[name] ?? "";
   [fields.area_a.value, fields.area_b.value] = [machine.area[0] || "", machine.area[1] || ""];
 }
+byId("channels-done").addEventListener("click", () => go("healthy"));
 byId("channel-file").addEventListener("change", (event) => go("channels", event.target.value));
 byId("sizes").addEventListener("submit", (event) => event.preventDefault());
 byId("sizes").addEventListener("change", async (event) => {

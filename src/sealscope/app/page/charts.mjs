@@ -1,18 +1,26 @@
 // Charts over time: a labelled figure whose window is asked of the server, with a cursor by arrow keys, a spoken
 // reading and a table of what is seen; and a plot of single results over dates.
-import { make, drawn } from "./main.mjs";
+import { ask, make, drawn } from "./main.mjs";
 const digits = (value) => (value === null || value === undefined || Number.isNaN(value) ? "–" : String(Number(value.toPrecision(4))).replace("-", "−"));
 const seconds = (t) => `${Number(t.toFixed(4))} s`;
+function keyOf(name, tone, dash) {
+  const sample = make("i");
+  sample.style.borderTopColor = colour(tone);
+  if (dash) sample.style.borderTopStyle = dash === "dot" ? "dotted" : "dashed";
+  return make("span", { class: "key" }, sample, make("span", { text: name }));
+}
+export const tableOf = (heads, rows) => make("table", {}, make("thead", {}, make("tr", {}, ...heads.map((text) => make("th", { scope: "col", text })))), make("tbody", {}, ...rows.map((row) => make("tr", {}, ...row.map((text) => make("td", { text }))))));
+// the head of a table once it is filled, or as soon as the page shows something else
+export async function settled(query, isWanted) {
+  for (;;) {
+    const head = await ask("window", { ...query, columns: "", pixels: 10 });
+    if (head.complete || head.error || !isWanted()) return head;
+    await new Promise((later) => setTimeout(later, 300));
+  }
+}
 // charts whose time axes move together
 export class Linked {
-  constructor() {
-    this.charts = [];
-    this.begin = null;
-    this.end = null;
-    this.first = 0;
-    this.last = 1;
-    this.waiting = 0;
-  }
+  constructor(span) { Object.assign(this, { charts: [], begin: null, end: null, first: 0, last: 1, waiting: 0 }, span); }
   move(begin, end) {
     const shortest = Math.max(1e-6, (this.last - this.first) * 1e-9);
     const length = Math.min(Math.max(end - begin, shortest), this.last - this.first);
@@ -88,7 +96,7 @@ export class Trace {
           height: options.height || 190,
           legend: { show: false },
           scales: { x: { time: false, range: () => [link.begin, link.end] }, y: { range: (plot, low, high) => (low === null ? [0, 1] : uPlot.rangeNum(low, high, 0.06, true)) } },
-          axes: [{ ...axis, size: 28, values: (plot, at) => at.map(seconds) }, { ...axis, size: 62, values: (plot, at) => at.map(digits) }],
+          axes: [{ ...axis, size: 28, values: (plot, at) => at.map(seconds) }, { ...axis, size: 54, space: 26, label: options.unit, labelSize: 18, labelFont: "12px system-ui", values: (plot, at) => at.map(digits) }],
           series: [{}, ...options.lines.map((line) => ({ label: line.name, stroke: colour(line.colour), width: line.width || 1.2, dash: line.dash, spanGaps: false, points: { show: false } }))],
           cursor: { sync: { key: "evidence", scales: ["x", null] }, drag: { x: true, y: false, setScale: false } },
           hooks: {
@@ -106,12 +114,7 @@ export class Trace {
         rows,
         this.box,
       );
-      this.key.replaceChildren(...options.lines.map((line) => {
-        const sample = make("i");
-        sample.style.borderTopColor = colour(line.colour);
-        if (line.dash) sample.style.borderTopStyle = "dashed";
-        return make("span", { class: "key" }, sample, make("span", { text: line.name }));
-      }));
+      this.key.replaceChildren(...options.lines.map((line) => keyOf(line.name, line.colour, line.dash)));
     }
     this.fillTable();
   }
@@ -195,10 +198,8 @@ export class Trace {
     if (!this.table.open || !this.data) return;
     const { t, lines } = this.data;
     const step = Math.max(1, Math.ceil(t.length / 200));
-    const head = make("tr", {}, make("th", { scope: "col", text: "t [s]" }), ...this.options.lines.map((line) => make("th", { scope: "col", text: `${line.name} [${this.options.unit}]` })));
-    const body = [];
-    for (let k = 0; k < t.length; k += step) body.push(make("tr", {}, make("td", { text: digits(t[k]) }), ...this.options.lines.map((line) => make("td", { text: digits(lines[line.column][k]) }))));
-    this.table.lastChild.replaceChildren(make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
+    const rows = t.map((value, k) => [value, ...this.options.lines.map((line) => lines[line.column][k])]).filter((row, k) => k % step === 0);
+    this.table.lastChild.replaceChildren(tableOf(["t [s]", ...this.options.lines.map((line) => `${line.name} [${this.options.unit}]`)], rows.map((row) => row.map(digits))));
   }
   resize() {
     clearTimeout(this.sizing);
@@ -214,35 +215,77 @@ export class Trace {
     this.figure.remove();
   }
 }
-// single results over dates; points: {t, value, low, high, bound, label, leak, chosen, go}; options: title, unit, limit,
-// log, join, repairs, lines of several machines by `series`
-export function dotPlot(points, options) {
-  const width = Math.max(330, Math.min(1400, document.querySelector("main").clientWidth - 34)), height = width < 600 ? 220 : 210, left = 62, right = 14, top = 14, bottom = 34;
-  const known = points.filter((point) => point.t !== null && point.t !== undefined && (point.value ?? point.bound) !== null);
-  const svg = drawn("svg", { class: "dots", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `${options.title}, ${options.unit}` });
-  if (!known.length) return make("p", { class: "quiet", text: options.empty || "Nothing to draw yet." });
-  const times = [...known.map((point) => point.t), ...(options.repairs || [])];
-  const margin = (Math.max(...times) - Math.min(...times)) * 0.04 || 43200;
-  const [begin, end] = [Math.min(...times) - margin, Math.max(...times) + margin];
-  const levels = known.flatMap((point) => [point.value, point.high, point.bound].filter((value) => value !== null && value !== undefined));
-  const limit = options.limit ?? null;
-  const highest = Math.max(...levels, limit ?? 0, 1e-9) * 1.12;
-  const positive = levels.filter((value) => value > 0);
-  const lowest = options.log ? Math.min(...(positive.length ? positive : [highest / 100]), limit || highest) / 2 : Math.min(0, ...known.map((point) => point.low ?? 0));
-  const x = (t) => left + ((t - begin) / (end - begin)) * (width - left - right);
-  const scale = (value) => (options.log ? Math.log(Math.max(value, lowest) / lowest) / Math.log(highest / lowest) : (value - lowest) / (highest - lowest));
-  const y = (value) => height - bottom - scale(value) * (height - top - bottom);
-  const text = (value, at, down, anchor, kind) => {
-    const made = drawn("text", { x: at, y: down, "text-anchor": anchor, class: kind });
-    made.textContent = value;
-    return made;
+// the frame of a drawing: its figure, axes with units, and the places of values
+function frame(title, size, [x0, x1], [y0, y1], unit, log, dates) {
+  const [width, height] = size, left = 62, right = width - 14, top = 20, bottom = height - 34;
+  const svg = drawn("svg", { class: "dots", viewBox: `0 0 ${width} ${height}`, role: "group", "aria-label": `${title}, ${unit}` });
+  const x = (value) => left + ((value - x0) / (x1 - x0 || 1)) * (right - left);
+  const y = (value) => bottom - (log ? Math.log(Math.max(value, y0) / y0) / Math.log(y1 / y0) : (value - y0) / (y1 - y0 || 1)) * (bottom - top);
+  const write = (words, at, down, anchor, kind) => { const made = drawn("text", { x: at, y: down, "text-anchor": anchor, class: kind }); made.textContent = words; svg.append(made); };
+  const ticks = (low, high) => { // whole multiples of 1, 2 or 5 times a power of ten
+    const least = (high - low || 1) / 6, power = 10 ** Math.floor(Math.log10(least)), step = [1, 2, 5, 10].map((factor) => factor * power).find((value) => value >= least * 0.999);
+    return Array.from({ length: 9 }, (none, k) => Number(((Math.ceil(low / step - 1e-9) + k) * step).toPrecision(12))).filter((value) => value <= high + 1e-9 * step);
   };
-  const ticks = options.log ? [0, 0.25, 0.5, 0.75, 1].map((share) => lowest * (highest / lowest) ** share) : [0, 0.25, 0.5, 0.75, 1].map((share) => lowest + share * (highest - lowest));
-  for (const tick of ticks) svg.append(drawn("path", { class: "axis", d: `M${left} ${y(tick)}H${width - right}` }), text(Math.abs(tick) < 0.004 * highest && !options.log ? "0" : digits(Number(tick.toPrecision(2))), left - 6, y(tick) + 4, "end"));
-  for (const share of [0, 0.5, 1]) svg.append(text(isoTime(begin + share * (end - begin), true).slice(0, 10), left + share * (width - left - right), height - 10, ["start", "middle", "end"][share * 2]));
-  svg.append(text(options.unit, left, 11, "start"));
-  if (limit !== null) svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${width - right}` }), text(`limit ${digits(limit)}`, left + 6, y(limit) - 5, "start", "limit-text"));
-  for (const t of options.repairs || []) svg.append(drawn("path", { class: "repair", d: `M${x(t)} ${top}V${height - bottom}` }), text("repair", x(t) + 4, top + 10, "start"));
+  for (const level of log ? [0, 0.25, 0.5, 0.75, 1].map((share) => Number((y0 * (y1 / y0) ** share).toPrecision(2))) : ticks(y0, y1)) {
+    svg.append(drawn("path", { class: "axis", d: `M${left} ${y(level)}H${right}` }));
+    write(digits(level), left - 6, y(level) + 4, "end");
+  }
+  for (const value of dates ? [x0, 0.5 * (x0 + x1), x1] : ticks(x0, x1)) write(dates ? isoTime(value, true).slice(0, 10) : digits(value), x(value), bottom + 16, !dates || value !== x0 && value !== x1 ? "middle" : value === x0 ? "start" : "end");
+  write(unit, left, 12, "start");
+  const keys = make("span", { class: "keys" }), caption = make("figcaption", {}, make("span", { text: title }), keys);
+  return { svg, x, y, write, keys, left, right, top, bottom, figure: make("figure", { class: "trace" }, caption, svg) };
+}
+const TONES = { out: "--side-a", "mean out": "--side-a", in: "--side-b", "mean in": "--side-b", samples: "--tone", proportional: "--quiet", "by the stated area A": "--d1", "by the stated area B": "--d4", "samples at rest": "--tone" };
+const span = (values, margin) => { const [low, high] = [Math.min(...values), Math.max(...values)], more = margin * (high - low || Math.abs(high) || 1); return [low - more, high + more]; };
+// one of the checks of the channels: curves and clouds of points over each other; arrow keys read the curves
+export function checkPlot(check) {
+  const rows = check.curves.flatMap((curve) => curve.x.map((value, k) => [value, curve.y[k]])).filter(([a, b]) => a !== null && b !== null);
+  if (!rows.length) return "";
+  const { svg, x, y, write, keys, figure, left, right, top, bottom } = frame(check.title, [560, 280], span(rows.map(([a]) => a), 0.02), span(rows.map(([, b]) => b), 0.06), check.y);
+  write(check.x, right, bottom + 31, "end");
+  const inside = (at, low, high) => at >= low && at <= high;
+  if (inside(y(0), top, bottom)) svg.append(drawn("path", { class: "zero", d: `M${left} ${y(0)}H${right}` }));
+  if (inside(x(0), left, right)) svg.append(drawn("path", { class: "zero", d: `M${x(0)} ${top}V${bottom}` }));
+  for (const curve of [...check.curves].sort((one, other) => one.is_cloud - other.is_cloud)) {
+    let path = "";
+    curve.x.forEach((value, k) => { if (value !== null && curve.y[k] !== null) path += `${curve.is_cloud || !path || curve.y[k - 1] === null ? "M" : "L"}${x(value).toFixed(1)} ${y(curve.y[k]).toFixed(1)}${curve.is_cloud ? "h0" : ""}`; });
+    const tone = TONES[curve.name] || "--leak", drawing = drawn("path", { class: curve.is_cloud ? "cloud" : "curve", d: path || "M0 0" });
+    drawing.style.stroke = colour(tone);
+    svg.append(drawing);
+    keys.append(keyOf(curve.name, tone, curve.is_cloud && "dot"));
+  }
+  if (check.mark !== null && inside(x(check.mark), left, right)) svg.append(drawn("path", { class: "limit", d: `M${x(check.mark)} ${top}V${bottom}` }));
+  const lines = check.curves.filter((curve) => !curve.is_cloud), read = lines.length ? lines : check.curves.slice(0, 1), reading = make("p", { class: "reading", role: "status", "aria-live": "polite" });
+  const say = (k) => `${check.x} ${digits(read[0].x[k])}: ${read.map((curve) => `${curve.name} ${digits(curve.y[k])}`).join(", ")}`;
+  let at = -1;
+  Object.entries({ tabindex: "0", "aria-roledescription": "chart", "aria-label": `${check.title}. ${check.text} Left and right arrow read the curves.` }).forEach((pair) => svg.setAttribute(...pair));
+  svg.addEventListener("keydown", (event) => {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    if (!step) return;
+    at = Math.max(0, Math.min(read[0].x.length - 1, at + step));
+    reading.textContent = say(at);
+    event.preventDefault();
+  });
+  const every = Math.ceil(read[0].x.length / 60), list = read[0].x.map((value, k) => [value, ...read.map((curve) => curve.y[k])]).filter((row, k) => k % every === 0);
+  const table = tableOf([check.x, ...read.map((curve) => `${curve.name}, ${check.y}`)], list.map((row) => row.map(digits)));
+  figure.append(make("p", { class: check.severity, text: check.text }), make("div", { class: "under" }, reading, make("details", {}, make("summary", { text: "Table of what is seen" }), make("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": `Table: ${check.title}` }, table))));
+  return figure;
+}
+// single results over dates; points: {t, value, low, high, bound, label, leak, chosen, go}; options: title, unit, limit,
+// log, join, repairs
+export function dotPlot(points, options) {
+  const width = Math.max(330, Math.min(1400, document.querySelector("main").clientWidth - 34));
+  const known = points.filter((point) => point.t !== null && point.t !== undefined && (point.value ?? point.bound) !== null);
+  if (!known.length) return make("p", { class: "quiet", text: options.empty || "Nothing to draw yet." });
+  const levels = known.flatMap((point) => [point.value, point.high, point.bound].filter((value) => value !== null && value !== undefined));
+  const limit = options.limit ?? null, highest = Math.max(...levels, limit ?? 0, 1e-9) * 1.12, positive = levels.filter((value) => value > 0);
+  const lowest = options.log ? Math.min(...(positive.length ? positive : [highest / 100]), limit || highest) / 2 : Math.min(0, ...known.map((point) => point.low ?? 0));
+  const dates = [...known.map((point) => point.t), ...(options.repairs || [])], margin = (Math.max(...dates) - Math.min(...dates)) * 0.04 || 43200;
+  const { svg, x, y, write, keys, figure, left, right, top, bottom } = frame(options.title, [width, 230], [Math.min(...dates) - margin, Math.max(...dates) + margin], [lowest, highest], options.unit, options.log, true);
+  if (limit !== null) { svg.append(drawn("path", { class: "limit", d: `M${left} ${y(limit)}H${right}` })); write(`limit ${litres(limit)}`, left + 6, y(limit) - 5, "start", "limit-text"); }
+  for (const t of options.repairs || []) { svg.append(drawn("path", { class: "repair", d: `M${x(t)} ${top}V${bottom}` })); write("repair", x(t) + 4, top + 10, "start"); }
+  const kinds = [["leak", "--leak", known.some((point) => point.leak)], [options.join ? "estimate" : "no leak stated", "--total", known.some((point) => !point.leak && (point.value ?? null) !== null)], ["no leak above", "--good", known.some((point) => (point.value ?? null) === null)]];
+  keys.append(...kinds.filter(([, , occurs]) => occurs).map(([name, tone]) => keyOf(name, tone)));
   const ordered = [...known].sort((a, b) => a.t - b.t);
   if (options.join) {
     const steps = ordered.slice(1).map((point, k) => point.t - ordered[k].t).sort((a, b) => a - b);
@@ -261,5 +304,5 @@ export function dotPlot(points, options) {
     else link.append(drawn("circle", { class: `dot ${point.leak ? "leak" : ""}`, cx: at, cy: y(level), r: 6.5 }));
     svg.append(link);
   }
-  return svg;
+  return figure;
 }

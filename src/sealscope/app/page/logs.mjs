@@ -1,5 +1,5 @@
 // The screen of the logs: folders and dropped files, what each holds, and logs that are read differently.
-import { app, ask, attempt, dateOf, go, lengthOf, make, miniature, refresh, say, tell } from "./main.mjs";
+import { app, ask, attempt, go, make, miniature, refresh, say, tell } from "./main.mjs";
 const PIECE = 4_000_000;
 let mended = "";
 
@@ -31,7 +31,7 @@ function rowOf(row) {
     return made;
   }
   if (row.state !== "read") {
-    made.append(make("td", { text: "…" }), name, make("td", { text: row.changed_s ? dateOf(row) : "" }), make("td", { text: `${(row.size / 1e6).toFixed(1)} MB` }), make("td", { text: "reading" }), make("td"), make("td", {}, mend));
+    made.append(make("td", { text: "…" }), name, make("td", { text: row.date }), make("td", { text: `${(row.size / 1e6).toFixed(1)} MB` }), make("td", { text: "reading" }), make("td"), make("td", {}, mend));
     return made;
   }
   const grave = row.findings.filter((finding) => finding.severity !== "note");
@@ -43,7 +43,7 @@ function rowOf(row) {
     findings.append(make("details", {}, make("summary", { class: grave.length ? "warning" : "", text: count }), list));
   }
   const unused = row.unused.length ? make("span", { class: "quiet", text: ` not used: ${row.unused.join(", ")}` }) : null;
-  made.append(make("td", {}, miniature(row.picture, `Course of ${Object.keys(row.picture).join(", ")} in ${row.name}`)), name, make("td", { text: dateOf(row) }), make("td", { text: `${lengthOf(row.seconds)} at ${Number(row.rate.toPrecision(5))} Hz` }), make("td", { text: row.channels.join(", ") }, unused), findings, make("td", {}, open, " ", mend));
+  made.append(make("td", {}, miniature(row.picture, `Course of ${Object.keys(row.picture).join(", ")} in ${row.name}`)), name, make("td", { text: row.date }), make("td", { text: `${row.length} at ${Number(row.rate.toPrecision(5))} Hz` }), make("td", { text: row.channels.join(", ") }, unused), findings, make("td", {}, open, " ", mend));
   return made;
 }
 // ---- files that are dropped: in pieces, each at its offset, resumed after a break
@@ -92,9 +92,10 @@ byId("open").addEventListener("submit", async (event) => {
 });
 // ---- a log that is read differently
 
+function openMend(open) { byId("mend").hidden = !open; byId("open").lastElementChild.classList.toggle("main", !open); }
 async function showMend(key) {
   mended = key;
-  byId("mend").hidden = false;
+  openMend(true);
   byId("mend-title").textContent = `Read ${app.rows.get(key).name} differently`;
   byId("mend-form").reset();
   await preview();
@@ -128,6 +129,6 @@ byId("mend-lines").addEventListener("click", (event) => {
 });
 byId("mend-form").addEventListener("submit", async (event) => {
   event.preventDefault();
-  if (await attempt(() => tell("mend", { file: mended, layout: layout() }))) byId("mend").hidden = true;
+  if (await attempt(() => tell("mend", { file: mended, layout: layout() }))) openMend(false);
 });
-byId("mend-close").addEventListener("click", () => (byId("mend").hidden = true));
+byId("mend-close").addEventListener("click", () => openMend(false));

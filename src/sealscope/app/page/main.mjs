@@ -50,18 +50,6 @@ export async function attempt(work) {
 }
 export const machineNow = () => app.machines.find((machine) => machine.name === app.machine) || null;
 export const rowsRead = () => app.keys.map((key) => app.rows.get(key)).filter((row) => row && row.state === "read");
-// a date with its zone: what the log states, else the logger's clock without a zone
-export function dateOf(row) {
-  const t = row.start_s ?? null;
-  if (t === null) return row.changed_s ? `file of ${isoTime(row.changed_s, false)} (local time)` : "no date";
-  const zone = row.zone === "Z" ? "UTC" : row.zone ? `${row.zone}, shown as UTC` : "logger’s clock";
-  return `${isoTime(t, true)} (${zone})`;
-}
-
-export function lengthOf(seconds) {
-  if (seconds < 120) return `${Number(seconds.toPrecision(3))} s`;
-  return seconds < 7200 ? `${Number((seconds / 60).toPrecision(3))} min` : `${Number((seconds / 3600).toPrecision(3))} h`;
-}
 // a small picture of minima and maxima, 0 .. 1, of each line
 export function miniature(picture, label) {
   const svg = drawn("svg", { class: "mini", viewBox: "0 0 100 100", preserveAspectRatio: "none", role: "img", "aria-label": label });

@@ -16,24 +16,15 @@ export async function update() {
     box.addEventListener("change", () => { if (box.checked) chosen.add(machine.name); else chosen.delete(machine.name); update(); });
     return make("label", {}, box, make("span", { text: machine.name }));
   }));
-  const recorded = byId("trend-kind").value === "recorded";
-  const names = app.machines.map((machine) => machine.name).filter((name) => chosen.has(name));
-  const trends = await Promise.all(names.map((name) => ask("trend", { machine: name })));
+  const kind = byId("trend-kind").value, names = app.machines.map((machine) => machine.name).filter((name) => chosen.has(name));
+  const trends = await Promise.all(names.map((name) => ask("trend", { machine: name, kind })));
   byId("trend-charts").replaceChildren(...names.flatMap((name, k) => {
-    const trend = trends[k];
-    const repairs = [...trend.repairs.map((date) => Date.parse(date) / 1000), ...(trend.seen || [])].filter(Number.isFinite);
-    const points = recorded
-      ? trend.recorded.map((point) => ({ t: point.start, value: point.leak, bound: point.bound, leak: point.verdict === "leak", label: `${point.file}: ${point.leak === null ? (point.bound === null ? point.verdict : `below ${litres(point.bound)} L/min`) : `${litres(point.leak)} L/min`}` }))
-      : (trend.points || []).filter((point) => point.value !== null).map((point) => ({ t: point.start, value: point.value, low: point.low, high: point.high, leak: trend.verdict === "leak" && trend.limit !== null && point.low > trend.limit, label: `${point.file}: ${litres(point.value)} ${trend.unit}` }));
-    const unit = recorded || !trend.known ? "L/min" : `${trend.unit}${trend.pressure ? ` at ${litres(trend.pressure / 1e5)} bar` : ""}`;
-    const leaking = trend.recorded.filter((point) => point.verdict === "leak").map((point) => point.file.split("/").pop()), single = leaking.length ? `Judged a leak by itself: ${leaking.join(", ")}; see Verdict. The trend compares means of whole recordings. ` : "";
-    const words = single + (trend.known ? `${trend.verdict}: ${trend.reason}. ${leaking.length ? "" : trend.next}` : recorded ? "" : "Not estimated yet.");
-    const page = make("p", { role: "status" }), left = (trend.points || []).filter((point) => point.note);
+    const trend = trends[k], page = make("p", { role: "status" });
+    const repairs = [...trend.repairs.map((date) => Date.parse(date) / 1000), ...trend.seen].filter(Number.isFinite);
     return [
-      make("h3", { text: name }),
-      dotPlot(points, { title: `Leakage of ${name}`, unit, limit: recorded ? null : trend.limit, log: byId("trend-log").checked, join: true, repairs }),
-      make("p", { text: words }),
-      left.length ? make("details", {}, make("summary", { text: `${left.length} remarks` }), make("ul", {}, ...left.map((point) => make("li", { text: `${point.file}: ${point.note}` })))) : "",
+      dotPlot(trend.points, { title: `Leakage of ${name}`, unit: trend.unit, limit: trend.limit, log: byId("trend-log").checked, join: true, repairs }),
+      make("p", { text: trend.words }), make("p", { class: "quiet", text: trend.limit_words }),
+      trend.remarks.length ? make("details", {}, make("summary", { text: `${trend.remarks.length} remarks` }), make("ul", {}, ...trend.remarks.map((text) => make("li", { text })))) : "",
       trend.known ? make("button", { type: "button", text: `Write the page of ${name}’s trend`, onclick: () => attempt(async () => {
         const written = await tell("trend-page", { machine: name });
         page.replaceChildren(make("a", { href: written.address, target: "_blank", rel: "noopener", text: `reports/${written.page}` }));

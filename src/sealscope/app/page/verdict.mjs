@@ -1,7 +1,7 @@
 // The screen of the verdicts: by date, and for one recording the signals, the evidence and the balance of its flows.
-import { app, ask, attempt, dateOf, ensureMachine, fillSelect, go, machineNow, make, rowsRead, say, tell } from "./main.mjs";
-import { Linked, Trace, dotPlot } from "./charts.mjs";
-const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--steel", piston: "--total", creep: "--steel", valve: "--d1", compression: "--compression", leakage: "--leak", other: "--other", residual: "--residual" };
+import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, rowsRead, say, tell } from "./main.mjs";
+import { Linked, Trace, dotPlot, settled } from "./charts.mjs";
+const TONES = { p_A: "--side-a", p_B: "--side-b", x: "--piston", pump: "--steel", piston: "--total", creep: "--steel", valve: "--d1", compression: "--compression", "compression A": "--compression", "compression B": "--d1", leakage: "--leak", other: "--other", residual: "--residual" };
 let link = new Linked();
 let result = null, limit = null, renewed = "", pages = new Map();
 let drawnFor = "";
@@ -41,7 +41,7 @@ function showDates(machine, verdicts, rows) {
     const known = verdict.leak_lpm !== null;
     const size = known ? `${litres(verdict.leak_lpm)} L/min` : verdict.bound_lpm === null ? "no L/min" : `below ${litres(verdict.bound_lpm)} L/min`;
     const interval = result && result.key === row.key ? result.leak_interval_lpm : null;
-    return { t: row.start_s ?? row.changed_s ?? k, value: known ? Math.max(0, verdict.leak_lpm) : null, bound: verdict.bound_lpm, low: interval && interval[0], high: interval && interval[1], leak: verdict.verdict === "leak", label: `${row.name}, ${dateOf(row)}: ${verdict.summary || verdict.verdict}, ${size}${verdict.opinion ? `, ${verdict.opinion}` : ""}`, chosen: row.key === app.file, go: `#${["verdict", machine.name, row.key].map(encodeURIComponent).join("|")}` };
+    return { t: row.start_s ?? row.changed_s ?? k, value: known ? Math.max(0, verdict.leak_lpm) : null, bound: verdict.bound_lpm, low: interval && interval[0], high: interval && interval[1], leak: verdict.verdict === "leak", label: `${row.name}, ${row.date}: ${verdict.summary || verdict.verdict}, ${size}${verdict.opinion ? `, ${verdict.opinion}` : ""}`, chosen: row.key === app.file, go: `#${["verdict", machine.name, row.key].map(encodeURIComponent).join("|")}` };
   });
   const list = make("ul", { class: "checks" }, ...points.map((point) => make("li", { class: point.leak ? "bad" : "" }, make("a", { href: point.go, text: point.label }))));
   byId("by-date").replaceChildren(
@@ -61,7 +61,7 @@ function showHead(machine, kept, key) {
     tell("judge", { machine: machine.name, files: [key] }).catch((error) => say(error.message));
   }
   if (!kept || !result) {
-    place.replaceChildren(make("p", { class: "verdict-line", text: kept ? `${row.name}: ${kept.summary || kept.verdict}` : `${row.name} is not judged yet` }), make("p", { class: "quiet", text: row.state === "unreadable" ? row.error : dateOf(row) }), make("div", { class: "actions" }, judge));
+    place.replaceChildren(make("p", { class: "verdict-line", text: kept ? `${row.name}: ${kept.summary || kept.verdict}` : `${row.name} is not judged yet` }), make("p", { class: "quiet", text: row.state === "unreadable" ? row.error : row.date }), make("div", { class: "actions" }, judge));
     return;
   }
   const interval = result.leak_interval_lpm;
@@ -101,15 +101,8 @@ async function draw(machine, key) {
   const place = byId("evidence-charts");
   place.replaceChildren();
   const window = (table, columns, file = key, moved = 0) => (begin, end, pixels) => ask("window", { table, file, machine: machine.name, columns: columns.join(","), pixels, ...(begin === null ? {} : { from: begin - moved, to: end - moved }) });
-  const settled = async (table) => {
-    for (;;) {
-      const data = await window(table, [])(null, null, 10);
-      if (data.complete || data.error || drawnFor !== now) return data;
-      await new Promise((later) => setTimeout(later, 300));
-    }
-  };
   place.append(make("p", { class: "quiet", text: "Reading the signals and balancing the volumes …" }));
-  const [head, flows] = await Promise.all([settled("channels"), settled("balance")]);
+  const [head, flows] = await Promise.all(["channels", "balance"].map((table) => settled({ table, file: key, machine: machine.name }, () => drawnFor === now)));
   if (drawnFor !== now) return;
   place.replaceChildren();
   Object.assign(link, { first: head.first, last: head.last, begin: head.first, end: head.last });
@@ -131,13 +124,14 @@ async function draw(machine, key) {
   const pressures = ["p_A", "p_B"].filter((name) => columnOf(name) >= 0);
   if (blocks.length) place.append(make("p", { class: "quiet", text: "Blue: the seconds that carry the evidence, the darker the more." }));
   if (pressures.length) add("Chamber pressures", pressures, "channels", unitOf(pressures[0]), pressures.map(columnOf), { height: 150 });
-  if (flows.names.length) {
-    const parts = flows.names;
-    add(`Where the oil goes: ${parts[0]} = ${parts.slice(1).join(" + ")}`, parts.filter((name) => name !== "residual"), "balance", flows.about.unit, parts.map((name, k) => k).filter((k) => parts[k] !== "residual"), { height: 200 });
-    const leak = parts.indexOf("leakage");
-    const rest = parts.indexOf("residual");
-    add("Leakage of pump and piston, and what no term explains", ["leakage", "residual"], "balance", flows.about.unit, [leak, rest], { height: 150 });
-  } else place.append(make("p", { class: "quiet", text: flows.error }));
+  for (const { chamber, names, first } of (flows.about && flows.about.groups) || []) {
+    const where = chamber ? ` in chamber ${chamber}` : "", main = names.filter((name) => name !== "residual");
+    const columnsOf = (wanted) => wanted.map((name) => first + names.indexOf(name));
+    add(`Where the oil goes${where}: ${names[0]} = ${names.slice(1).join(" + ")}`, main, "balance", flows.about.unit, columnsOf(main), { height: 200 });
+    const small = names.slice(1).filter((name) => !["piston", "valve"].includes(name));
+    add(`The small parts${where} on their own scale: leakage of pump and piston, compression, and what no term explains`, small, "balance", flows.about.unit, columnsOf(small), { height: 170 });
+  }
+  if (!flows.names.length) place.append(make("p", { class: "quiet", text: flows.error || flows.about.problem }));
   if (result && result.course) {
     const { t, lpm, low, high } = result.course;
     const title = result.course.whole ? "Leakage estimated block by block" : "Leak since its onset, block by block";

@@ -10,7 +10,7 @@ from dataclasses import replace
 from sealscope.paragraphs import format_count
 from sealscope.recordings.channels import COUNTS
 from sealscope.recordings.formats.wrapped_angle import continue_resets, unwrap_angle
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import Finding, locate_rows
 from sealscope.recordings.recording import Recording
 
 #: Channels that tell how far the shaft turns from sample to sample.
@@ -30,14 +30,14 @@ def unwrap_angles(recording: Recording) -> tuple[Recording, list[Finding]]:
     if angle is None:
         return _continue_resets(recording)
     period = recording.format_value("theta", angle.period, is_span=True)
-    leaps, first = format_count(angle.n_leaps, "time"), float(recording.t[angle.first])
+    leaps, places = format_count(angle.leaps.size, "time"), locate_rows(recording.t, angle.leaps)
     if angle.values is None:
         text = f"theta: begins anew after {period} and turns by half of this or more from sample to sample, "
         text += "as no other channel tells how far: left out; record the speed, or sample faster"
-        finding = Finding("angle_ambiguous", "warning", "theta", angle.n_leaps, first, text)
+        finding = Finding("angle_ambiguous", "warning", "theta", angle.leaps.size, places[0], text, places)
         return recording.only(name for name in recording.channels if name != "theta"), [finding]
     text = f"theta: begins anew after {period}, {leaps}: unwrapped"
-    finding = Finding("angle_unwrapped", "note", "theta", angle.n_leaps, first, text)
+    finding = Finding("angle_unwrapped", "note", "theta", angle.leaps.size, places[0], text, places)
     return replace(recording, channels={**recording.channels, "theta": angle.values}), [finding]
 
 
@@ -47,5 +47,6 @@ def _continue_resets(recording: Recording) -> tuple[Recording, list[Finding]]:
     if not resets.size:
         return recording, []
     text = f"theta: begins again from its first value, {format_count(resets.size, 'time')}: taken as continuing"
-    finding = Finding("angle_reset", "note", "theta", int(resets.size), float(recording.t[resets[0]]), text)
+    places = locate_rows(recording.t, resets)
+    finding = Finding("angle_reset", "note", "theta", int(resets.size), float(recording.t[resets[0]]), text, places)
     return replace(recording, channels={**recording.channels, "theta": values}), [finding]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sealscope.recordings.channels import SLOW, Array, estimate_quantum
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import Finding, locate_rows
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.spike
@@ -40,7 +40,8 @@ def remove_spikes(recording: Recording) -> tuple[Recording, list[Finding]]:
         phrase = "sample leaps and returns" if spikes.size == 1 else "samples leap and return"
         first = recording.format_value(name, values[spikes[0]])
         text = f"{name}: {spikes.size} {phrase} at once, first to {first}: left out"
-        findings.append(Finding("spike", "note", name, spikes.size, float(recording.t[spikes[0]]), text))
+        places = locate_rows(recording.t, spikes)
+        findings.append(Finding("spike", "note", name, spikes.size, float(recording.t[spikes[0]]), text, places))
     return (replace(recording, channels=channels) if findings else recording), findings
 
 

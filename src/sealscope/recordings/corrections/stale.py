@@ -16,7 +16,7 @@ from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import SLOW, Array, estimate_quantum
 from sealscope.recordings.motion import find_holds, find_runs, find_stuck
 from sealscope.recordings.priors import RECORDINGS
-from sealscope.recordings.quality import Finding
+from sealscope.recordings.quality import Finding, locate_rows
 from sealscope.recordings.recording import Recording
 
 _PRIORS = RECORDINGS.stale
@@ -44,7 +44,8 @@ def interpolate_stale_samples(recording: Recording) -> tuple[Recording, list[Fin
     rows = np.flatnonzero(repeated)
     if rows.size:
         text = f"{rows.size} rows repeat the row before: interpolated"
-        findings.append(Finding("repeated_rows", "note", None, rows.size, float(recording.t[rows[0]]), text))
+        places = locate_rows(recording.t, rows)
+        findings.append(Finding("repeated_rows", "note", None, rows.size, float(recording.t[rows[0]]), text, places))
     for name in names:
         values = recording[name]
         stale = repeated & np.isfinite(values)

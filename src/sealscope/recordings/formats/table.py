@@ -510,14 +510,15 @@ def _unwrap_angle(values: Array, member: Series, unit: str) -> tuple[Array, list
     if angle is None:
         return values, []
     is_known = angle.values is not None
-    text = f"theta: begins anew after {angle.period / scale:.6g} {unit}, {format_count(angle.n_leaps, 'time')}: "
+    text = f"theta: begins anew after {angle.period / scale:.6g} {unit}, {format_count(angle.leaps.size, 'time')}: "
     text += "unwrapped" if is_known else "turns of half of it or more from sample to sample are ambiguous, left out"
     finding: dict[str, Any] = {
         "code": "angle_unwrapped" if is_known else "angle_ambiguous",
         "text": text,
         "channel": "theta",
     }
-    finding |= {"severity": "note" if is_known else "warning", "count": angle.n_leaps, "first_t": float(t[angle.first])}
+    count, first_t = int(angle.leaps.size), float(t[angle.leaps[0]])
+    finding |= {"severity": "note" if is_known else "warning", "count": count, "first_t": first_t}
     return np.full(values.size, np.nan) if angle.values is None else angle.values / scale, [finding]
 
 

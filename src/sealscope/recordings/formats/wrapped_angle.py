@@ -39,8 +39,7 @@ class Unwrapped(NamedTuple):
 
     values: Array | None  # (n,); None if the shaft may turn by half a period or more from sample to sample
     period: float  # in the unit of the angle
-    n_leaps: int
-    first: int  # index of the first sample after a leap
+    leaps: NDArray[np.intp]  # indices of the first samples after each leap
 
 
 class _Period(NamedTuple):
@@ -75,8 +74,7 @@ def unwrap_angle(values: Array, unit: str, t: Array, signals: Mapping[str, Array
         return None
     result = values.copy()
     result[rows[1:]] += period.value * np.cumsum(turns)
-    first = int(rows[np.flatnonzero(turns)[0] + 1])
-    return Unwrapped(None if is_fast else result, period.value, int(np.count_nonzero(turns)), first)
+    return Unwrapped(None if is_fast else result, period.value, rows[np.flatnonzero(turns) + 1])
 
 
 def continue_resets(values: Array, position: Array | None) -> tuple[Array, NDArray[np.intp]]:
