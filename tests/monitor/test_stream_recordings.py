@@ -34,7 +34,7 @@ def settings_of(folder: Path, machine_file: Path, more: str = "", recording_s: f
     """Settings of one machine whose samples come as lines, in recordings of a minute."""
     file = folder / "watch.toml"
     file.write_text(
-        'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
+        f'database = "monitor.db"\nlines = true\n[[actuator]]\nname = "press"\nmachine = "{machine_file}"\n'
         f"recording_s = {recording_s}\nfalse_alarms_per_1000_h = {rate}\n{more}",
         encoding="utf-8",
     )

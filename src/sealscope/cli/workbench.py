@@ -9,7 +9,6 @@ from typer import Argument, Exit, Option
 
 from sealscope.cli.options import check_folder, say
 
-_REPLAY = "Judge the session anew, without a page; status 1 if a verdict differs."
 _FOLDER = "Folder of the session, made if it is new; a folder of logs opens these."
 
 

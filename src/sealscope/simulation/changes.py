@@ -116,21 +116,6 @@ def block_bounds(effects: Sequence[Effect], n_out: int, rate: float) -> np.ndarr
     return np.unique(np.rint(np.r_[part_starts, n_out]).astype(np.int64))
 
 
-def step_limiting_parameters(effects: Sequence[Effect], base: RigNumbers, duration: float) -> tuple[RigNumbers, ...]:
-    """Collect the sets of model parameters in a run of `duration` [s] for which the solver's step is checked.
-
-    The first is `base`, without effects. The others are those just before and just after each breakpoint of an effect,
-    or at the end of the run if that is earlier. Effects without breakpoints, such as smooth drifts, are left out.
-    """
-    faults = [effect for effect in effects if effect.breakpoints]
-    if not faults:
-        return (base,)
-    times = np.array(sorted({min(t, duration) for effect in faults for t in effect.breakpoints}))
-    values = changing_values(faults, base, np.r_[times - 1e-9, times + 1e-9])  # a nanosecond from each
-    distinct_rows = np.unique(np.array(list(values.values())).T, axis=0)  # a row has the changing parameters at a time
-    return base, *(base._replace(**dict(zip(values, row.tolist(), strict=True))) for row in distinct_rows)
-
-
 def add_needed_laws(base: RigNumbers, effects: Sequence[Effect]) -> RigNumbers:
     """Add to the parameters `base` the optional laws that effects need: leaks to the outside, and free air.
 

@@ -66,27 +66,6 @@ def require_part(state: Any, name: str, kind: type | tuple[type, ...]) -> Any:
     return value
 
 
-def require_count(state: Any, name: str) -> int:
-    """Return the entry `name` of a saved state; raise InputError if it is not a whole number of 0 or more."""
-    value = require_part(state, name, object)
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 0:
-        raise InputError(f"saved state's {name} must be a whole number >= 0, got {value!r}")
-    return int(value)
-
-
-def require_numbers(state: Any, name: str, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Return the entry `name` of a saved state as an array of numbers with this shape; raise InputError otherwise."""
-    try:
-        values = np.asarray(require_part(state, name, object))
-        if values.dtype.kind not in "fi":
-            raise TypeError(f"got {values.dtype}")
-    except (TypeError, ValueError) as error:
-        raise InputError(f"saved state's {name} must hold numbers: {error}") from None
-    if values.shape != shape:
-        raise InputError(f"saved state's {name} must have shape {shape}, got {values.shape}")
-    return values.astype(np.float64)
-
-
 def save_attributes(owner: Any, names: Iterable[str]) -> dict[str, Any]:
     """Convert the attributes of `owner` called `names` to plain values, which `restore_attributes` reads.
 

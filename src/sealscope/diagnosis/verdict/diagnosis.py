@@ -35,8 +35,6 @@ _FIRST_FIELDS = (
     *("file", "verdict", "reason", "onset_s", "onset_interval_s", "leak_lpm", "leak_interval_lpm", "bound_lpm"),
     *("unused", "false_alarm_probability", "score", "threshold"),
 )
-#: Condition of a recording without a leak that is not in all respects like the healthy ones.
-NO_LEAK_FOUND = "no leak found"
 #: Smallest p-value of a usual test result.
 _MIN_USUAL_CHANCE = 0.05
 #: Names in a recording's preamble that state its machine, in the order of preference.
