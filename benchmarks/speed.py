@@ -26,24 +26,43 @@ import numpy as np
 import sealscope as ss
 
 #: Program of a row in a process of its own: it reads its files, works once before the clock starts, and prints seconds.
+#: Results of recordings are kept on disk by their content: unless they were learnt before ("again", "next"), each run
+#: has recordings of another content. Of "next" the last one was judged before, beside the same healthy ones.
 _ROW = """
-import json, sys, time
+import json, os, sys, tempfile, time
+from dataclasses import replace
 import sealscope as ss
 kind, names, channels = json.loads(sys.argv[1])
-def read():
+def read(is_new=True):
     recordings = [ss.read(name) for name in names]
+    if is_new:
+        run = str(time.time_ns())
+        recordings = [replace(recording, provenance={**recording.provenance, "run": run}) for recording in recordings]
     return [recording.only(channels) for recording in recordings] if channels else recordings
 def diagnose(recordings):
     return ss.diagnose(recordings[0], baseline=recordings[1:])
 if kind == "commission":
-    ss.commission(names[:1])
+    def copy():
+        folder = tempfile.mkdtemp(dir=os.path.dirname(names[0]))
+        files = [f"{folder}/{os.path.basename(name)}" for name in names]
+        for recording, file in zip(read(), files):
+            ss.write(recording, file)
+        return files
+    ss.commission(copy()[:1])
+    names = copy()
     start = time.process_time()
     ss.commission(names)
+elif kind == "again":
+    diagnose(read(is_new=False))
+    recordings = read(is_new=False)
+    start = time.process_time()
+    diagnose(recordings)
 else:
     diagnose(read())
     recordings = read()
     if kind == "next":
-        diagnose([recordings[1], *recordings[2:]])
+        *recordings, other = recordings
+        diagnose([other, *recordings[1:]])
     start = time.process_time()
     diagnose(recordings)
 print(json.dumps(time.process_time() - start))
@@ -166,6 +185,7 @@ def main() -> None:
             f"{length:g} s at 500 Hz, pressures and command": of_library("first", three, channels=("u", "p_A", "p_B")),
             f"60 s beside {n_beside}, first": of_library("first", minute[: 1 + n_beside]),
             f"60 s beside {n_beside}, next": of_library("next", minute[: 2 + n_beside]),
+            f"60 s beside {n_beside}, learnt by another process": of_library("again", minute[: 1 + n_beside]),
             f"commissioning, {3 * 1.5 * share:g} h at 10 Hz": of_library("commission", days),
             f"commissioning, {share:g} h at 1 kHz": of_library("commission", [hour]),
             f"`diagnose` of {share:g} h at 1 kHz, a text of 6 columns": of_command("diagnose", str(table)),

@@ -147,6 +147,12 @@ def drive() -> Callable[..., Trajectory]:
 
 
 @pytest.fixture(autouse=True)
+def nothing_learnt_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let no test see what others learnt of the same recording, perhaps under other priors: results are not kept."""
+    monkeypatch.setattr("sealscope.diagnosis.learnt.results_folder", lambda: None)
+
+
+@pytest.fixture(autouse=True)
 def unlimited_log() -> None:
     """Let this test's log have any number of lines: a monitor that another test ran limits those of all handlers."""
     for handler in logging.getLogger().handlers:

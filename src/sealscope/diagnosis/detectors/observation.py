@@ -25,11 +25,12 @@ from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
 from sealscope.recordings.motion import describe_hold, describe_line
-from sealscope.recordings.recording import Recording, compute_once
+from sealscope.recordings.recording import Recording
 
 #: Key of the surprisals of a recording's observables in its cache (`compute_once`).
 SURPRISALS = "surprisals"
@@ -126,7 +127,7 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
 
 def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
     """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached."""
-    return compute_once(recording, (SURPRISALS, rig), lambda samples: _compute_surprisals(samples, rig))
+    return learn_once(recording, (SURPRISALS,), lambda samples: _compute_surprisals(samples, rig), rig)
 
 
 def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:

@@ -627,6 +627,10 @@ def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Arra
     last column is zero.
     """
     size = gram.shape[1]
+    if not offset and not coefficients.any():  # the appended column is zero
+        shifted = np.zeros((len(gram), size + 1, size + 1))
+        shifted[:, :size, :size] = gram
+        return shifted
     transform = np.zeros((len(gram), size, size + 1))
     transform[:, :, :size] = np.eye(size)
     if roles.bias is not None:  # the column of the flow offset is dt

@@ -576,15 +576,20 @@ def _test_step(whitening: _Whitening, onsets: Array, steps: _WhitenedSteps, fits
     and noise, with the prior on the walk.
     """
     fits = fits._replace(moments=sign * fits.moments)
-    weight, _, total, moments, energies = fits
+    weight, log_factor, total, moments, energies = fits
     n, unit = weight.shape[1], whitening.unit
     residual_squares = fits.residual_squares()
-    log_likelihood, log_likelihood_with_step = fits.log_likelihood(total), fits.log_likelihood(residual_squares)
+    log_likelihood = fits.log_likelihood(total)
     walk_without_step = int(log_likelihood.argmax())
-    walk, best = np.unravel_index(int(log_likelihood_with_step.argmax()), log_likelihood_with_step.shape)
-    score = 2.0 * float(log_likelihood_with_step[walk, best] - log_likelihood[walk_without_step])
+    # at each onset the likeliest walk is that with the least squares times exp(-2 log_factor / n): one logarithm each
+    largest_factor = log_factor.max()
+    scaled_squares = residual_squares * np.exp(2.0 / n * (largest_factor - log_factor))[:, None]
+    walk, best = np.unravel_index(int(scaled_squares.argmin()), scaled_squares.shape)
+    likelihood = largest_factor - 0.5 * n * np.log(scaled_squares.min(axis=0) / n)  # of a step at each onset
+    score = 2.0 * float(likelihood[best] - log_likelihood[walk_without_step])
     # variances of the walk that the data alone, without the prior, allow: with or without a step
-    data_likelihoods = np.array([log_likelihood, log_likelihood_with_step.max(axis=1)]) - whitening.walk_log_priors
+    with_step = fits.log_likelihood(residual_squares.min(axis=1))  # at the best onset for each walk
+    data_likelihoods = np.array([log_likelihood, with_step]) - whitening.walk_log_priors
     allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
     length = steps.lengths[allowed].max()
     noise = float(residual_squares[walk, best]) / n
@@ -597,7 +602,7 @@ def _test_step(whitening: _Whitening, onsets: Array, steps: _WhitenedSteps, fits
         best=int(best),
         positions=whitening.positions,
         onsets=onsets,
-        likelihood=log_likelihood_with_step.max(axis=0),
+        likelihood=likelihood,
         size=size,
         deviation=np.sqrt(np.maximum(squares, 0.0) / n) / np.sqrt(energies[walk_without_step]),
         fitted=Estimate(float(size_at_best), float(error_at_best)),

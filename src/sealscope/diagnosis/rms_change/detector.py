@@ -15,6 +15,7 @@ import numpy as np
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import Interval, StepTest, step_tests
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.blocks import (
     JUDGED,
@@ -30,7 +31,7 @@ from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import min_samples
 
 #: Kind of data (`Observable.data`) of the judged details d2 to d4.
@@ -56,7 +57,7 @@ class RmsChange:
 
     def learn(self, recording: Recording) -> Summary:
         """Summarise a healthy recording by the log RMS of its wavelet details, for comparison with later recordings."""
-        return compute_once(recording, (self.name, "summary"), self._summarise)
+        return learn_once(recording, (self.name, "summary"), self._summarise)
 
     @staticmethod
     def _summarise(recording: Recording) -> Summary:

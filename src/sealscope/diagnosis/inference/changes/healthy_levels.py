@@ -40,10 +40,11 @@ from sealscope.diagnosis.inference.changes.signals import SIGNALS
 from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Recording, compute_once
+from sealscope.recordings.recording import Recording
 from sealscope.signals.smoothing import TINY
 
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
@@ -71,7 +72,7 @@ class HealthyLevels:
         The summary maps names to numbers, such as "friction_pressure" [Pa], and each name in `PAIRS` (a pair of
         channels) to an array (4, k) with the fields of `Octaves` in k octaves. Unknown entries are missing.
         """
-        return compute_once(recording, ("healthy levels",), _estimate_levels)
+        return learn_once(recording, ("healthy levels",), _estimate_levels)
 
     def compare(self, recording: Recording, baseline: Sequence[Healthy]) -> Iterator[Observable]:
         """Compare friction, spectra and drifts of the pressures with those of the healthy recordings in `baseline`.

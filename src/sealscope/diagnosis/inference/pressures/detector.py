@@ -14,6 +14,7 @@ from sealscope.diagnosis.inference.onset import Information, step_tests
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak
 from sealscope.diagnosis.inference.pressures.response import measure_leak
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE
 from sealscope.recordings.recording import Recording
 
@@ -46,6 +47,10 @@ class PressureResponse:
         - `law`: law of friction that describes the recording;
         - the fields of `recording_sums.RecordingSums` that are known.
         """
+        return learn_once(recording, (self.name, "summary"), self._summarise, self.rig)
+
+    def _summarise(self, recording: Recording) -> Summary | None:
+        """Compute the summary of a healthy recording (`learn`)."""
         leak = measure_leak(recording, self.rig, is_healthy=True)
         if leak is None:
             return None

@@ -119,15 +119,17 @@ class Priors:
 class Linearisation(NamedTuple):
     """Linearisation of the model's output over n samples about p parameters `theta` (p,).
 
-    `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `gram` (1 + p, 1 +
-    p): sums over the samples of their products with each other, without the mains hum; `ends` (8, 12): simulated states
-    at the last sample, as in `response.Segment`; `squares` (m,): residual sums of squares [Pa^2] of `theta` and of the
-    further parameter sets that were simulated with it.
+    `rows` (1 + p, n): residual [Pa], and derivative of the output by each parameter [Pa per unit]; `amplitudes` (1 + p,
+    m): the waves of the mains hum in each of them; `gram` (1 + p, 1 + p): sums over the samples of their products with
+    each other, without the hum; `ends` (8, 12): simulated states at the last sample, as in `response.Segment`;
+    `squares` (m,): residual sums of squares [Pa^2] of `theta` and of the further parameter sets that were simulated
+    with it.
     """
 
     theta: Array
     gram: Array
     rows: Array
+    amplitudes: Array
     ends: Array
     squares: Array
 
@@ -162,17 +164,17 @@ class Block(NamedTuple):
 class Joint:
     """Joint fit of the parameters in all K blocks of a recording.
 
-    `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,) and `covariance` (K p, K p): fitted
-    deviations from these, in units of `priors.unit`, block after block; `prior_precision` (K p, K p): prior precision
-    of the same deviations; `variance`: variance of the residual [Pa^2]; `squares`: sum of squares of the residual at
-    `theta` [Pa^2]; `samples`: number of known samples; `gain`: decrease of -2 log posterior from `theta` to the fitted
-    parameters in the linearised model.
+    `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,): fitted deviations from these, in
+    units of `priors.unit`, block after block; `factor`: Cholesky factor of their precision, as by `cho_factor`;
+    `prior_precision` (K p, K p): prior precision of the same deviations; `variance`: variance of the residual [Pa^2];
+    `squares`: sum of squares of the residual at `theta` [Pa^2]; `samples`: number of known samples; `gain`: decrease of
+    -2 log posterior from `theta` to the fitted parameters in the linearised model.
     """
 
     priors: Priors
     theta: Array
     mean: Array
-    covariance: Array
+    factor: tuple[Array, bool]
     prior_precision: Array
     variance: float
     squares: float
@@ -184,19 +186,22 @@ class Joint:
         """Fitted parameters in all blocks, (K, p)."""
         return self.theta + self.mean.reshape(self.theta.shape) * self.priors.unit
 
+    @cached_property
+    def covariance(self) -> Array:
+        """Covariance (K p, K p) of the fitted deviations from `theta`."""
+        return np.asarray(cho_solve(self.factor, np.eye(self.theta.size), check_finite=False))
+
     def cost(self, variance: float) -> float:
         """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise `variance` [Pa^2]."""
-        deviations = ((self.theta - self.priors.centre) / self.priors.unit).ravel()
-        return self.squares / variance + float(deviations @ self.prior_precision @ deviations)
+        return self.squares / variance + prior_cost(self.theta, self.priors, self.prior_precision)
 
     @staticmethod
-    def fit(blocks: Sequence[Block], priors: Priors, block_s: float, parameter: int) -> Joint:
-        """Fit the parameters of all blocks, each `block_s` [s] long, together.
+    def fit(blocks: Sequence[Block], priors: Priors, prior_precision: Array, parameter: int) -> Joint:
+        """Fit the parameters of all blocks together, with the `prior_precision` of all deviations.
 
         `parameter`: index of the tested parameter, whose scores (`Block`) show the correlation of the noise.
         """
         theta = np.array([block.theta for block in blocks])
-        prior_precision = _prior_precision(len(blocks), priors, block_s)
         prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()  # at `theta`
         # row and column 0 of a block's Gram matrix belong to the residual, the others to its derivatives
         gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
@@ -209,10 +214,9 @@ class Joint:
             vector = gradient / (variance * inflation) - prior_gradient
             mean = cho_solve(factor, vector, check_finite=False)
             variance, inflation = _estimate_noise(blocks, mean, parameter)
-        covariance = cho_solve(factor, np.eye(theta.size), check_finite=False)
         squares = sum(float(block.gram[0, 0]) for block in blocks)
         samples = sum(block.samples for block in blocks)
-        return Joint(priors, theta, mean, covariance, prior_precision, variance, squares, samples, float(vector @ mean))
+        return Joint(priors, theta, mean, factor, prior_precision, variance, squares, samples, float(vector @ mean))
 
     def sums(self, parameter: int, step: float) -> Array:
         """Compute the likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1).
@@ -270,7 +274,13 @@ def _gram_of_normal(precision: Array, moments: Array, unit: Array) -> Array:
     return np.asarray(0.5 * (gram + gram.T) / units / units[:, None])
 
 
-def _prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
+def prior_cost(theta: Array, priors: Priors, prior_precision: Array) -> float:
+    """Compute -2 log prior density of the parameters `theta` (K, p) of all blocks, up to a constant."""
+    deviations = ((theta - priors.centre) / priors.unit).ravel()
+    return float(deviations @ prior_precision @ deviations)
+
+
+def joint_prior_precision(n_blocks: int, priors: Priors, block_s: float) -> Array:
     """Compute the joint prior precision of p parameters in K blocks, each `block_s` [s] long, shape (K p, K p).
 
     The parameters are in units of `priors.unit`. Each is a random walk whose mean has the prior `priors.normal`.

@@ -22,12 +22,20 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.linalg.lapack import dtbtrs
 from scipy.ndimage import gaussian_filter1d
+from scipy.signal import lfilter
 
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import Information
-from sealscope.diagnosis.inference.pressures.fit import Block, Joint, Linearisation, Normal, Priors
+from sealscope.diagnosis.inference.pressures.fit import (
+    Block,
+    Joint,
+    Linearisation,
+    Normal,
+    Priors,
+    joint_prior_precision,
+    prior_cost,
+)
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
     BRISTLES,
@@ -183,19 +191,23 @@ class Segment:
         rows, products, amplitudes = self._project_on_waves(rows)
         gram = rows @ rows.T - amplitudes @ products.T  # without the mains waves
         squares = np.diag(gram)[[0, *range(n_rows, len(rows))]]
-        return Linearisation(theta, gram[:n_rows, :n_rows], rows[:n_rows], ends[:, : n_slopes + 1], squares)
+        return Linearisation(
+            theta, gram[:n_rows, :n_rows], rows[:n_rows], amplitudes[:n_rows], ends[:, : n_slopes + 1], squares
+        )
 
     def _analytic_slopes(self, theta: Array, response: Array) -> Array:
         """Compute the derivatives (3, n) of scale * response by lead, lag and scale, per unit of `priors.unit`.
 
         `theta` (p,): all parameters; `response` (n,): simulated p_A - p_B [Pa].
         """
-        change = np.asarray(np.gradient(response))
-        change[1:-1] -= np.diff(change, 2) / 6.0  # accurate to fourth order, since the ringing is fast
+        change = np.empty(len(response))  # central differences, at the ends one-sided
+        change[1:-1] = 0.5 * (response[2:] - response[:-2])
+        change[0], change[-1] = response[1] - response[0], response[-1] - response[-2]
+        # accurate to fourth order, since the ringing is fast
+        change[1:-1] -= (change[2:] - 2.0 * change[1:-1] + change[:-2]) / 6.0
         by_lead = theta[SCALE] * self.machine.rate * change  # time derivative of the reading
         decay = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _MIN)))
-        # first-order low pass of -by_lead, as the solution of a bidiagonal system
-        by_lag = dtbtrs(np.tile([[1.0], [-decay]], by_lead.size), (decay - 1.0) * by_lead, uplo="L")[0]
+        by_lag = lfilter([decay - 1.0], [1.0, -decay], by_lead)  # first-order low pass of -by_lead
         return np.array([by_lead, by_lag, response]) * self.priors.unit[LEAD:OFFSET, None]
 
     def descend(self, fit: Linearisation, prior: Normal, n_steps: int, noise: float | None = None) -> Linearisation:
@@ -236,10 +248,13 @@ class Segment:
 
     def block_sums(self, fit: Linearisation) -> Block:
         """Reduce a linearised fit of these samples to sums of products; the scores are those of G for each second."""
-        rows = fit.rows - (fit.rows @ self.waves.T) @ self.wave_gram_inverse @ self.waves
-        first = np.arange(0, self.dp.size, round(self.machine.rate))  # index of the first sample of each second
-        scores = np.add.reduceat(rows[1 + G] * rows, first, axis=1).T
-        return Block(fit.theta, fit.gram, self.n_samples, scores)
+        slope = fit.rows[1 + G] - fit.amplitudes[1 + G] @ self.waves  # without the hum
+        length, scores = round(self.machine.rate), list[Array]()
+        for first in range(0, self.dp.size, length):  # first sample of each second
+            second = slice(first, first + length)
+            by_waves = fit.amplitudes @ (self.waves[:, second] @ slope[second])
+            scores.append(fit.rows[:, second] @ slope[second] - by_waves)
+        return Block(fit.theta, fit.gram, self.n_samples, np.array(scores))
 
 
 def _prepare_hum(block: Recording, n_settling: int) -> tuple[Array, Array, Array]:
@@ -487,14 +502,23 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
     (K, p), the model is linearised step by step, until a fit explains the recording but for its noise. Returns the best
     fit; raises LinAlgError if there is none.
     """
-    states = follower.states
+    states, priors = follower.states, follower.priors
     seconds = float(np.mean([block.duration for block in blocks]))
+    prior_precision = joint_prior_precision(len(blocks), priors, seconds)
 
-    def linearise(theta: Array) -> Joint:
-        """Simulate all blocks with the parameters `theta` (K, p) and fit them together."""
+    def linearise(theta: Array, max_cost: float = math.inf) -> Joint | None:
+        """Simulate all blocks with the parameters `theta` (K, p) and fit them together.
+
+        The result is None if -2 log posterior of `theta` exceeds `max_cost`. The simulation ends as soon as it does.
+        """
         follower.states, follower.last = states, math.nan
-        sums = [follower.linearise(block, row) for block, row in zip(blocks, theta, strict=True)]
-        return Joint.fit(sums, follower.priors, seconds, G)
+        cost, sums = prior_cost(theta, priors, prior_precision), list[Block]()
+        for block, row in zip(blocks, theta, strict=True):
+            if cost > max_cost:
+                return None
+            sums.append(follower.linearise(block, row))
+            cost += float(sums[-1].gram[0, 0]) / noise  # the residual's sum of squares
+        return None if cost > max_cost else Joint.fit(sums, priors, prior_precision, G)
 
     def converge(joint: Joint) -> Joint:
         """Take Gauss-Newton steps, or fractions of them, as long as each improves the fit clearly."""
@@ -502,9 +526,9 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
         for _ in range(_N_JOINT_STEPS):
             if not (joint.gain >= _MIN_GAIN and fraction > _SMALLEST_STEP):
                 break
-            step = fraction * (joint.fitted - joint.theta)
-            stepped = linearise(limit_step(joint.theta + step, joint.theta))
-            if joint.cost(noise) - stepped.cost(noise) >= _MIN_GAIN:
+            step, cost = fraction * (joint.fitted - joint.theta), joint.cost(noise)
+            stepped = linearise(limit_step(joint.theta + step, joint.theta), cost - _MIN_GAIN)
+            if stepped is not None and cost - stepped.cost(noise) >= _MIN_GAIN:
                 joint, fraction = stepped, 1.0
             else:
                 fraction *= _SMALLER_STEP
@@ -513,7 +537,9 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
     best_cost, best = math.inf, None
     for start in starts:
         try:
-            joint = converge(linearise(start))
+            begin = linearise(start)
+            assert begin is not None  # without a limit of the cost
+            joint = converge(begin)
         except np.linalg.LinAlgError:
             continue
         cost = float(np.nan_to_num(joint.cost(noise), nan=np.inf))

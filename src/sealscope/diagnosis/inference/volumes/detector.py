@@ -34,6 +34,7 @@ from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.chambers import CHAMBERS
@@ -197,7 +198,7 @@ class VolumeBalance:
         - `stroke`, with a position: ends of the recorded motion [m];
         - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
         """
-        return compute_once(recording, (self.name, self.rig, "summary"), self._summarise)
+        return learn_once(recording, (self.name, "summary"), self._summarise, self.rig)
 
     def _summarise(self, recording: Recording) -> Summary | None:
         """Compute the summary of a healthy recording (`learn`)."""
