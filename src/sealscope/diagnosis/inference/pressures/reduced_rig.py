@@ -27,6 +27,7 @@ from sealscope.physics.motor import controller_voltage, shaft_acceleration, wind
 from sealscope.physics.pump import pump_flow, pump_torque
 from sealscope.physics.rig import rig_numbers
 from sealscope.recordings.recording import Array
+from sealscope.signals.spectrum import average_power
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -270,8 +271,6 @@ class Machine(NamedTuple):
         [Pa], which has the same noise and hum but does not ring. A single peak is repeated. If no frequency of the
         spectrum lies within the prior of the stiffness (`priors`), both results are the centre of this prior.
         """
-        from scipy.signal import welch
-
         relative_width = priors.width[K_OIL] / priors.centre[K_OIL]
         n_padded = 4 * _SEGMENT  # samples of a segment with zeros, for a finer grid of frequencies
         middle = n_padded / self.ringing_period(priors.centre[K_OIL])  # bin of the ringing at the centre of the prior
@@ -283,7 +282,7 @@ class Machine(NamedTuple):
         if not bins.size:
             return np.full(2, priors.centre[K_OIL])
         segment = min(_SEGMENT, dp.size)
-        _, (difference_power, total_power) = welch(np.array([dp, total]), nperseg=segment, nfft=n_padded, detrend=False)
+        difference_power, total_power = average_power(np.array([dp, total]), segment, n_padded)
         excess = np.pad((difference_power - total_power)[bins], 1, constant_values=-np.inf)  # so that ends may be peaks
         peaks = np.flatnonzero((excess[1:-1] > excess[:-2]) & (excess[1:-1] >= excess[2:]))
         strongest = np.resize(peaks[np.argsort(-excess[1 + peaks])], 2)  # a single peak is repeated
