@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.parameters import load_rig
 from sealscope.parameters.rig import Rig
 from sealscope.physics.rig import rig_numbers
+from sealscope.signals.recursion import filter_recursively
 from sealscope.simulation.bench.machines import draw
 from sealscope.simulation.bench.profile import load_profile
 from sealscope.simulation.changes import ParameterDrift, linear_path
@@ -152,6 +154,15 @@ def test_a_slow_transducer_answers_a_ramp_as_the_closed_form(lag):
     assert filter_first_order(t, lag, 2000.0) == pytest.approx(expected, abs=1e-12)
     assert filter_first_order(np.full(5, 3.0), lag, 2000.0) == pytest.approx(np.full(5, 3.0), rel=1e-12)
     assert filter_first_order(t, 0.0, 2000.0) is t
+
+
+def test_a_recursive_filter_equals_that_of_scipy():
+    random = np.random.default_rng(89)
+    for _ in range(20):
+        values = random.normal(3.0, 1.0, random.integers(1, 400))
+        decay, b_0, b_1, carried = random.uniform(-1.0, 1.0, 4)
+        expected, _ = lfilter([b_0, b_1], [1.0, -decay], values, zi=[carried])
+        np.testing.assert_allclose(filter_recursively(values, decay, b_0, b_1, carried), expected, rtol=0, atol=1e-12)
 
 
 def test_a_jittering_clock_samples_where_it_says():

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sealscope.compiled import kernel
 from sealscope.physics.solvers.loop import quantize
 from sealscope.recordings.chambers import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
+from sealscope.signals.recursion import filter_recursively
 from sealscope.simulation.changes import apply_effects
 from sealscope.simulation.experiment import FILTER_REACH, Experiment
 
@@ -71,18 +71,8 @@ def filter_first_order(values: Array, lag: float, rate: float) -> Array:
     decay = math.exp(-1.0 / (lag * rate))
     mean_decay = (1.0 - decay) * lag * rate  # mean of exp(-t/lag) over one interval
     b_0 = 1.0 - mean_decay
-    return np.asarray(_filter_recursively(np.ascontiguousarray(values, np.float64), decay, b_0, mean_decay - decay))
-
-
-@kernel
-def _filter_recursively(values: Array, decay: float, b_0: float, b_1: float) -> Array:
-    """Compute y_k = decay y_(k-1) + b_0 x_k + b_1 x_(k-1), settled at the first value of the signal x (n,)."""
-    output = np.empty(values.size)
-    carried = (1.0 - b_0) * values[0]  # what the samples before contribute
-    for k in range(values.size):
-        output[k] = b_0 * values[k] + carried
-        carried = b_1 * values[k] + decay * output[k]
-    return output
+    # settled at the first value of the signal
+    return filter_recursively(values, decay, b_0, mean_decay - decay, (1.0 - b_0) * values[0])
 
 
 def sample_with_jitter(sample: Callable[[Array], Array], values: Array, lateness: Array | None) -> Array:

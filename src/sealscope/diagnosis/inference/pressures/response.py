@@ -23,7 +23,6 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
-from scipy.signal import lfilter
 
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import Information
@@ -63,6 +62,7 @@ from sealscope.physics.lanes import WIDTH
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.signals.recursion import filter_recursively
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -207,7 +207,7 @@ class Segment:
         change[1:-1] -= (change[2:] - 2.0 * change[1:-1] + change[:-2]) / 6.0
         by_lead = theta[SCALE] * self.machine.rate * change  # time derivative of the reading
         decay = math.exp(-1.0 / (self.machine.rate * max(theta[LAG], _MIN)))
-        by_lag = lfilter([decay - 1.0], [1.0, -decay], by_lead)  # first-order low pass of -by_lead
+        by_lag = filter_recursively(by_lead, decay, decay - 1.0)  # first-order low pass of -by_lead
         return np.array([by_lead, by_lag, response]) * self.priors.unit[LEAD:OFFSET, None]
 
     def descend(self, fit: Linearisation, prior: Normal, n_steps: int, noise: float | None = None) -> Linearisation:
