@@ -29,6 +29,7 @@ import sealscope as ss
 from sealscope.diagnosis.live.kernel import stream as kernel
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.run_program import CompiledStream
+from sealscope.emit.single_precision import learn_basis
 from sealscope.emit.stream_program import StreamProgram, stream_program
 
 COMPILER = "arm-none-eabi-gcc"
@@ -195,10 +196,18 @@ def iter_samples(samples: np.ndarray) -> Iterator[np.ndarray]:
         yield from samples + spread * random.standard_normal(samples.shape)
 
 
+def single_unit(unit: StreamProgram) -> StreamProgram:
+    """Build the program in single precision, with the basis that a recording of 100 s shows."""
+    texts = render_c(unit, prefix="leak", title="a machine", origin="a benchmark", alarm_rate=1.0)
+    stream = CompiledStream(unit, texts, "leak")
+    for _ in stream.feed(stream_samples(unit.settings.rate, 100.0, 2), parts_a_sample(unit.settings)):
+        pass
+    return stream_program(unit.settings._replace(basis=learn_basis(stream)))
+
+
 def count_costs(
     unit: StreamProgram,
     processor: str = "m7",
-    precision: str = "double",
     full_blocks: int = 4200,
     optimise: str = "-Os",
 ) -> Costs:
@@ -215,11 +224,13 @@ def count_costs(
         n_ended = int(native.state.n_ended)
         is_counted = n_ended <= n_first or n_ended >= full_blocks
         if is_counted and int(native.state.phase) == kernel.IDLE:
-            emulator.write("reading", reading.astype(np.float64 if precision == "double" else np.float32).tobytes())
+            emulator.write(
+                "reading", reading.astype(np.float64 if unit.precision == "double" else np.float32).tobytes()
+            )
             emulator.write("state", bytes(native.state))
             sample = max(sample, emulator.run("run_sample"))
         onsets = max(onsets, int(native.state.steps_n_onsets))
-        native._call("sample", *map(ctypes.c_double, reading))
+        native._call("sample", *map(ctypes.c_double if unit.precision == "double" else ctypes.c_float, reading))
         for _ in range(n_parts if n_ended < full_blocks - 1 else 1 << 20):
             phase = int(native.state.phase)
             if phase == kernel.IDLE:
@@ -252,7 +263,8 @@ def main() -> None:
         raise SystemExit(f"{COMPILER} must be installed: apt install gcc-arm-none-eabi libnewlib-arm-none-eabi")
     settings = kernel.StreamSettings.from_rig(ss.load_rig(arguments.rig), arguments.rate)
     unit = stream_program(settings)
-    costs = count_costs(unit, arguments.processor, arguments.precision, arguments.blocks, arguments.optimise)
+    unit = single_unit(unit) if arguments.precision == "single" else unit
+    costs = count_costs(unit, arguments.processor, arguments.blocks, arguments.optimise)
     print(f"{arguments.rig}, {arguments.rate:g} Hz, {arguments.processor}, {arguments.precision}, {arguments.optimise}")
     print(f"code {costs.code_bytes / 1000:.1f} kB, state {costs.state_bytes / 1000:.1f} kB")
     print(f"leak_sample {costs.sample} instructions, leak_results {costs.results}")

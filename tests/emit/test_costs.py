@@ -14,9 +14,9 @@ from sealscope.emit.stream_program import stream_program
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rate", [25.0])
-def test_no_call_takes_a_controller_long(rate):
-    """A Cortex-M7 in double precision; the bounds are those that the how-to states."""
+@pytest.mark.parametrize("processor", ["m7", "m4f"])
+def test_no_call_takes_a_controller_long(processor):
+    """A Cortex-M7 in double precision, and an M4F in single precision."""
     pytest.importorskip("unicorn", reason="unicorn emulates the processor: pip install unicorn")
     spec = spec_from_file_location(
         "controller_costs", Path(__file__).resolve().parents[2] / "benchmarks" / "controller_costs.py"
@@ -25,7 +25,10 @@ def test_no_call_takes_a_controller_long(rate):
     spec.loader.exec_module(benchmark)
     if not shutil.which(benchmark.COMPILER):
         pytest.skip(f"needs {benchmark.COMPILER} with newlib, of Debian's gcc-arm-none-eabi")
-    costs = benchmark.count_costs(stream_program(StreamSettings.from_rig(ss.load_rig("thesis"), rate)), full_blocks=150)
-    assert costs.code_bytes <= 24000 and costs.state_bytes <= 64000
+    unit = stream_program(StreamSettings.from_rig(ss.load_rig("thesis"), 25.0))
+    if processor == "m4f":
+        unit = benchmark.single_unit(unit)
+    costs = benchmark.count_costs(unit, processor, full_blocks=150)
+    assert costs.code_bytes <= 24000 and costs.state_bytes <= (48000 if processor == "m4f" else 64000)
     assert 0 < costs.sample <= 4000 and 0 < costs.step <= 50000
     assert all(count for part, count in costs.parts.items() if part != "IDLE"), costs.parts

@@ -23,6 +23,7 @@ def export(
     flow: Annotated[str, Option(help="Channel of the pump's flow: theta, omega or q_pump.")] = "theta",
     alarms: Annotated[float, Option("--false-alarms", help="False alarms in 1000 h of a healthy machine.")] = 1.0,
     learn: Annotated[list[Path] | None, Option(metavar="FILE", help=_LEARN)] = None,
+    precision: Annotated[str, Option(help="Of C's real numbers: double or single (with --learn).")] = "double",
     prefix: Annotated[str, Option(help="Beginning of all names.")] = "leak",
 ) -> None:
     """Write the estimator of a machine's leakage, with alarm, for a controller or PLC.
@@ -51,6 +52,7 @@ def export(
         flow=flow,
         false_alarms_per_1000_h=alarms,
         learn=recordings,
+        precision=precision,  # type: ignore[arg-type]
         prefix=prefix,
         origin="" if machine is None else machine.name,
     )
@@ -58,4 +60,6 @@ def export(
     lines = [f"{output}: {names}", f"state {written.state_bytes} bytes, {written.parts_a_sample} parts a sample"]
     if paths:
         lines.append(f"learned from {written.learned_blocks} blocks of {len(paths)} recordings")
+    if written.single_error is not None:
+        lines.append(f"single precision errs by at most {written.single_error:.2g} standard deviations of a block")
     say("\n".join(lines))

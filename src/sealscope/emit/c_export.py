@@ -70,9 +70,8 @@ def render_c(
     `title`, `origin`: the machine, and its file, in words; `alarm_rate`: false alarms in 1000 h; `learned`: numbers
     that `CompiledStream.saved` returned after healthy recordings.
     """
-    text = CText(unit.program, prefix)
+    text = CText(unit.program, prefix, unit.precision)
     flow = unit.settings.channels[2]
-    state_bytes = sum((8 if field.kind == "real" else 4) * (field.size or 1) for field in unit.program.fields)
     values: dict[str, Any] = {
         "unit": unit,
         "prefix": prefix,
@@ -81,7 +80,7 @@ def render_c(
         "version": version("sealscope"),
         "results": result_rows(),
         "state": text.declare_state(),
-        "state_bytes": state_bytes,
+        "state_bytes": unit.state_bytes,
         "source": text.render_source(_PUBLIC),
         "declarations": [text.declare_function(unit.program.function(name)) for name in _DECLARED],
         "types": {"real": text.real_type, "whole": "int32_t"},

@@ -12,8 +12,10 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.live.kernel.stream import StreamSettings
+from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
+from sealscope.emit.single_precision import check_error, learn_basis, measure_error
 from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
@@ -30,12 +32,17 @@ _VECTOR_SECONDS = 90.0
 
 
 class Export(NamedTuple):
-    """The files that `export_controller` wrote, and figures of the program."""
+    """The files that `export_controller` wrote, and figures of the program.
+
+    `single_error`: largest error of single precision in a block of the recordings to learn from, in standard deviations
+    of its conductance; None in double precision.
+    """
 
     files: tuple[Path, ...]
     state_bytes: int
     parts_a_sample: int
     learned_blocks: int
+    single_error: float | None = None
 
 
 @checked_call
@@ -48,6 +55,7 @@ def export_controller(
     flow: str = "theta",
     false_alarms_per_1000_h: float = 1.0,
     learn: Sequence[Recording] = (),
+    precision: Precision = "double",
     prefix: str = "leak",
     origin: str = "",
 ) -> Export:
@@ -69,6 +77,9 @@ def export_controller(
         Largest number of false alarms of a healthy machine per 1000 operating hours.
     learn : sequence of Recording, optional
         Healthy recordings, from which the program begins to know the machine. The first also gives test vectors.
+    precision : {"double", "single"}, default "double"
+        Precision of C's real numbers. Single precision computes in columns learned from the recordings, and must err by
+        at most a tenth of a standard deviation in each of their blocks.
     prefix : str, default "leak"
         Beginning of all names.
     origin : str, optional
@@ -82,8 +93,8 @@ def export_controller(
     Raises
     ------
     InputError
-        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate, or
-        learning needs a C compiler and there is none.
+        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate,
+        single precision errs too much, or learning needs a C compiler and there is none.
 
     Examples
     --------
@@ -94,6 +105,11 @@ def export_controller(
     """
     if language not in ("c", "st"):
         raise InputError(f"language must be c or st, got {language!r}")
+    if precision not in ("double", "single"):
+        raise InputError(f"precision must be double or single, got {precision!r}")
+    if precision == "single" and (language != "c" or not learn):
+        lacking = "the language c" if language != "c" else "healthy recordings to learn from"
+        raise InputError(f"single precision must have {lacking}")
     if not _PREFIX.fullmatch(prefix) or len(prefix) > 16:
         raise InputError(f"prefix must be a name of at most 16 letters and digits, got {prefix!r}")
     machine = load_rig(rig)
@@ -105,7 +121,15 @@ def export_controller(
         "alarm_rate": false_alarms_per_1000_h,
     }
     samples = [_samples_of(recording, unit) for recording in learn]
-    learned, blocks = _learn(unit, samples, words) if samples else ((), 0)
+    learned: Sequence[float] = ()
+    blocks, error = 0, None
+    if samples:
+        stream, blocks = _learn(unit, samples, words)
+        if precision == "single":
+            unit = stream_program(unit.settings._replace(basis=learn_basis(stream)))
+            error = _prove_single(stream.unit, unit, samples, words)
+            stream, blocks = _learn(unit, samples, words)
+        learned = stream.saved()
     texts: Mapping[str, str]
     if language == "c":
         texts = render_c(unit, **words, learned=learned)
@@ -119,8 +143,7 @@ def export_controller(
     for name, text in texts.items():
         with atomic_write(place / name) as temporary:
             Path(temporary).write_text(text, encoding="utf-8")
-    state_bytes = sum((8 if field.kind == "real" else 4) * (field.size or 1) for field in unit.program.fields)
-    return Export(tuple(place / name for name in texts), state_bytes, parts_a_sample(unit.settings), blocks)
+    return Export(tuple(place / name for name in texts), unit.state_bytes, parts_a_sample(unit.settings), blocks, error)
 
 
 def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
@@ -136,8 +159,8 @@ def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
     return np.stack([recording[name] for name in settings.channels], axis=1)
 
 
-def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]) -> tuple[list[float], int]:
-    """Run the program on healthy recordings; return the numbers that it saves, and how many blocks it estimated.
+def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]) -> tuple[CompiledStream, int]:
+    """Run the program on healthy recordings; return it, and how many blocks it estimated.
 
     Raises InputError if no block could be estimated, or a recording raises an alarm.
     """
@@ -153,4 +176,14 @@ def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str,
         blocks += int(stream.state.n_estimated)
     if not blocks:
         raise InputError("recordings to learn from must have a minute of motion or more, got none that was estimated")
-    return stream.saved(), blocks
+    return stream, blocks
+
+
+def _prove_single(
+    double: StreamProgram, single: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]
+) -> float:
+    """Measure the error of single precision on recordings; raise InputError if it is not small."""
+    streams = [CompiledStream(unit, render_c(unit, **words), str(words["prefix"])) for unit in (double, single)]
+    error = measure_error(streams[0], streams[1], recordings)
+    check_error(error)
+    return error

@@ -20,7 +20,7 @@ from sealscope.recordings.recording import Array
 #: Flags by which results equal those of numba's code to the bit: no fused multiplication and addition.
 FLAGS = ("-std=c99", "-O2", "-ffp-contract=off")
 _COMPILE_TIMEOUT = 120.0
-_KINDS: Mapping[str, Any] = {"real": ctypes.c_double, "whole": ctypes.c_int32, "truth": ctypes.c_bool}
+_KINDS: Mapping[str, Any] = {"whole": ctypes.c_int32, "truth": ctypes.c_bool}
 
 
 class CompiledStream:
@@ -38,7 +38,9 @@ class CompiledStream:
 
     def __init__(self, unit: StreamProgram, texts: Mapping[str, str], prefix: str) -> None:
         self.unit, self._prefix = unit, prefix
-        fields = [(f.name, _KINDS[f.kind] * f.size if f.size else _KINDS[f.kind]) for f in unit.program.fields]
+        self._real = ctypes.c_double if unit.precision == "double" else ctypes.c_float
+        kinds = {"real": self._real, **_KINDS}
+        fields = [(f.name, kinds[f.kind] * f.size if f.size else kinds[f.kind]) for f in unit.program.fields]
         self.state = type("State", (ctypes.Structure,), {"_fields_": fields})()
         with tempfile.TemporaryDirectory(prefix="sealscope-c-") as folder:
             self._library = self._compile(Path(folder), texts)
@@ -85,7 +87,7 @@ class CompiledStream:
         """Add samples (n, 4), and yield the results after each block."""
         blocks = int(self.state.n_ended)
         for reading in samples:
-            self._call("sample", *map(ctypes.c_double, reading))
+            self._call("sample", *map(self._real, reading))
             works = True
             for _ in range(parts_a_sample):
                 works = bool(self._call("step"))

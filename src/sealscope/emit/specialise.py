@@ -153,7 +153,11 @@ def allocate_fields(layout: np.dtype[Any]) -> tuple[tuple[StateField, ...], dict
     return tuple(fields), places
 
 
-def specialise(layout: np.dtype[Any], entries: Mapping[str, tuple[Any, Mapping[str, Any]]]) -> Program:
+def specialise(
+    layout: np.dtype[Any],
+    entries: Mapping[str, tuple[Any, Mapping[str, Any]]],
+    constants: Mapping[str, float] | None = None,
+) -> Program:
     """Specialise kernels to a program whose state is a record of the dtype `layout`.
 
     Parameters
@@ -163,13 +167,15 @@ def specialise(layout: np.dtype[Any], entries: Mapping[str, tuple[Any, Mapping[s
     entries : mapping of str to tuple
         Name of each function to be called from outside; the kernel, and a value for each of its arguments: "state" for
         the record, "real" or "whole" for a number, anything else for a setting.
+    constants : mapping of str to float, optional
+        Values of module constants, by name, that differ from the kernels' own, such as limits of rounding.
 
     Raises
     ------
     InputError
         A kernel is outside of the subset that can be written; the message has file, line and reason.
     """
-    writer = _Writer(layout)
+    writer = _Writer(layout, constants or {})
     for name, (kernel, arguments) in entries.items():
         values = {key: _value_of_argument(key, kind, layout) for key, kind in arguments.items()}
         writer.add_function(source_function(kernel), values, name)
@@ -198,8 +204,8 @@ def _kind_of(dtype: np.dtype[Any]) -> Kind:
 class _Writer:
     """The program under construction: its functions by what they are specialised for, and its tables."""
 
-    def __init__(self, layout: np.dtype[Any]) -> None:
-        self.layout = layout
+    def __init__(self, layout: np.dtype[Any], constants: Mapping[str, float]) -> None:
+        self.layout, self.constants = layout, constants
         self.fields, self.places = allocate_fields(layout)
         self.functions: dict[Any, Function] = {}
         self.writes_state: set[str] = set()
@@ -346,7 +352,8 @@ class _Body:
         function = self._function
         closure = function.__closure__ or ()
         captured = {name: cell.cell_contents for name, cell in zip(function.__code__.co_freevars, closure, strict=True)}
-        return {**vars(builtins), **function.__globals__, **captured}
+        changed = {name: value for name, value in self._writer.constants.items() if name in function.__globals__}
+        return {**vars(builtins), **function.__globals__, **changed, **captured}
 
     def write(self, name: str, keeps_parameters: bool) -> Function:
         """Write the function, again until the kinds of its variables are settled.

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,6 +19,7 @@ from sealscope.diagnosis.live.kernel.stream import (
     stream_kernels,
     stream_layout,
 )
+from sealscope.emit.c99 import Precision
 from sealscope.emit.program import Program, StateField
 from sealscope.emit.specialise import specialise
 
@@ -57,6 +59,17 @@ class StreamProgram(NamedTuple):
     program: Program
 
     @property
+    def precision(self) -> Precision:
+        """Precision of the program's real numbers."""
+        return "single" if self.settings.basis else "double"
+
+    @property
+    def state_bytes(self) -> int:
+        """Size of the state in C [bytes]."""
+        real = 4 if self.settings.basis else 8
+        return sum((real if field.kind == "real" else 4) * (field.size or 1) for field in self.program.fields)
+
+    @property
     def learned_fields(self) -> tuple[StateField, ...]:
         """Fields that outlast a power cut."""
         fields = {field.name: field for field in self.program.fields}
@@ -79,9 +92,18 @@ class StreamProgram(NamedTuple):
         return hashlib.sha256(repr((self.settings, self.program)).encode()).hexdigest()[:16]
 
 
+#: Constants of the kernels in single precision: limits of rounding, least and largest numbers.
+SINGLE_CONSTANTS: Mapping[str, float] = MappingProxyType(
+    {"RIDGE": 1e-6, "ROUNDING": 1e-7, "TINY": 1e-30, "MOST_EXPLAINED": 1.0 - 1e-6, "MAX_READING": 1e12}
+)
+
+
 @lru_cache(maxsize=8)
 def stream_program(settings: StreamSettings) -> StreamProgram:
-    """Specialise the kernels of a stream to a program whose state includes the results."""
+    """Specialise the kernels of a stream to a program whose state includes the results.
+
+    With a basis in its settings, the program is one for single precision.
+    """
     kernels, layout = stream_kernels(settings), stream_layout(settings)
     fields = {name: (dtype, offset) for name, (dtype, offset, *_) in (layout.fields or {}).items()}
     fields["results"] = np.dtype(("f8", (len(RESULTS),))), layout.itemsize
@@ -100,7 +122,7 @@ def stream_program(settings: StreamSettings) -> StreamProgram:
     }
     entries["add_sample"] = (kernels.add_sample, {"m": "state", **channels})
     entries["results"] = (results, {"m": "state"})
-    return StreamProgram(settings, specialise(with_results, entries))
+    return StreamProgram(settings, specialise(with_results, entries, SINGLE_CONSTANTS if settings.basis else None))
 
 
 def result_rows() -> Sequence[tuple[str, str, str]]:

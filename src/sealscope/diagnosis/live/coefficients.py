@@ -31,6 +31,8 @@ STANDSTILL: float = LIVE.block.standstill
 _MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
 _SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)
 TINY = float(np.finfo(float).tiny)
+#: A residual's sum of squares below this fraction of the left side's is due to rounding.
+ROUNDING = 1e-14
 
 #: Indices of `Coefficients.numbers`.
 ROWS = 0  # number of equations in the sums
@@ -47,6 +49,7 @@ class Coefficients(NamedTuple):
     # work arrays
     block: Any  # (n + 2, n + 2): products of one block
     matrix: Any  # (n, n + 3): normal equations
+    volume: Any  # (1,): sum of squares of the measured volume in one block
     sums: Any  # (n + 2, n + 2): weighted products of the columns of nuisances, leak and left side
     values: Any  # (n,): the nuisances
     leak_products: Any  # (n,): products of the leak's column with the nuisances' columns
@@ -55,7 +58,7 @@ class Coefficients(NamedTuple):
 
 def coefficient_shapes(n: int) -> tuple[tuple[int, ...], ...]:
     """Return the shapes of the arrays of a `Coefficients` with n nuisances, in the order of its fields."""
-    return (n + 2, n + 2), (n, n + 3), (n + 2, n + 2), (n,), (n,), (6,)
+    return (n + 2, n + 2), (n, n + 3), (1,), (n + 2, n + 2), (n,), (n,), (6,)
 
 
 @law
@@ -68,6 +71,7 @@ def load_block(model: Any, gram: Any, column_order: Any) -> None:
     for i in range(len(column_order)):
         for j in range(len(column_order)):
             model.block[i, j] = gram[column_order[i], column_order[j]]
+    model.volume[0] = gram[column_order[-1], column_order[-1]]
 
 
 @large_law
@@ -99,7 +103,7 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
         model.leak_products[i] = _MEMORY * model.leak_products[i] + block[i, leak]
     model.numbers[ENERGY] = _MEMORY * model.numbers[ENERGY] + block[leak, leak]
     model.numbers[ROWS] = _MEMORY * model.numbers[ROWS] + weight * rows
-    model.numbers[MOTION] = _MEMORY * model.numbers[MOTION] + weight * block[size - 1, size - 1]
+    model.numbers[MOTION] = _MEMORY * model.numbers[MOTION] + weight * model.volume[0]
 
 
 @large_law
@@ -152,7 +156,7 @@ def fit_coefficients(model: Any) -> None:
     for i in range(n):
         model.values[i] = solution[i, 0]
     square = _sum_residual_squares(model.sums, solution)
-    rounding = 1e-14 * model.sums[n + 1, n + 1]  # a smaller residual is due to rounding
+    rounding = ROUNDING * model.sums[n + 1, n + 1]
     model.numbers[NOISE] = max(square, rounding, TINY) / model.numbers[ROWS]
 
 

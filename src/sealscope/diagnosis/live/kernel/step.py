@@ -43,6 +43,8 @@ _JUMP_SQUARE = float(LIVE.coefficients.jump) ** 2
 _MIN_SQUARE = 1e-12
 #: Number of innovations from which on onsets are possible, and the probabilities of the walks are updated.
 _N_WARM = 4
+#: Logarithms that are summed over all blocks begin anew beyond this, so that their differences stay exact.
+_MOST_LOG = 4096.0
 #: Number of blocks from one thinning of the onsets to the next.
 _SELECT_EVERY = 8
 #: Most recent and older blocks with onsets: those since the last thinning, and those that it keeps.
@@ -51,9 +53,9 @@ MAX_BLOCKS, MAX_ONSETS = MAX_RECENT + MAX_OLD, MAX_RECENT * _N_PARTS + MAX_OLD
 _LOG_CHOICES = math.log(_N_SIZES * _N_PARTS)
 _LOG_PI = math.log(math.pi)
 #: Least positive number, against division by 0.
-_TINY = float(np.finfo(float).tiny)
+TINY = float(np.finfo(float).tiny)
 #: Share of T that a step explains at most, so that its logarithm is finite.
-_MOST_EXPLAINED = 1.0 - 1e-15
+MOST_EXPLAINED = 1.0 - 1e-15
 #: Standard deviations beyond which a size has practically no probability, and steps of the search for the bound.
 _FAR, BISECTIONS = 12.0, 50
 #: Tail of the posterior on either side of the interval of the onset.
@@ -275,6 +277,10 @@ def _add_evidence(d: Any) -> None:
         density -= 0.5 * (n + 1.0) * math.log1p(d.square[q] / d.squares[q])
         total = add_logs(total, d.log_prior[q] + density)
     d.log_evidence += total
+    if abs(d.log_evidence) > _MOST_LOG:
+        for b in range(int(d.n_stored)):
+            d.blocks[b, EVIDENCE] -= d.log_evidence
+        d.log_evidence = 0.0
 
 
 @large_law
@@ -318,6 +324,10 @@ def _update_walks(d: Any) -> None:
             total = add_logs(total, d.log_weights[q])
         d.squares[q] = _MEMORY * d.squares[q] + square
         d.log_variances[q] += math.log(d.variance[q])
+        if abs(d.log_variances[q]) > _MOST_LOG:
+            for b in range(int(d.n_stored)):
+                d.sums[LOG_PRIOR, q, b] -= 0.5 * d.log_variances[q]
+            d.log_variances[q] = 0.0
     if d.count >= _N_WARM:
         for q in range(_N_WALKS):
             d.log_weights[q] -= total
@@ -336,7 +346,7 @@ def limit_log_e(d: Any) -> float:
         for q in range(_N_WALKS):
             a, b = _step_sums(d, q, k, part)
             a = max(a, 0.0)
-            explained = min(a * a / (b * d.sums[T, q, k]), _MOST_EXPLAINED)
+            explained = min(a * a / (b * d.sums[T, q, k]), MOST_EXPLAINED)
             largest = max(largest, -0.5 * d.blocks[k, N] * math.log1p(-explained))
     return float(largest + math.log(d.n_onsets / _N_PARTS)) if d.n_onsets > 0 else LOG_ZERO
 
@@ -418,7 +428,7 @@ def _spacing(d: Any, j: int) -> float:
     before, after = max(j - 1, 0), min(j + 1, last)
     if after == before:
         return 1.0
-    return float(max((_time_of(d, after) - _time_of(d, before)) / (after - before), _TINY))
+    return float(max((_time_of(d, after) - _time_of(d, before)) / (after - before), TINY))
 
 
 @law
@@ -461,7 +471,7 @@ def start_bound(d: Any) -> None:
 @law
 def _size_deviation(a: float, b: float, squares: float, n: float) -> float:
     """Compute the standard error of the least-squares size a/b of a step, from T (`squares`) of n innovations."""
-    return max(math.sqrt(max(squares - a * (a / b), _TINY) / n / b), _TINY)
+    return max(math.sqrt(max(squares - a * (a / b), TINY) / n / b), TINY)
 
 
 @large_law

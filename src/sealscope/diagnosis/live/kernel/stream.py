@@ -151,6 +151,28 @@ _WHOLE_NUMBERS = (
 )
 
 
+class Basis(NamedTuple):
+    """Columns of rows in which single precision computes: well conditioned, and of magnitudes near 1.
+
+    Terms of a balance are nearly collinear; the squares of their rows have a condition number of 1e8, more than single
+    precision resolves. A row u of the n nuisances (all columns but the leak and the left side) is replaced by a
+    triangular combination, which only changes what the nuisances' coefficients mean: column i becomes `constant`[i]
+    times the constant flow plus the sum over k <= i of `combination`[i (i + 1)/2 + k] u[k]. The left side becomes
+    (left - sum over j of `prediction`[j] u[j]) times `left_scale`.
+    """
+
+    constant: tuple[float, ...]  # (n,)
+    combination: tuple[float, ...]  # (n (n + 1)/2,)
+    prediction: tuple[float, ...]  # (n,)
+    leak_scale: float
+    left_scale: float
+
+    @property
+    def conductance_unit(self) -> float:
+        """Unit of the estimated conductances [m^3/(s Pa)]."""
+        return self.leak_scale / self.left_scale
+
+
 class StreamSettings(NamedTuple):
     """The settings of a stream, which become constants of its kernels."""
 
@@ -164,6 +186,7 @@ class StreamSettings(NamedTuple):
     displacement: float  # of the pump [m^3/rad], 1 if a meter gives the flow
     size_error: float  # relative standard error of the leakage due to the machine's displacement and piston area
     log_threshold: float  # of the score
+    basis: Basis | None = None  # for single precision
 
     @classmethod
     def from_rig(
@@ -204,6 +227,11 @@ class StreamSettings(NamedTuple):
         )
 
     @property
+    def row_width(self) -> int:
+        """Number of columns of a row: with a `basis`, the measured volume, too, which shows motion."""
+        return len(self.expressions) + (self.basis is not None)
+
+    @property
     def counts(self) -> tuple[int, int, int]:
         """Samples in a stride, strides in a block, and samples in half a difference.
 
@@ -223,9 +251,10 @@ def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
     n_columns = len(settings.expressions)
     n_slow = len(settings.column_order) - settings.n_fast - 1  # - 1: the left side
     support_rows = SUPPORT * block_strides
-    n_packed = n_columns * (n_columns + 1) // 2
+    width = settings.row_width
+    n_packed = width * (width + 1) // 2
     # finished rows: of the blocks that are worked on, then of the open ones; later than the first blocks, one of each
-    n_rows, n_later = (support_rows + block_strides) * n_columns, 2 * block_strides * n_columns
+    n_rows, n_later = (support_rows + block_strides) * width, 2 * block_strides * width
     arena = max(LEARNED * n_packed, n_rows - n_later + SUPPORT * n_packed)
     steps = step.detector_layout(gap=n_later, sums=arena)
     end_of_sums, end_of_steps = _offset(steps, step.SCRATCH[0]), steps.itemsize
@@ -240,17 +269,17 @@ def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
     )
     # nuisances: all columns but the leak and the left side
     shapes = dict(zip(Coefficients._fields, coefficient_shapes(n_columns - 2), strict=True))
-    gram_bytes = 8 * n_columns * n_columns
+    gram_bytes = 8 * width * width
     workspace_begin = end_of_sums + gram_bytes
     model_begin = workspace_begin + _offset(workspace, "reduced")
     end_of_work = max(end_of_steps, workspace_begin + workspace.itemsize)
     model = _model_layout(shapes, end_of_work - model_begin)
     fields: dict[str, tuple[Any, int]] = {
         "steps": (steps, 0),
-        "rows": (("f8", (support_rows + block_strides, n_columns)), _offset(steps, "sums") - 8 * n_later),
+        "rows": (("f8", (support_rows + block_strides, width)), _offset(steps, "sums") - 8 * n_later),
         # lower triangles of the Gram matrices of blocks that wait for the first fit, the first block at the end
         "waiting_grams": (("f8", (LEARNED, n_packed)), end_of_sums - 8 * LEARNED * n_packed),
-        "gram": (("f8", (n_columns, n_columns)), end_of_sums),  # of the block that is worked on
+        "gram": (("f8", (width, width)), end_of_sums),  # of the block that is worked on
         "workspace": (workspace, workspace_begin),
         "model": (model, model_begin),
     }
@@ -284,12 +313,12 @@ def _offset(layout: np.dtype[Any], name: str) -> int:
 
 
 def _model_layout(shapes: dict[str, tuple[int, ...]], work_bytes: int) -> np.dtype[Any]:
-    """Build the layout of a `Coefficients` whose work arrays, its first two fields, take `work_bytes` or more."""
+    """Build the layout of a `Coefficients` whose work arrays, its first three fields, take `work_bytes` or more."""
     sizes = [8 * math.prod(shape) for shape in shapes.values()]
-    begin = max(work_bytes, sizes[0] + sizes[1])
-    offsets = [0, sizes[0], *(begin + sum(sizes[2:k]) for k in range(2, len(sizes)))]
+    begin = max(work_bytes, sum(sizes[:3]))
+    offsets = [*(sum(sizes[:k]) for k in range(3)), *(begin + sum(sizes[3:k]) for k in range(3, len(sizes)))]
     formats = [("f8", shape) for shape in shapes.values()]
-    end = begin + sum(sizes[2:])
+    end = begin + sum(sizes[3:])
     return np.dtype({"names": [*shapes], "formats": formats, "offsets": offsets, "itemsize": end})
 
 
@@ -331,6 +360,11 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     quantiles = tuple(float(stdtrit(freedom, order)) for freedom in range(1, WINDOW))  # Student's t
     own_size_error, own_displacement, own_threshold = settings.size_error, settings.displacement, settings.log_threshold
     leak_error = math.hypot(settings.size_error, float(LIVE.watch.law))
+    basis = settings.basis
+    row_width, volume = settings.row_width, settings.row_width - 1  # volume: column of the measured volume
+    # without a basis the names are not used
+    constant, combination, prediction, leak_scale, left_scale = basis or ((), (), (), 1.0, 1.0)
+    unit = 1.0 if basis is None else basis.conductance_unit
     increments = build_increments(settings.expressions, {name: k for k, name in enumerate(channels)})
     compute_increments = large_law(increments)
 
@@ -365,6 +399,29 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             m.pressure_sums[slot, _NUMBER] += 1.0
 
     @law
+    def copy_row(m: Any, place: int, slot: int) -> None:
+        """Copy the row that is finished in `slot` to `place` of the rows."""
+        for j in range(n_columns):
+            m.rows[place, j] = m.unfinished[slot, j]
+
+    @large_law
+    def transform_row(m: Any, place: int, slot: int) -> None:
+        """Write the row that is finished in `slot` to `place` of the rows, in the columns of the basis."""
+        entry, left = 0, m.unfinished[slot, response]
+        m.rows[place, volume] = left * left_scale
+        for i in range(n_columns - 2):
+            total = constant[i] * m.unfinished[slot, bias]
+            for k in range(i + 1):
+                total += combination[entry + k] * m.unfinished[slot, k]
+            entry += i + 1
+            m.rows[place, i] = total
+            left -= prediction[i] * m.unfinished[slot, i]
+        m.rows[place, leak] = m.unfinished[slot, leak] * leak_scale
+        m.rows[place, response] = left * left_scale
+
+    store_row = copy_row if basis is None else transform_row
+
+    @law
     def add_sample(m: Any, p_A: float, p_B: float, flow: float, x: float) -> None:
         """Add a sample to the state; after the last row of a block, begin the work at its end."""
         n_samples = int(m.sample_count)
@@ -391,8 +448,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             return
         is_finite, place = True, int(m.n_rows)
         if place < capacity:
-            for j in range(n_columns):
-                m.rows[place, j] = m.unfinished[row % SPAN, j]
+            store_row(m, place, row % SPAN)
+            for j in range(row_width):
                 is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
             if is_finite:  # a row with a missing measurement is overwritten by the next
                 m.n_rows = place + 1
@@ -482,8 +539,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             gram = m.waiting_grams[LEARNED - 1 - k]
             weight += gram[packed_index(bias, bias)]
             leak_sum += gram[packed_index(max(bias, leak), min(bias, leak))]
-            response_sum += gram[packed_index(response, bias)]
-            product += gram[packed_index(response, leak)]
+            response_sum += gram[packed_index(volume, bias)]
+            product += gram[packed_index(volume, leak)]
         m.angle_sign = -1.0 if product < leak_sum * response_sum / weight else 1.0
 
     @law
@@ -500,6 +557,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             for j in range(i + 1):
                 m.model.block[i, j] = m.waiting_grams[LEARNED - 1 - k, packed_index(i, j)]
                 m.model.block[j, i] = m.model.block[i, j]
+        m.model.volume[0] = m.waiting_grams[LEARNED - 1 - k, packed_index(volume, volume)]
         correct_sign(m)
 
     @large_law
@@ -512,7 +570,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         updated with the block.
         """
         model = m.model
-        motion = relative_motion(model.block[-1, -1], n_rows, model.numbers)  # [-1, -1]: sum of the squared response
+        motion = relative_motion(model.volume[0], n_rows, model.numbers)
         # G and the shift are multiplied by the precision, the systematic variance of G by the square of the precision
         precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
         if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
@@ -585,7 +643,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         if not n_rows > 0.0:
             m.reason = _MISSING
             return
-        motion_square = m.gram[response, response]
+        motion_square = m.gram[volume, volume]
         if m.usual_precision > 0.0:  # after the first fit
             motion = relative_motion(motion_square, n_rows, m.model.numbers)
             m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
@@ -593,6 +651,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
                 forget_standstill(m)
                 return
             load_block(m.model, m.gram, all_columns)
+            m.model.volume[0] = motion_square
             correct_sign(m)
             append_conductance(m, n_rows, pressure, number, is_learned=True)
             return
@@ -604,7 +663,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         m.waiting_sizes[k, _BLOCK_NUMBER] = number
         if m.steps.n_stored > 0:  # its memory is now that of the waiting blocks
             step.forget_onsets(m.steps)
-        for i in range(n_columns):
+        for i in range(row_width):
             for j in range(i + 1):
                 m.waiting_grams[LEARNED - 1 - k, packed_index(i, j)] = m.gram[i, j]
         m.n_waiting = k + 1
@@ -760,7 +819,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             quantiles[n - 2] * math.sqrt(variance),
             WITHIN_95 * math.sqrt(mean_of(history, newest, n, _SYSTEMATIC_VARIANCE)),
         )
-        out[_OUT_G], out[_OUT_Q] = G, pressure * G
+        pressure *= unit
+        out[_OUT_G], out[_OUT_Q] = unit * G, pressure * G
         out[_OUT_Q_LOW], out[_OUT_Q_HIGH] = pressure * (G - half_width), pressure * (G + half_width)
         if m.alarm == 1:
             half_width = WITHIN_95 * math.hypot(m.leak_deviation, m.leak_error * m.leak_size)
