@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, information, solve
+from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, information
 from sealscope.diagnosis.inference.equations.terms import LEAK, Equation, Term
 from sealscope.diagnosis.inference.rows.row_weights import HUBER, SUPPORT, block_gram_matrices
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP, weak_form_rows

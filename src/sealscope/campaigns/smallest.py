@@ -19,8 +19,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.hold.plan import PlannedHold, plan_hold
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.priors.decision import DECISION
@@ -242,11 +243,11 @@ def _separation_ratio(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     middle = len(blocks) // 2
     gram = blocks.gram[:, 0].sum(axis=0)  # 0: the only equation
     gram_after_step = blocks.gram[middle:, 0].sum(axis=0)  # products of a step's column, which is 0 before the step
-    constants = np.array(roles.nuisance)
-    steps = np.array([roles.leak, roles.names.index(PUMP)])
-    cross = gram_after_step[np.ix_(constants, steps)]
-    # Fisher information of both steps with the constant terms eliminated (Schur complement)
-    information = gram_after_step[np.ix_(steps, steps)] - cross.T @ solve(gram[np.ix_(constants, constants)], cross)
+    constants, steps = list(roles.nuisance), [roles.leak, roles.names.index(PUMP)]
+    # Fisher information of both steps with the constant terms integrated out
+    cross = gram_after_step[np.ix_(steps, constants)]
+    after_step = Gaussian.from_gram(gram_after_step).among(steps)
+    information = Gaussian.from_gram(gram).among(constants).integrate_out(cross, after_step).precision
     known_pump = information[0, 0]
     unknown_pump = known_pump - information[0, 1] ** 2 / max(information[1, 1], 1e-300)  # 1e-300: no division by 0
     is_separable = unknown_pump > 1e-9 * known_pump  # beyond rounding

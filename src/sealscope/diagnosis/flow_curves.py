@@ -16,6 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.observation import limit_threads
+from sealscope.diagnosis.estimate.linear import solve
 from sealscope.diagnosis.inference.balance import (
     CLIPPED_DIFFERENCE,
     HOLE,
@@ -24,7 +25,6 @@ from sealscope.diagnosis.inference.balance import (
     derive_drive_signals,
     find_rest_limits,
 )
-from sealscope.diagnosis.inference.blocks import solve
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LOCKED, START
 from sealscope.diagnosis.inference.onset import Estimate

@@ -9,8 +9,9 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.commissioned.machine_file import read_machine
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.healthy import SummarisedRecording
-from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
+from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
@@ -135,7 +136,7 @@ def _leak_conductance(recording: SummarisedRecording, rig: Rig) -> float | None:
     # without a column for the pump's leakage, which lies in parallel, the leak's column stands for both
     nuisance = [k for k in roles.nuisance if k != roles.leak and roles.names[k] != PUMP]
     columns = [*nuisance, roles.leak]
-    *_, leak_coefficient = solve(gram[np.ix_(columns, columns)], gram[columns, roles.left])  # least squares
+    *_, leak_coefficient = Gaussian.from_gram(gram).among(columns).mean
     # true over computed flow; 0 if it is unknown: the stream computes its flows with the same assumed sizes
     scale = float(summary["scale"]) or 1.0
     conductance = float(leak_coefficient * scale)

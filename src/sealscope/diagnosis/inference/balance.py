@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, solve
+from sealscope.diagnosis.estimate.linear import RIDGE, Gaussian
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
 from sealscope.diagnosis.inference.delays import (
     DelayChange,
     DelayTest,
@@ -53,7 +54,7 @@ from sealscope.diagnosis.inference.pressure_offset import (
 )
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
-from sealscope.diagnosis.inference.rows.row_weights import RIDGE, SD_PER_MEDIAN, SUPPORT
+from sealscope.diagnosis.inference.rows.row_weights import SD_PER_MEDIAN, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     OVERLAP,
     SPAN,
@@ -559,10 +560,9 @@ def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
     `gram` (m, m): Gram matrix of the `n_rows` rows of the regression. The result is 0 if the rows do not determine the
     coefficient.
     """
-    nuisance, tested = [k for k in roles.nuisance if k != roles.leak], [roles.leak, roles.left]
-    coupling = gram[np.ix_(nuisance, tested)]
-    reduced = gram[np.ix_(tested, tested)] - coupling.T @ solve(gram[np.ix_(nuisance, nuisance)], coupling)
-    energy, moment, left_square = float(reduced[0, 0]), float(reduced[0, 1]), float(reduced[1, 1])
+    nuisance = [k for k in roles.nuisance if k != roles.leak]
+    leak = Gaussian.from_gram(gram).marginal([roles.leak], nuisance)
+    energy, moment, left_square = float(leak.precision[0, 0]), float(leak.moment[0]), leak.square
     freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
     if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
         return 0.0

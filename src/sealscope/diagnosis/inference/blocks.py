@@ -22,13 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg.lapack import dposv
 
+from sealscope.diagnosis.estimate.linear import RIDGE, Gaussian, limit_precisions, solve
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.inference.onset import History, Information
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
-    RIDGE,
     SUPPORT,
     TOLERANCE,
     block_gram_matrices,
@@ -385,28 +384,6 @@ class Weighting(SavedAttributes):
         return np.stack(grams, axis=1)
 
 
-def solve(matrix: Array, right: Array) -> Array:
-    """Solve matrix x = right for a positive semidefinite `matrix` (n, n) and `right` (n,) or (n, k).
-
-    The matrix is scaled to a unit diagonal, to which the small number `RIDGE` is added. Components of x in the null
-    space of the matrix are about zero.
-    """
-    scale = np.sqrt(np.maximum(matrix.diagonal(), 0.0))
-    scale[~(scale > 0.0)] = 1.0  # a column of zeros stays as it is
-    column = scale[:, None]
-    scaled = matrix / column / scale
-    scaled.flat[:: len(scale) + 1] += RIDGE  # this stride selects the diagonal
-    right_scale = scale if right.ndim == 1 else column
-    scaled_right = right / right_scale
-    if not scaled_right.size:  # nothing to solve
-        return np.asarray(scaled_right)
-    # of LAPACK, which is faster for a few columns than NumPy
-    _, solution, has_failed = dposv(scaled, scaled_right)
-    if has_failed:  # not positive definite, by rounding
-        solution = np.asarray(np.linalg.solve(scaled, scaled_right))
-    return np.asarray(solution / right_scale)
-
-
 def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, with_expansion: bool = False) -> Information:
     """Compute the joint likelihood of one coefficient's values in all blocks, with the other coefficients eliminated.
 
@@ -428,18 +405,11 @@ def information(blocks: Blocks, columns: Sequence[ColumnRoles], test: int, with_
     precision, vector = np.zeros((count, count)), np.zeros(count)
     for e, roles in enumerate(columns):
         fit = _fit_equation(blocks, e, roles, test)
-        normal = fit.normal
-        right_sides = np.column_stack([normal.coupling.T, normal.moment + fit.prior_moment])
-        solution = solve(normal.gram + np.diag(fit.prior_precision), right_sides)
-        schur = (np.diag(normal.energy) - normal.coupling @ solution[:, :-1]) / fit.variance
-        moment = (normal.tested_moment - normal.coupling @ solution[:, -1]) / fit.variance
+        tested = fit.tested_likelihood()
         if with_expansion:
-            # the squared errors, a diagonal matrix E, are added to the covariance, the inverse of the precision S:
-            # (S^-1 + E)^-1 = (I + S E)^-1 S, without S^-1, which may not exist
-            widening = np.linalg.inv(np.eye(count) + schur * _expansion_errors(fit, roles) ** 2)
-            schur, moment = widening @ schur, widening @ moment
-        precision += 0.5 * (schur + schur.T)
-        vector += moment
+            tested = tested.widen(_expansion_errors(fit, roles) ** 2)
+        precision += 0.5 * (tested.precision + tested.precision.T)
+        vector += tested.moment
     return Information(blocks.time, precision, vector, level=columns[0].leak_deviation(test, blocks))
 
 
@@ -454,8 +424,8 @@ def _expansion_errors(fit: _EquationFit, roles: ColumnRoles) -> Array:
     # a flag for each polynomial of each nuisance column, and of the offset's, which is the last
     is_compliance = np.repeat([*(k in roles.compliance for k in fit.nuisance), False], n_polynomials)
     coupling = np.where(is_compliance, fit.normal.coupling, 0.0)
-    gram, _, _ = fit.normal.eliminate_tested()
-    covariances = solve(gram + np.diag(fit.prior_precision), coupling.T) * fit.variance
+    posterior = fit.normal.eliminate_tested() + fit.prior
+    covariances = solve(posterior.precision, coupling.T) * fit.variance
     # squared product of the tested column and the fitted volume of expansion, minus its variance by errors of the fit
     squares = (coupling @ fit.coefficients) ** 2 - np.einsum("kc,ck->k", coupling, covariances)
     has_energy = fit.normal.energy > 0.0
@@ -468,25 +438,25 @@ class _NormalEquations(NamedTuple):
 
     Each nuisance column is multiplied by each drift polynomial, which gives c columns. Sums over rows:
 
-    - `gram` (c, c), `moment` (c,): products of these columns with each other and with the left side;
+    - `nuisance`: products of these columns with each other and with the left side, and its sum of squares;
     - `coupling` (K, c): products of the tested column with these, in each block;
-    - `energy`, `tested_moment` (K,): products of the tested column with itself and with the left side, in each block;
-    - `left_square`: sum of squares of the left side.
+    - `energy`, `tested_moment` (K,): products of the tested column with itself and with the left side, in each block.
     """
 
-    gram: Array
-    moment: Array
+    nuisance: Gaussian
     coupling: Array
     energy: Array
     tested_moment: Array
-    left_square: float
 
-    def eliminate_tested(self) -> tuple[Array, Array, float]:
-        """Return `gram`, `moment` and `left_square` after elimination of the tested coefficient, free in each block."""
+    def eliminate_tested(self) -> Gaussian:
+        """Return `nuisance` with the tested coefficient, free in each block, integrated out."""
         energy = np.maximum(self.energy, np.finfo(float).tiny)  # where it is 0, `coupling` and `tested_moment` are 0
-        gram = self.gram - (self.coupling / energy[:, None]).T @ self.coupling
-        moment = self.moment - self.coupling.T @ (self.tested_moment / energy)
-        return gram, moment, self.left_square - float((self.tested_moment**2 / energy).sum())
+        # of a diagonal matrix: no equations to solve
+        return Gaussian(
+            self.nuisance.precision - (self.coupling / energy[:, None]).T @ self.coupling,
+            self.nuisance.moment - self.coupling.T @ (self.tested_moment / energy),
+            self.nuisance.square - float((self.tested_moment**2 / energy).sum()),
+        )
 
 
 def _build_normal_equations(
@@ -502,14 +472,14 @@ def _build_normal_equations(
     # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
     products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), n_polynomials**2)
     sums = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ products
+    # a column for each pair of a nuisance column (i or j) and a polynomial (p or q): (i, j, p, q) to (i p, j q)
+    precision = sums.reshape(n, n, n_polynomials, n_polynomials).transpose(0, 2, 1, 3).reshape(size, size)
+    moment = np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel()
     return _NormalEquations(
-        # a column for each pair of a nuisance column (i or j) and a polynomial (p or q): (i, j, p, q) to (i p, j q)
-        gram=sums.reshape(n, n, n_polynomials, n_polynomials).transpose(0, 2, 1, 3).reshape(size, size),
-        moment=np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel(),
+        Gaussian(precision, moment, float(gram[:, left, left].sum())),
         coupling=np.einsum("ki,kp->kip", gram[:, nuisance, test], polynomials).reshape(len(gram), size),
         energy=gram[:, test, test],
         tested_moment=gram[:, test, left],
-        left_square=float(gram[:, left, left].sum()),
     )
 
 
@@ -527,23 +497,25 @@ def _fit_nuisance(
     correlated, as if their variance were OVERLAP times as large. The weight of the prior and the returned variance
     contain this factor. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
     """
-    gram, moment, left_square = normal.eliminate_tested()
-    min_variance = 1e-14 * normal.left_square / n_rows  # rounding errors of the sums
-    row_variance = max(left_square / n_rows, min_variance)
+    data = normal.eliminate_tested()
+    min_variance = 1e-14 * normal.nuisance.square / n_rows  # rounding errors of the sums
+    row_variance = max(data.square / n_rows, min_variance)
     for _ in range(MAX_ITERATIONS):
         # prior precision times the variance; the deviation of a drift is relative to the coefficient, which may be 0:
         # the precision is then infinite
         with np.errstate(divide="ignore", over="ignore"):
             precision = OVERLAP * row_variance / deviations**2
-        # this limit is enough to fix a coefficient; the diagonal of `gram` would be no measure, as the elimination may
-        # leave only rounding errors of it
-        prior_precision = np.minimum(precision, 1e9 * np.diag(normal.gram))
+        # the diagonal of `data` would be no measure of the limit, as the elimination may leave only rounding errors
+        prior_precision = limit_precisions(precision, normal.nuisance.precision)
         prior_moment = prior_precision * prior_mean
-        coefficients = solve(gram + np.diag(prior_precision), moment + prior_moment)
+        coefficients = (data + Gaussian(np.diag(prior_precision), prior_moment)).mean
         # by the normal equations, the difference is the sum of squared residuals plus c' P (c - mu), with the prior's
         # precision P and mean mu; this is about OVERLAP row variances for each coefficient with a prior, a small share
         # with many rows
-        previous, row_variance = row_variance, max((left_square - float(moment @ coefficients)) / n_rows, min_variance)
+        previous, row_variance = (
+            row_variance,
+            max((data.square - float(data.moment @ coefficients)) / n_rows, min_variance),
+        )
         if abs(row_variance - previous) <= TOLERANCE * previous:
             break
     return coefficients, prior_precision, prior_moment, max(OVERLAP * row_variance, np.finfo(float).tiny)
@@ -570,6 +542,17 @@ class _EquationFit(NamedTuple):
     prior_moment: Array
     variance: float
 
+    @property
+    def prior(self) -> Gaussian:
+        """The priors of the coefficients, times `variance`."""
+        return Gaussian(np.diag(self.prior_precision), self.prior_moment)
+
+    def tested_likelihood(self) -> Gaussian:
+        """Compute the likelihood of the tested coefficient in K blocks, with all other coefficients integrated out."""
+        tested = Gaussian(np.diag(self.normal.energy), self.normal.tested_moment)
+        nuisance = self.normal.nuisance + self.prior
+        return nuisance.integrate_out(self.normal.coupling, tested) / self.variance
+
 
 def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int | None = None) -> _EquationFit:
     """Fit the nuisance coefficients of an equation and the sensor offset z of p_A - p_B, by Gauss-Newton steps.
@@ -587,7 +570,7 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     polynomials = np.polynomial.legendre.legvander(position, DRIFT_DEGREE if len(blocks) > 1 else 0)  # of the drifts
     n_rows, n_polynomials = max(float(blocks.rows.sum()), 1.0), polynomials.shape[1]
     total = gram.sum(axis=0)
-    constants = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])  # without drifts
+    constants = Gaussian.from_gram(total).among(nuisance).mean  # without drifts
     level = roles.level_deviations(total)[nuisance]
     magnitudes = np.minimum(np.abs(constants), level)  # at most the prior deviation, which `constants` may exceed
     offset_deviation = roles.offset_deviation(test, blocks)
@@ -696,11 +679,13 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     prior = fit.prior_precision.reshape(-1, fit.polynomials.shape[1])[:-1]
     prior = np.delete(prior, fit.nuisance.index(bias), axis=0).ravel()  # without the flow offset
     leaks, biases = (_build_normal_equations(gram, fit.polynomials, nuisance, k, roles.left) for k in (leak, bias))
-    coupling = np.vstack([leaks.coupling, biases.coupling])
-    solution = solve(leaks.gram + np.diag(prior), np.column_stack([coupling.T, leaks.moment]))
-    precision = np.diag(np.concatenate([leaks.energy, biases.energy])) - coupling @ solution[:, :-1]
-    vector = np.concatenate([leaks.tested_moment, biases.tested_moment]) - coupling @ solution[:, -1]
-    return 0.5 * (precision + precision.T) / fit.variance, vector / fit.variance, mean_pressure
+    tested = Gaussian(
+        np.diag(np.concatenate([leaks.energy, biases.energy])),
+        np.concatenate([leaks.tested_moment, biases.tested_moment]),
+    )
+    rest = leaks.nuisance + Gaussian(np.diag(prior), np.zeros(len(prior)))
+    joint = rest.integrate_out(np.vstack([leaks.coupling, biases.coupling]), tested)
+    return 0.5 * (joint.precision + joint.precision.T) / fit.variance, joint.moment / fit.variance, mean_pressure
 
 
 def estimate_weighted_mean(
@@ -725,9 +710,10 @@ def estimate_weighted_mean(
         first = fit.nuisance.index(column) * n_polynomials  # index of the column's first coefficient
         mean_polynomials = squares @ fit.polynomials / max(float(squares.sum()), np.finfo(float).tiny)
         contrast[first : first + n_polynomials] = weight * mean_polynomials
-    factors = solve(normal.gram + np.diag(fit.prior_precision), contrast)
+    posterior = normal.nuisance + fit.prior
+    factors = solve(posterior.precision, contrast)
     by_leak = normal.coupling @ factors
-    value = factors @ (normal.moment + fit.prior_moment) - by_leak @ leak.mean
+    value = factors @ posterior.moment - by_leak @ leak.mean
     variance = float(contrast @ factors * fit.variance + by_leak @ leak.covariance @ by_leak)
     return float(value), float(np.sqrt(max(variance, 0.0)))
 

@@ -24,7 +24,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information, solve
+from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
 from sealscope.diagnosis.inference.rows.weak_form import half_width

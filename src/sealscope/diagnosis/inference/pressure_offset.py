@@ -32,14 +32,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import (
-    Blocks,
-    ColumnRoles,
-    estimate_leak_and_bias,
-    offset_cost,
-    solve,
-    sum_blocks,
-)
+from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost, sum_blocks
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
 from sealscope.diagnosis.inference.equations.terms import Equation
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, WALKS

@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
+from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

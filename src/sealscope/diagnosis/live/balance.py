@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import kernel
+from sealscope.diagnosis.estimate.linear import solve
 from sealscope.diagnosis.inference.balance import BlockStream
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation

@@ -12,13 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.linear import solve
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
     estimate_offset,
     information,
     offset_penalty,
-    solve,
     sum_blocks,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import ChargeTrend

@@ -11,12 +11,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import compress
 from typing import Protocol
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
+from sealscope.diagnosis.estimate.linear import Gaussian, limit_precisions, solve
+from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
@@ -42,28 +42,6 @@ class ComparedColumns(Protocol):
         """Compute the prior precisions of differences between recordings."""
 
 
-def eliminate(gram: Array, eliminated: Sequence[int], prior: Array | None = None) -> Array:
-    """Eliminate the coefficients of c columns from a Gram matrix (m, m), whose rows and columns become zero.
-
-    The result is the Schur complement G - C' (D + P)^-1 C, where C are the rows of G in `eliminated`, and D those of
-    their entries that lie in these columns. The coefficient of a remaining column k alone is then entry (k, left) /
-    entry (k, k), with the precision of entry (k, k). `prior` (c,): precisions P of normal priors on the coefficients,
-    about 0, which `_limit_precisions` limits; None without priors.
-    """
-    cross, matrix = gram[eliminated], gram[np.ix_(eliminated, eliminated)]
-    if prior is not None:
-        matrix = matrix + np.diag(_limit_precisions(prior, matrix))
-    reduced = gram - cross.T @ solve(matrix, cross)
-    reduced[eliminated] = reduced[:, eliminated] = 0.0
-    return np.asarray(reduced)
-
-
-def _limit_precisions(prior: Array, gram: Array) -> Array:
-    """Limit prior precisions (c,), which may be infinite, to 1e9 times those of the data, the diagonal of `gram`."""
-    # enough to fix a coefficient; 0 for a column of zeros, whose coefficient `solve` makes 0
-    return np.minimum(prior, 1e9 * np.diag(gram))
-
-
 def coefficient_level(gram: Array, columns: Sequence[ComparedColumns]) -> tuple[float, float]:
     """Estimate the leak coefficient, at least 0, and its standard error from Gram matrices of the volume balance.
 
@@ -73,8 +51,8 @@ def coefficient_level(gram: Array, columns: Sequence[ComparedColumns]) -> tuple[
     precision, moment = 0.0, 0.0
     for e, roles in enumerate(columns):
         nuisance = [k for k in roles.compared if k != roles.leak and np.isfinite(roles.between_deviation[k])]
-        reduced = eliminate(gram[e], nuisance)
-        precision, moment = precision + reduced[roles.leak, roles.leak], moment + reduced[roles.leak, roles.left]
+        leak = Gaussian.from_gram(gram[e]).marginal([roles.leak], nuisance)
+        precision, moment = precision + leak.precision[0, 0], moment + leak.moment[0]
     return (max(moment, 0.0) / precision, precision**-0.5) if precision > 0.0 else (0.0, 0.0)
 
 
@@ -93,20 +71,17 @@ def motion_change(judged: Array, healthy: Array, roles: ColumnRoles) -> tuple[fl
     """
     motion = [k for k in roles.motion if roles.names[k] != LAG]
     fitted = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
-    reference = solve(healthy[np.ix_(fitted, fitted)], healthy[fitted, roles.left])
+    reference = Gaussian.from_gram(healthy).among(fitted).mean
     is_free = np.isin(fitted, [*roles.motion, roles.leak])
     leak_coefficient = reference[fitted.index(roles.leak)]
     precision = roles.difference_precisions(fitted, reference, leak_coefficient)
-    gram = judged[np.ix_(fitted, fitted)]
-    prior = np.where(is_free, 0.0, _limit_precisions(precision, gram))
-    weights = np.where(np.isin(fitted, motion), np.diag(gram), 0.0)
-    # second right side: gives the variance of the weighted sum of the coefficients
-    right_sides = np.column_stack([judged[fitted, roles.left] + prior * reference, weights])
-    coefficients, error_weights = solve(gram + np.diag(prior), right_sides).T
+    data = Gaussian.from_gram(judged).among(fitted)
+    weights = np.where(np.isin(fitted, motion), np.diag(data.precision), 0.0)
     # means of the motion coefficients, times the sum of the weights, which cancels in both results; magnitudes above 0,
     # for their logarithm
-    motion_sum, healthy_sum = (max(abs(float(weights @ c)), TINY) for c in (coefficients, reference))
-    return math.log(motion_sum / healthy_sum), math.sqrt(max(float(weights @ error_weights), 0.0)) / motion_sum
+    judged_sum, variance = data.with_prior(np.where(is_free, 0.0, precision), reference).contrast(weights)
+    motion_sum, healthy_sum = (max(abs(total), TINY) for total in (judged_sum, float(weights @ reference)))
+    return math.log(motion_sum / healthy_sum), math.sqrt(max(variance, 0.0)) / motion_sum
 
 
 def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
@@ -118,7 +93,7 @@ def eliminate_unshared(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     """
     reduced = _remove_hold_leaks(gram, columns)
     for e, roles in enumerate(columns):
-        reduced[e] = eliminate(reduced[e], roles.unshared)
+        reduced[e] = Gaussian.from_gram(reduced[e]).drop(roles.unshared).gram
     return reduced
 
 
@@ -131,25 +106,15 @@ def _remove_hold_leaks(gram: Array, columns: Sequence[ColumnRoles]) -> Array:
     return reduced
 
 
-def subtract_fit(gram: Array, fitted: Sequence[int], coefficients: Array, left: int) -> Array:
-    """Replace the left side of a regression, in its Gram matrix (m, m), by the residual of a fit.
-
-    The residual is the left side, column `left`, minus the columns `fitted` times the `coefficients` (c,).
-    """
-    transform = np.eye(len(gram))
-    transform[fitted, left] = -coefficients
-    return np.asarray(transform.T @ gram @ transform)
-
-
 def subtract_reference(
     gram: Array, reference: Array, roles: ComparedColumns, *, has_leak: bool = False
-) -> tuple[Array, list[int], Array]:
+) -> tuple[Gaussian, list[int], Array]:
     """Compute the residual of a recording under the coefficients fitted to reference recordings.
 
     `gram`, `reference` (m, m): Gram matrices of the recording and of the sum of the reference recordings, both after
-    `eliminate_unshared`. Returns the arguments of `eliminate`:
+    `eliminate_unshared`. Returns
 
-    - Gram matrix (m, m) of the recording with the residual in place of the left side;
+    - the likelihood of the differences of the recording's coefficients from the reference, by column;
     - indices of the c columns whose coefficients may differ between recordings, with the leak only if `has_leak`;
     - precisions (c,) of the priors on these differences; that of a laminar leak is the pump's (`between.pump`).
 
@@ -158,15 +123,25 @@ def subtract_reference(
     limit (infinite `between_deviation`).
     """
     compared = [k for k in roles.compared if k == roles.leak or np.isfinite(roles.between_deviation[k])]
-    matrix, leak = reference[np.ix_(compared, compared)], compared.index(roles.leak)
-    matrix[leak, leak] += roles.healthy_conductance**-2  # precision of the prior; 0 if the healthy leakage is unknown
-    coefficients = solve(matrix, reference[compared, roles.left])
+    # precision of the leak's prior: 0 if the healthy leakage is unknown
+    healthy = np.where(np.array(compared) == roles.leak, roles.healthy_conductance**-2, 0.0)
+    fit = Gaussian.from_gram(reference).among(compared) + Gaussian(np.diag(healthy), np.zeros(len(compared)))
+    coefficients = np.zeros(len(gram) - 1)
+    coefficients[compared] = fit.mean
     # of the laminar leak, even if another term takes its place in `roles.leak` (`ColumnRoles.replace_leak`)
-    leak_coefficient = coefficients[compared.index(roles.names.index(LEAK))]
-    is_nuisance = [has_leak or k != roles.leak for k in compared]
-    nuisance = [*compress(compared, is_nuisance)]
-    prior = roles.difference_precisions(nuisance, coefficients[is_nuisance], leak_coefficient)
-    return subtract_fit(gram, compared, coefficients, roles.left), nuisance, prior
+    leak_coefficient = coefficients[roles.names.index(LEAK)]
+    nuisance = [k for k in compared if has_leak or k != roles.leak]
+    prior = roles.difference_precisions(nuisance, coefficients[nuisance], leak_coefficient)
+    return Gaussian.from_gram(gram).subtract(coefficients), nuisance, prior
+
+
+def marginal_difference(residual: Gaussian, tested: Sequence[int], nuisance: Sequence[int], prior: Array) -> Gaussian:
+    """Compute the likelihood of the `tested` differences, with those of the columns `nuisance` (c,) integrated out.
+
+    `residual`, `nuisance`, `prior`: as `subtract_reference` returns them.
+    """
+    differences = residual.among(nuisance).with_prior(prior)
+    return differences.integrate_out(residual.precision[np.ix_(tested, nuisance)], residual.among(tested))
 
 
 def estimate_leak_excess(
@@ -184,9 +159,9 @@ def estimate_leak_excess(
     for e, roles in enumerate(columns):
         residual, nuisance, prior = subtract_reference(gram[e], reference[e], roles)
         for index, width in enumerate(widths):
-            reduced = eliminate(residual, nuisance, prior / width**2)
-            precision[index] += reduced[roles.leak, roles.leak]
-            moment[index] += reduced[roles.leak, roles.left]
+            leak = marginal_difference(residual, [roles.leak], nuisance, prior / width**2)
+            precision[index] += leak.precision[0, 0]
+            moment[index] += leak.moment[0]
     is_known = precision > 0.0
     divisor = np.where(is_known, precision, 1.0)
     return np.where(is_known, moment / divisor, 0.0), np.where(is_known, divisor**-0.5, 0.0)
@@ -217,7 +192,7 @@ def block_weights(grams: Array, reference: Array, columns: Sequence[ColumnRoles]
         eliminated = [*nuisance, *roles.unshared]
         matrix = totals[e][np.ix_(eliminated, eliminated)]
         n = len(nuisance)  # only these have a prior, limited as in `estimate_leak_excess`
-        matrix[:n, :n] += np.diag(_limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]))
+        matrix[:n, :n] += np.diag(limit_precisions(prior, shared[e][np.ix_(nuisance, nuisance)]))
         factors = solve(matrix, totals[e][eliminated, roles.leak])
         weights += grams[:, e, roles.leak, roles.leak] - grams[:, e, roles.leak][:, eliminated] @ factors
     total = float(weights.sum())

@@ -7,8 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.coefficients import eliminate, subtract_reference
+from sealscope.diagnosis.inference.comparison.coefficients import marginal_difference, subtract_reference
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
 from sealscope.recordings.recording import Array
@@ -90,11 +91,9 @@ def _fit_excess(
     Gram matrix (c, c) of the tested columns, their products (c,) with the residual, and the residual's sum of squares.
     """
     reference = np.sum([recording.sums for recording in baseline], axis=0)
-    gram, moments, left_square = np.zeros((len(names), len(names))), np.zeros(len(names)), 0.0
+    total = Gaussian(np.zeros((len(names), len(names))), np.zeros(len(names)))
     for e, roles in enumerate(columns):
         tested = [roles.names.index(name) for name in names]
-        reduced = eliminate(*subtract_reference(judged.sums[e], reference[e], roles, has_leak=has_leak))
-        gram += reduced[np.ix_(tested, tested)]
-        moments += reduced[tested, roles.left]
-        left_square += float(reduced[roles.left, roles.left])
-    return gram, moments, left_square
+        residual, nuisance, prior = subtract_reference(judged.sums[e], reference[e], roles, has_leak=has_leak)
+        total += marginal_difference(residual, tested, nuisance, prior)
+    return total.precision, total.moment, total.square

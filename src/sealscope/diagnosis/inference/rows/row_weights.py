@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import large_law, law
+from sealscope.diagnosis.estimate.linear import RIDGE
 from sealscope.recordings.recording import Array
 
 #: Number of blocks whose rows are weighted together at the beginning of a stream. Later the prior from all earlier
@@ -24,8 +25,6 @@ from sealscope.recordings.recording import Array
 SUPPORT = 5
 #: Where Huber's function turns from square to linear, in standard deviations: 95 % efficiency for normal errors.
 HUBER = 1.345
-#: Relative increase of a matrix diagonal, against rounding.
-RIDGE = 1e-10
 #: Maximum number of iterations to a fixed point, and the mean relative change of the weights that ends them.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-2
 #: Standard deviation of normal values over the median of their magnitudes.

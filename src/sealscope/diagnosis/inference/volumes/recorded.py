@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.linear import solve
 from sealscope.diagnosis.inference.balance import (
     RegimeBlocks,
     derive_drive_signals,
@@ -24,7 +25,6 @@ from sealscope.diagnosis.inference.blocks import (
     information,
     offset_cost,
     scale_grams,
-    solve,
 )
 from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charge_trend
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference

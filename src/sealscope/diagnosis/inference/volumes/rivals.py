@@ -14,9 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.inference.blocks import ColumnRoles, solve
+from sealscope.diagnosis.estimate.linear import Gaussian
+from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, eliminate, subtract_fit
+from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, marginal_difference
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
 from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
@@ -192,8 +193,10 @@ def _estimate_change(gram: Array, reference: Array, columns: Sequence[ColumnRole
     for e, roles in enumerate(columns):
         leak = roles.names.index(LEAK)
         fitted = [k for k in roles.compared if k != tested and (k == leak or np.isfinite(roles.between_deviation[k]))]
-        coefficients = solve(reference[e][np.ix_(fitted, fitted)], reference[e][fitted, roles.left])
-        prior = roles.difference_precisions(fitted, coefficients, coefficients[fitted.index(leak)])
-        reduced = eliminate(subtract_fit(gram[e], fitted, coefficients, roles.left), fitted, prior)
-        precision, moment = precision + reduced[tested, tested], moment + reduced[tested, roles.left]
+        coefficients = np.zeros(roles.left)
+        coefficients[fitted] = Gaussian.from_gram(reference[e]).among(fitted).mean
+        prior = roles.difference_precisions(fitted, coefficients[fitted], coefficients[leak])
+        residual = Gaussian.from_gram(gram[e]).subtract(coefficients)
+        change = marginal_difference(residual, [tested], fitted, prior)
+        precision, moment = precision + change.precision[0, 0], moment + change.moment[0]
     return (moment / precision, precision**-0.5) if precision > 0.0 else (0.0, np.inf)

@@ -28,7 +28,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, solve
+from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -1,0 +1,1 @@
+"""Estimation: models of normal errors that all inference of the diagnosis shares."""
