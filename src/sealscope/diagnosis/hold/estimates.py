@@ -319,13 +319,13 @@ class HeldLoad:
         """Build the bends [mm] of the travel by pressures that change: compression, and laws of a leak."""
         readings = self._travel_readings
         columns = []
-        for side, mean in ((self.loaded, 1.0), (self.unloaded, 0.0)):
-            if (p := self._pressure(side)) is None:
-                continue
+        if (p := self._pressure(self.loaded)) is not None:
             part_t, course = smooth_course(self.t, p)
-            compression = self.column[0] * relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
+            length, deviation = self.column
+            compression = length * relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
             values = sample_course(readings, part_t, compression)
-            columns.append(Column(self._bend(readings.t, values, float(compression[-1] - compression[0])), mean, 1.0))
+            bend = self._bend(readings.t, values, float(compression[-1] - compression[0]))
+            columns.append(Column(bend, 1.0, math.hypot(deviation, INFERENCE.held_oil.deviation)))
         clocks = self._clocks(readings)
         speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
         for k, clock in enumerate(clocks):
@@ -342,15 +342,20 @@ class HeldLoad:
         """Readings of the travel [mm]."""
         return read_channel(self.t, np.asarray(self.travel), HOLD.noise.position)
 
-    def _compression_readings(self, p: Array, length: float) -> tuple[Readings, Readings]:
-        """Read an absolute pressure `p` (n,) [Pa], and the travel [mm] that a column of a `length` [mm] gives way."""
+    def _read_compression(self, p: Array, length: float) -> tuple[Readings, Readings, list[Column]]:
+        """Read an absolute pressure `p` (n,) [Pa], and the travel [mm] that a column of a `length` [mm] gives way.
+
+        Returns both, and the columns of a fit to the latter that hold its level and what the oil's law leaves.
+        """
         readings = read_channel(self.t, p, HOLD.noise.pressure * BAR)
         middle = float(np.mean(p)) + np.array([-0.5, 0.5]) * BAR
         slope = length * float(np.diff(relative_compression(middle).sum(axis=0))[0]) / BAR
         compression = length * relative_compression(readings.values).sum(axis=0)
-        return readings, readings._replace(
-            values=compression, loose=slope * readings.loose, quantum=slope * readings.quantum
-        )
+        travel = readings._replace(values=compression, loose=slope * readings.loose, quantum=slope * readings.quantum)
+        size = INFERENCE.held_oil.misfit * float(np.ptp(compression))
+        course = sample_course(readings, *smooth_course(self.t, p))
+        misfit = self._misfit(readings.t, course, size) if size > LEAST_BEND else []
+        return readings, travel, [Column(np.ones_like(readings.t)), *misfit]
 
     @cached_property
     def gain(self) -> Mixture | None:
@@ -359,14 +364,18 @@ class HeldLoad:
         if p is None:
             return None
         length, deviation = self.set_up.column(self.unloaded, None)
-        _, compression = self._compression_readings(p, _MM * length)
+        _, compression, base = self._read_compression(p, _MM * length)
         t = compression.t
-        base = [Column(t / 60.0), Column(np.ones_like(t))]
-        # oil that cools in a closed chamber loses pressure
-        base += [column._replace(values=-column.values) for column in self._thermal_columns(t)]
+        # oil that cools in a closed chamber loses pressure; a side that is open to the tank follows no temperature
+        logged = [column._replace(values=-column.values) for column in self._thermal_columns(t)]
+        closed = [Alternative(1.0, tuple(logged))] if logged else self._cooling(compression)
+        thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
         sizes = [_MM * length * strain for strain in HOLD.settling.strain]
-        alternatives = [self._settling(compression, sizes), self._cooling(compression)]
-        fit = fit_rate(compression, base, alternatives, self.duration)
+        alternatives = [self._settling(compression, sizes), thermal]
+        clocks = self._clocks(compression)[: len(EXPONENTS)]
+        if len(clocks) > 1:  # a steady gain, too, whatever its law
+            clocks.append(LeakClock(clocks[0].weight, t / 60.0))
+        fit = self._fit_laws(compression, base, alternatives, clocks)
         return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
 
     @cached_property
@@ -415,7 +424,7 @@ class HeldLoad:
                 base.append(Column(column, 1.0, math.hypot(deviation, width)))
                 if np.ptp(column) > LEAST_BEND:
                     base += self._misfit(readings.t, column, oil.misfit * float(np.ptp(column)))
-        fit = self._fit_laws(readings, base, HOLD.settling.travel)
+        fit = self._fit_leak(readings, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
     def _leak_by_pressure(self) -> LeakEstimate:
@@ -424,9 +433,9 @@ class HeldLoad:
         if p is None:
             return LeakEstimate(None, None)
         length, deviation = self.column
-        pressures, compression = self._compression_readings(p, -length)
+        pressures, compression, base = self._read_compression(p, -length)
         sizes = [length * strain for strain in HOLD.settling.strain]
-        fit = self._fit_laws(compression, [Column(np.ones_like(compression.t))], sizes)
+        fit = self._fit_leak(compression, base, sizes)
         rate = fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
         if self.creep is not None:
             rate = rate.add_error(self.creep.rate.deviation)
@@ -447,21 +456,31 @@ class HeldLoad:
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
         return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
 
-    def _fit_laws(self, readings: Readings, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
-        """Fit the rate [mm/min] under each law of a leak, with temperature and settling, and pool the laws."""
+    def _fit_laws(
+        self,
+        readings: Readings,
+        base: Sequence[Column],
+        alternatives: Sequence[Sequence[Alternative]],
+        clocks: Sequence[LeakClock],
+    ) -> RateFit:
+        """Fit the rate [mm/min] under each law of a leak (`clocks`), and pool the laws."""
         t = readings.t
-        base = [*base, *self._thermal_columns(t)]
-        alternatives = [self._settling(readings, sizes), self._cooling(readings)]
         fits, logs = [], []
         speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
-        for clock in self._clocks(readings):
+        for clock in clocks:
             law = [] if clock.spare is None else [Column(speed * clock.spare, 0.0, 1.0)]
             bend = float(np.ptp(speed * self._bend(t, clock.minutes, self.duration / 60.0)))
             if bend > LEAST_BEND:
                 law += self._misfit(t, clock.minutes, INFERENCE.held_oil.misfit * bend)
             fits.append(fit_rate(readings, [Column(clock.minutes), *base, *law], alternatives, self.duration))
             logs.append(math.log(clock.weight) + fits[-1].log_evidence)
-        fit = pool_fits(fits, logs)
+        return pool_fits(fits, logs)
+
+    def _fit_leak(self, readings: Readings, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
+        """Fit the rate of a leak [mm/min] under each law, with temperature and what settles."""
+        alternatives = [self._settling(readings, sizes), self._cooling(readings)]
+        columns = [*base, *self._thermal_columns(readings.t)]
+        fit = self._fit_laws(readings, columns, alternatives, self._clocks(readings))
         return fit._replace(rate=fit.rate.add_error(self.rounding))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:

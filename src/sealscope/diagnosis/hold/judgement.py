@@ -133,10 +133,10 @@ def _weigh_piston(hold: HeldLoad) -> int:
     if gain is None or leak.rate is None:
         return 0
     prior, is_material = HOLD.other, abs(gain.mean) > HOLD.other.material * abs(leak.rate.mean)
-    if is_material and gain.interval[0] > 0.0:
-        return 1
     p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
     is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > prior.tank * BAR
+    if is_closed and is_material and gain.interval[0] > 0.0:
+        return 1
     area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
     ratio = 1.0 if area is None or other_area is None else other_area / area
     travel = Mixture(np.ones(1), np.zeros(1), np.zeros(1)) if hold.creep is None else hold.creep.rate
