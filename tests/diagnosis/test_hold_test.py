@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.commissioned.watched import load_watched
 from sealscope.diagnosis.verdict.machine import unstated_rig
-from sealscope.errors import InputError
+from sealscope.errors import InputError, SealscopeError
+from sealscope.monitor.verdicts import judge_recording
 
 AREAS = ("3117 mm^2", "2155 mm^2")
 
@@ -184,3 +186,41 @@ def test_tests_in_order_of_time_are_a_trend():
     assert trend.basis == "hold test"
     assert trend.wear.growth.low <= 0.3e-3 * 0.15 * 3.117 <= trend.wear.growth.high
     assert trend.wear.reach is not None
+
+
+def test_a_commissioned_machine_and_its_monitor_take_hold_tests(tmp_path):
+    for seed in range(3):
+        ss.write(record_hold(0.3, minutes=1.0, seed=seed, p_B=tank, log_T=True), tmp_path / f"healthy{seed}.csv")
+    machine = ss.commission(tmp_path, rig=RIG, name="boom")
+    ss.write_machine(machine, tmp_path / "boom.toml")
+    assert [healthy.file for healthy in machine.healthy] == [f"healthy{seed}.csv" for seed in range(3)]
+    sinking = record_hold(3.0, minutes=1.0, seed=9, p_B=tank, log_T=True)
+    verdict = judge_recording(load_watched(str(tmp_path / "boom.toml")), sinking, "sinking.csv", 1.7e9)
+    (hold,) = machine.diagnose(sinking).holds
+    assert hold.leak_interval_lpm[0] <= 3e-3 * 3.117 <= hold.leak_interval_lpm[1]
+    assert (verdict.verdict, verdict.total_lpm) == ("leak", pytest.approx(hold.leak_lpm))
+
+
+@pytest.mark.parametrize(
+    ("recording", "arguments", "named"),
+    [
+        (lambda t: {"x [m]": 0.1 * np.sin(t)}, {}, "without motion"),
+        (lambda t: {"x [m]": 0.4 - 1e-6 * t}, {"end": "2 s"}, "10 s with 5 samples"),
+        (lambda t: {"p_A": 8e6 + t}, {}, "p_A.*unit"),
+        (lambda t: {"x [m]": 0.4 - 1e-6 * t}, {"area": "3117 m^2"}, "is its unit right"),
+        (lambda t: {"x [m]": 0.4 - 1e-6 * t}, {"area": "0.003117 mm^2"}, "is its unit right"),
+        (lambda t: {"T_oil [degC]": 40.0 + 0.0 * t}, {}, "position, a chamber pressure or a leakage flow"),
+    ],
+)
+def test_a_log_that_is_no_hold_test_is_one_line(recording, arguments, named, tmp_path):
+    t = np.arange(0.0, 60.0, 0.1)
+    columns = {"time [s]": t, **recording(t)}
+    file = tmp_path / "log.csv"
+    rows = [
+        ",".join(columns),
+        *(",".join(f"{value:.9g}" for value in row) for row in zip(*columns.values(), strict=True)),
+    ]
+    file.write_text("\n".join(rows) + "\n")
+    with pytest.raises(SealscopeError, match=named) as error:
+        ss.hold_test(ss.read(file, map="auto"), **arguments)
+    assert "\n" not in str(error.value)
