@@ -34,7 +34,7 @@ import numpy as np
 from numba import njit
 
 import sealscope as ss
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.units import LITRE_PER_MINUTE
 
 DT, TANK, HEALTHY_DAYS, LOGS = 5e-5, 2e5, 5, 2  # s, Pa gauge, healthy days, logs of a machine with a leak

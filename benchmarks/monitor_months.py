@@ -39,9 +39,9 @@ from stored_rows import StoredRows
 from threadpoolctl import threadpool_limits
 
 import sealscope as ss
-from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance, NotJudged
 from sealscope.diagnosis.live.estimates import BlockEstimate
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.live_balance import BlockConductance, LiveBalance, NotJudged
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 RESULTS = Path(__file__).parent / "results" / "monitor_months.csv"

@@ -24,7 +24,7 @@ import numpy as np
 from numba import njit
 
 import sealscope as ss
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.units import LITRE_PER_MINUTE
 
 DT, EVERY, RATE, HEALTHY_DAYS, LEAKING_DAYS, RAMP = 1e-4, 100, 100, 6, 4, 0.5

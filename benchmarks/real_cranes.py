@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 import sealscope as ss
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 

@@ -72,6 +72,12 @@ def test_imports_within_a_folder_are_few_steps_deep(folder):
     assert depth(folder) <= MOST_DEPTH
 
 
+def test_a_module_of_the_diagnosis_has_a_name_of_its_own():
+    """A name in a message, a stack or a search leads to one file."""
+    names = [path.stem for path in (SOURCE / "diagnosis").rglob("*.py") if path.stem != "__init__"]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
 def test_the_depth_of_a_folder_is_measured():
     assert depth(SOURCE / "diagnosis") >= 3
     assert "physics" in entries(SOURCE)

@@ -29,7 +29,7 @@ KEPT = {
     ("diagnosis/live/estimates.py", "judged"),
     ("diagnosis/live/watch.py", "each"),
     ("diagnosis/verdict/diagnosis.py", "about"),
-    ("diagnosis/verdict/machine.py", "stated"),
+    ("diagnosis/verdict/machine_sizes.py", "stated"),
     ("monitor/bounded_queue.py", "put"),
     ("parameters/rig.py", "given"),
     ("simulation/bench/profile.py", "each"),

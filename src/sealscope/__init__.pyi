@@ -9,8 +9,8 @@ from sealscope.diagnosis.hold.hold_test import hold_test as hold_test
 from sealscope.diagnosis.hold.result import HoldResult as HoldResult
 from sealscope.diagnosis.live.watch import Watch as Watch
 from sealscope.diagnosis.live.watch import watch as watch
-from sealscope.diagnosis.trend.trend import Trend as Trend
-from sealscope.diagnosis.trend.trend import trend as trend
+from sealscope.diagnosis.trend.machine_trend import Trend as Trend
+from sealscope.diagnosis.trend.machine_trend import trend as trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis as Diagnosis
 from sealscope.emit.export import export_controller as export_controller
 from sealscope.fmu.build import write_fmu as write_fmu

@@ -10,10 +10,10 @@ import pytest
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.detectors import observation
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LeakCourse
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit, severity
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording

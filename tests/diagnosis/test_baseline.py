@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.recordings.recording import Recording
 
 from ..representatives import SLOW, other

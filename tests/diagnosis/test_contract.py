@@ -14,7 +14,7 @@ from sealscope.diagnosis.detectors import observation
 from sealscope.diagnosis.detectors.detector import validate_report
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import COUNTS, Recording

@@ -9,7 +9,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.recordings.recording import Recording
 
 RATE, AREA, DISPLACEMENT = 20.0, 78.5e-4, 1.6e-6  # [Hz], [m^2], [m^3/rev]

@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.recordings.recording import Recording
 
 from ..representatives import few

@@ -9,7 +9,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.monitor.verdicts import judge_recording
 

@@ -10,8 +10,8 @@ import pytest
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
 from sealscope.diagnosis.inference.leak_law import find_leak_step
 from sealscope.diagnosis.inference.onset import Information, step_test
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.simulate import simulate_experiment

@@ -12,7 +12,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.inference.changes import healthy_levels
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.storage.kept_results import MISSING, SUFFIX, keep_result, remove_oldest, restore_result
 

@@ -10,15 +10,15 @@ import pytest
 from scipy.optimize import least_squares, lsq_linear
 
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
-from sealscope.diagnosis.inference.circuit.holds.hold import (
+from sealscope.diagnosis.inference.circuit.holds.hold_oil import CylinderSides, OilRegression, fit_leak
+from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, SideSupply, UnitLeak, growth_factor
+from sealscope.diagnosis.inference.circuit.holds.onset_sums import score_onsets
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     estimate_hold_offsets,
     extend_rests,
     find_charge_pressure,
     find_locked_holds,
 )
-from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, SideSupply, UnitLeak, growth_factor
-from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides, OilRegression, fit_leak
-from sealscope.diagnosis.inference.circuit.holds.onset_sums import score_onsets
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

@@ -11,9 +11,9 @@ import pytest
 from sealscope.diagnosis.inference.balance import flag_lowering
 from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
 from sealscope.diagnosis.inference.equations.signals import LoweringLimits, Signals
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.live.balance import LiveBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.live_balance import LiveBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings import Recording
 from sealscope.recordings.channels import CHANNEL_UNITS

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

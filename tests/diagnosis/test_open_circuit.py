@@ -15,12 +15,12 @@ import pytest
 
 from sealscope import diagnose, load_rig, simulate, watch
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
-from sealscope.diagnosis.live.balance import BlockConductance, LiveBalance
 from sealscope.diagnosis.live.joining import SampleRun
+from sealscope.diagnosis.live.live_balance import BlockConductance, LiveBalance
 from sealscope.diagnosis.live.watch import Watch
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Recording
 

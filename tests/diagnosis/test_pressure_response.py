@@ -8,7 +8,7 @@ from functools import cache
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.parameters import load_rig
 

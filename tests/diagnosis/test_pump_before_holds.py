@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.circuit.holds.hold import find_locked_holds
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import find_locked_holds
 from sealscope.diagnosis.inference.comparison.levels import held_pump_rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.onset import Estimate

@@ -13,10 +13,10 @@ from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, find_rests
 from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.inference.volumes.detector import _healthy_sign_log_odds as healthy_sign_log_odds
-from sealscope.diagnosis.inference.volumes.detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import _healthy_sign_log_odds as healthy_sign_log_odds
+from sealscope.diagnosis.inference.volumes.volume_detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.recordings.channels import CHANNEL_UNITS

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.response import Follower
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings import cycle
 from sealscope.recordings.cycle import estimate_period

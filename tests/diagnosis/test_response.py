@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.diagnosis.inference.onset import WITHIN_95, Information
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.fit import Priors
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
@@ -27,6 +26,7 @@ from sealscope.diagnosis.inference.pressures.reduced_rig import (
     response_priors,
 )
 from sealscope.diagnosis.inference.pressures.response import fit_response, measure_leak
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE

@@ -9,19 +9,19 @@ import pytest
 from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
-from sealscope.diagnosis.inference.comparison.coefficients import (
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.excess import (
     block_weights,
     eliminate_unshared,
     estimate_leak_excess,
     motion_change,
 )
-from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.levels import rise
 from sealscope.diagnosis.inference.comparison.population import Population
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
-from sealscope.diagnosis.inference.volumes.detector import compare_motion
+from sealscope.diagnosis.inference.volumes.volume_detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
 
 from ..representatives import few

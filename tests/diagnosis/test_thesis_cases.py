@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.recording import Recording
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import diagnosis_text, total_leakage

@@ -17,9 +17,9 @@ import sealscope as ss
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.trend import trend_leak
+from sealscope.diagnosis.trend.machine_trend import Trend
+from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
-from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.diagnosis.trend.wear import Levels, ScatterPrior, outlier_excess, score_changes
 from sealscope.recordings.oil import oil_temperature
 from sealscope.units import DAY, DAYS_PER_MONTH, LITRE_PER_MINUTE

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.trend.machine_trend import Trend
+from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
-from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.trend.page import render_trend_page
 from sealscope.simulation.leaks import Leak

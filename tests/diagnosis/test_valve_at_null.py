@@ -13,9 +13,9 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.inference.balance import BlockStream, bridged_samples
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.coefficients import estimate_leak_excess
+from sealscope.diagnosis.inference.comparison.excess import estimate_leak_excess
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.bench.machines import draw

@@ -7,9 +7,9 @@ import pytest
 from scipy.stats import t as student
 
 import sealscope as ss
-from sealscope.diagnosis.live.balance import LiveBalance, NotJudged, size_error
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import WINDOW, StreamSettings, stream_layout
+from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged, size_error
 from sealscope.fmu.variables import SENSOR_RESULTS as RESULTS
 
 from ..refusals import refusal

@@ -10,7 +10,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.machine_file import write_machine
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.monitor.settings import MonitorSettings
 
 from ..diagnosis.balance_machine import machine

@@ -18,7 +18,7 @@ import orjson
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.live.balance import BlockConductance
+from sealscope.diagnosis.live.live_balance import BlockConductance
 from sealscope.errors import InputError
 from sealscope.monitor.actuators import _Actuator
 from sealscope.monitor.alarms import AlarmJudge

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 import sealscope as ss
 from sealscope.cli.app import app
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import Recording, read, write
 from sealscope.reporting.messages import next_steps, say

@@ -11,9 +11,9 @@ from sealscope.campaigns.cases.row import CaseRow, Statement
 from sealscope.campaigns.judging.judge import judge
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import CampaignResult, prior_knowledge
+from sealscope.diagnosis.trend.machine_trend import Trend
+from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading
-from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.recordings.quality import Finding

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.trend.machine_trend import Trend
+from sealscope.diagnosis.trend.machine_trend import trend as trend_of
 from sealscope.diagnosis.trend.reading import LeakReading
-from sealscope.diagnosis.trend.trend import Trend
-from sealscope.diagnosis.trend.trend import trend as trend_of
 from sealscope.reporting.trend.page import (
     _cut_line,
     find_pauses,

@@ -12,7 +12,7 @@ from sealscope.app.workbench import Workbench
 from sealscope.recordings.formats.columns import GROUP, REST
 
 _IMPORT = "import sealscope as ss"
-_IMPORT_RIG = "from sealscope.diagnosis.verdict.machine import build_stated_rig"
+_IMPORT_RIG = "from sealscope.diagnosis.verdict.machine_sizes import build_stated_rig"
 
 
 def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict[str, str]:

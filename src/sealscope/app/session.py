@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 from sealscope.diagnosis.commissioned.machine import recordings_in
 from sealscope.diagnosis.hold.set_up import parse_set_up
-from sealscope.diagnosis.verdict.machine import build_stated_rig
+from sealscope.diagnosis.verdict.machine_sizes import build_stated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.parameters import Rig

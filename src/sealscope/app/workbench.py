@@ -45,10 +45,10 @@ from sealscope.diagnosis.commissioned.machine_file import read_machine, write_ma
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.hold.hold_test import hold_test
 from sealscope.diagnosis.hold.result import HoldCurve, HoldResult
+from sealscope.diagnosis.trend.machine_trend import Trend, trend
 from sealscope.diagnosis.trend.reading import LeakReading, estimate_reading
-from sealscope.diagnosis.trend.trend import Trend, trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.machine import AssumedMachine, states_rig
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine, states_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings.formats.columns import GROUP
 from sealscope.recordings.joining import file_seconds, start_seconds

@@ -23,10 +23,10 @@ from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.hold.plan import PlannedHold, plan_hold
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import PUMP
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.hold import HOLD
-from sealscope.diagnosis.verdict.machine import healthy_leakage
+from sealscope.diagnosis.verdict.machine_sizes import healthy_leakage
 from sealscope.errors import InputError, SealscopeError
 from sealscope.paragraphs import paragraph
 from sealscope.parameters import Rig

@@ -159,7 +159,7 @@ class StatedMachine:
         Raises InputError for an invalid option, and for another option than `maps` together with `machine`: maps add to
         that in the machine's file.
         """
-        from sealscope.diagnosis.verdict.machine import build_stated_rig
+        from sealscope.diagnosis.verdict.machine_sizes import build_stated_rig
         from sealscope.diagnosis.verdict.severity import RepairLimit
         from sealscope.recordings.formats.columns import check_request
 

@@ -44,8 +44,8 @@ def trend(
     The exit status is 1 if a file could not be read.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
+    from sealscope.diagnosis.trend.machine_trend import trend as trend_of
     from sealscope.diagnosis.trend.reading import estimate_reading
-    from sealscope.diagnosis.trend.trend import trend as trend_of
     from sealscope.diagnosis.verdict.diagnosis import find_machine_name
     from sealscope.recordings.joining import file_seconds
     from sealscope.reporting.trend.page import write_trend_page

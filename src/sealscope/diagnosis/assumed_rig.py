@@ -10,7 +10,14 @@ import numpy as np
 
 from sealscope.diagnosis.inference.circuit.recognition import recognise_circuit
 from sealscope.diagnosis.priors.verdict import VERDICT
-from sealscope.diagnosis.verdict.machine import DEFAULT, UNSTATED, AssumedMachine, StatedBy, measures_flow, states_rig
+from sealscope.diagnosis.verdict.machine_sizes import (
+    DEFAULT,
+    UNSTATED,
+    AssumedMachine,
+    StatedBy,
+    measures_flow,
+    states_rig,
+)
 from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.parameters.circuit import OPEN_CIRCUIT
 from sealscope.parameters.rig import ASSUMED

@@ -24,7 +24,7 @@ from sealscope.diagnosis.detectors.observation import healthy_null, limit_thread
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
-from sealscope.diagnosis.hold.summary import describe_holds, held_leakage
+from sealscope.diagnosis.hold.recorded_holds import describe_holds, held_leakage
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable

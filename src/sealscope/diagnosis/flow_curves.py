@@ -28,7 +28,7 @@ from sealscope.diagnosis.inference.balance import (
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LOCKED, START
 from sealscope.diagnosis.inference.onset import Estimate
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import Array, Recording

@@ -9,9 +9,9 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.inference.rows.row_weights import MAX_ITERATIONS, SUPPORT
-from sealscope.diagnosis.live.balance import BLOCK_SECONDS, LEARNED
 from sealscope.diagnosis.live.kernel.step import MAX_ONSETS
 from sealscope.diagnosis.live.kernel.stream import ADDED_A_CALL, HALVINGS, WEIGHED_A_CALL, StreamSettings
+from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LEARNED
 from sealscope.emit.c99 import CText
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.stream_program import StreamProgram, result_rows

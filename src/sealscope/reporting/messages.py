@@ -13,7 +13,7 @@ from typing import Any
 from sealscope.diagnosis.decision.combination import ORDER
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, TotalLeakage
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.diagnosis.verdict.states import MachineState
 from sealscope.errors import printable
 from sealscope.paragraphs import format_count, join_names, paragraph, paragraphs

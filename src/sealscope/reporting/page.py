@@ -14,7 +14,7 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.machine import states_rig
+from sealscope.diagnosis.verdict.machine_sizes import states_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig, rig_names
 from sealscope.recordings.chambers import CHAMBERS

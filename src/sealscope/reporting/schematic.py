@@ -7,7 +7,7 @@ from math import sqrt
 from typing import Any, NamedTuple
 
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.parameters import Rig
 from sealscope.recordings.recording import CHANNEL_UNITS, Recording
 from sealscope.reporting import messages, template

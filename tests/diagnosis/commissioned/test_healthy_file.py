@@ -13,7 +13,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.healthy_file import SUFFIX, Line, format_summary, parse_summary, read_lines
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import plain_array
 
@@ -273,7 +273,7 @@ def test_a_main_method_that_cannot_run_is_never_no_leak(machine, monkeypatch):
     def fail(*_: object) -> None:
         raise np.linalg.LinAlgError("Singular matrix")
 
-    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.detector.VolumeBalance.observe", fail)
+    monkeypatch.setattr("sealscope.diagnosis.inference.volumes.volume_detector.VolumeBalance.observe", fail)
     diagnosis = machine.diagnose(judged)
     assert diagnosis.verdict == "cannot tell"
     assert "volume balance cannot be computed on this recording: singular matrix" in diagnosis.reason

@@ -9,7 +9,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.watched import WatchedMachine, load_watched
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 
 #: Leakage of the pump of the recorded machine [m^3/(s Pa)].
 PUMP = 2e-13

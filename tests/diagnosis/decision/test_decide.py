@@ -197,7 +197,7 @@ NAMES = {
     "decision/reasons.py",
     "inference/balance.py",
     "inference/blocks.py",
-    "inference/comparison/coefficients.py",
+    "inference/comparison/excess.py",
     "inference/equations/balances.py",
     "inference/equations/terms.py",
     "live/explanation.py",

@@ -20,8 +20,8 @@ from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
 from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, sensor_features
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION, ZEROS
-from sealscope.diagnosis.inference.changes.levels import PATTERNS
-from sealscope.diagnosis.inference.changes.signals import observe_signals
+from sealscope.diagnosis.inference.changes.level_changes import PATTERNS
+from sealscope.diagnosis.inference.changes.signal_tests import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
 from sealscope.diagnosis.inference.delays import DELAYED
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked
@@ -29,7 +29,7 @@ from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, de
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.diagnosis.rms_change.blocks import JUDGED
+from sealscope.diagnosis.rms_change.rms_blocks import JUDGED
 from sealscope.parameters import load_rig
 from sealscope.parameters.load import rig_names
 from sealscope.signals.details import QUANTITIES

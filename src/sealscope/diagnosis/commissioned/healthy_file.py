@@ -24,11 +24,11 @@ from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Fiel
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS, ZERO_KEYS
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
-from sealscope.diagnosis.inference.changes.signals import SIGNALS
+from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.terms import LEAK
-from sealscope.diagnosis.rms_change.blocks import DUTY
+from sealscope.diagnosis.rms_change.rms_blocks import DUTY
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
 from sealscope.errors import InputError
 from sealscope.signals.details import QUANTITIES

@@ -14,11 +14,11 @@ import numpy as np
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.paragraphs import paragraphs
 from sealscope.recordings.channels import estimate_quantum

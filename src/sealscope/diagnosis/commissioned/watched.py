@@ -17,7 +17,7 @@ from sealscope.diagnosis.inference.equations.terms import PUMP
 from sealscope.diagnosis.live.estimates import HealthyLevel
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
-from sealscope.diagnosis.verdict.machine import unstated_rig
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.parameters import Rig, load_rig
 from sealscope.recordings.channels import METERS, flow_source

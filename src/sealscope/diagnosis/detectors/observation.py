@@ -22,11 +22,11 @@ from sealscope.diagnosis.detectors.detector import Detector, log_failure, unusab
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, healthy_summaries
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
-from sealscope.diagnosis.inference.changes.signals import SIGNALS, observe_signals
+from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.learnt import learn_once
-from sealscope.diagnosis.rms_change.detector import RmsChange, compare_summaries, has_same_rate
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
 from sealscope.recordings.motion import describe_hold, describe_line

@@ -107,9 +107,9 @@ def _make_detector(module: str, name: str, rig: Rig) -> Detector:
 
 #: Factories of the built-in detectors by name; a module is imported when its detector is first created.
 DETECTORS: dict[str, Factory] = {
-    VOLUME_BALANCE: partial(_make_detector, "inference.volumes.detector", "VolumeBalance"),
-    PRESSURE_RESPONSE: partial(_make_detector, "inference.pressures.detector", "PressureResponse"),
-    RMS_CHANGE: partial(_make_detector, "rms_change.detector", "RmsChange"),
+    VOLUME_BALANCE: partial(_make_detector, "inference.volumes.volume_detector", "VolumeBalance"),
+    PRESSURE_RESPONSE: partial(_make_detector, "inference.pressures.response_detector", "PressureResponse"),
+    RMS_CHANGE: partial(_make_detector, "rms_change.rms_detector", "RmsChange"),
 }
 
 

@@ -14,7 +14,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from sealscope.calls import checked_call
-from sealscope.diagnosis.hold.estimates import HeldLoad
+from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.judgement import judge_hold
 from sealscope.diagnosis.hold.readings import find_held_parts
 from sealscope.diagnosis.hold.result import HoldResult

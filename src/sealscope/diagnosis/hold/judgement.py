@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.diagnosis.hold.estimates import HeldLoad
+from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
 from sealscope.diagnosis.hold.plan import predict_rate_error
 from sealscope.diagnosis.hold.regression import Mixture, pool_mixtures

@@ -49,7 +49,7 @@ from sealscope.diagnosis.live.kernel.step import (
     take_block,
     weigh_all,
 )
-from sealscope.diagnosis.live.rise import STEP, LiveRise
+from sealscope.diagnosis.live.live_rise import STEP, LiveRise
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.storage.plain_state import plain_array, require_part, restore_array

@@ -20,7 +20,7 @@ from sealscope.diagnosis.inference.comparison.population import Population, numb
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.rms_change.blocks import DUTY, RmsBlocks, column_names
+from sealscope.diagnosis.rms_change.rms_blocks import DUTY, RmsBlocks, column_names
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 

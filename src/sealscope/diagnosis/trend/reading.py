@@ -17,21 +17,21 @@ from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
-from sealscope.diagnosis.hold.summary import held_leakage
+from sealscope.diagnosis.hold.recorded_holds import held_leakage
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import WITHIN_95
-from sealscope.diagnosis.inference.pressures.detector import PressureResponse
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
-from sealscope.diagnosis.inference.volumes.detector import VolumeBalance
+from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.priors.trend import TREND
-from sealscope.diagnosis.rms_change.blocks import JUDGED, measure_levels
-from sealscope.diagnosis.rms_change.detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_blocks import JUDGED, measure_levels
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.diagnosis.trend.wear import ScatterPrior
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig

@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixtur
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
-from sealscope.diagnosis.rms_change.detector import DETAILS, compare_summaries, has_same_rate
+from sealscope.diagnosis.rms_change.rms_detector import DETAILS, compare_summaries, has_same_rate
 from sealscope.diagnosis.trend.reading import TrendPoint
 from sealscope.diagnosis.trend.wear import Episode, Wear
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE, Cause, Evidence, TotalLeakage

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.diagnosis.verdict.evidence import AGAINST, LEAK, LEAKS, NO_LEAK, RMS_CHANGE, WITHIN, Evidence
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit, Severity, relative_leak, severity
 from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, action_of, state_of
 from sealscope.errors import InputError, MissingExtra

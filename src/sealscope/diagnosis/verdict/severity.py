@@ -11,7 +11,7 @@ import numpy as np
 
 from sealscope.diagnosis.priors.verdict import VERDICT
 from sealscope.diagnosis.verdict.evidence import LEAK, Evidence, RelativeLeak
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
 from sealscope.units import LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE, parse_quantity

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.machine_trend import Trend
 from sealscope.diagnosis.trend.wear import Episode
 from sealscope.reporting import messages, template
 from sealscope.reporting.picture import Picture

@@ -10,7 +10,7 @@ import numpy as np
 
 from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.trend import TREND
-from sealscope.diagnosis.trend.trend import Trend
+from sealscope.diagnosis.trend.machine_trend import Trend
 from sealscope.diagnosis.trend.wear import Wear
 from sealscope.paragraphs import format_count, paragraph, paragraphs
 from sealscope.reporting.messages import machine_text, number, say, state_text

@@ -19,7 +19,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.levels import MOTIONS, motion_columns, top_speed
+from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, motion_columns, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Information, StepTest, step_test

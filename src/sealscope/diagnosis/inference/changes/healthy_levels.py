@@ -36,7 +36,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     select_motion,
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
-from sealscope.diagnosis.inference.changes.signals import SIGNALS
+from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
 from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import Estimate

@@ -25,7 +25,7 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.balance import max_rest_rate
-from sealscope.diagnosis.inference.changes.levels import find_motion_channel
+from sealscope.diagnosis.inference.changes.level_changes import find_motion_channel
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, MIN_REST
 from sealscope.diagnosis.inference.onset import Estimate

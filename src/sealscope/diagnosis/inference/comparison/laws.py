@@ -9,7 +9,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.coefficients import marginal_difference, subtract_reference
+from sealscope.diagnosis.inference.comparison.excess import marginal_difference, subtract_reference
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
 from sealscope.recordings.recording import Array

@@ -35,13 +35,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.coefficients import (
+from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
+from sealscope.diagnosis.inference.comparison.excess import (
     ComparedColumns,
     coefficient_level,
     eliminate_unshared,
     estimate_leak_excess,
 )
-from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
 from sealscope.diagnosis.inference.comparison.population import Population, number_sessions
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, sum_blocks
-from sealscope.diagnosis.inference.comparison.coefficients import eliminate_unshared
+from sealscope.diagnosis.inference.comparison.excess import eliminate_unshared
 from sealscope.recordings.recording import Array
 
 

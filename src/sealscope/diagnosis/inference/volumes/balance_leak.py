@@ -30,7 +30,7 @@ from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_s
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage
-from sealscope.diagnosis.verdict.machine import healthy_leakage
+from sealscope.diagnosis.verdict.machine_sizes import healthy_leakage
 from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR, LITRE_PER_MINUTE

@@ -30,14 +30,14 @@ from sealscope.diagnosis.inference.changes.charge_pressure import estimate_charg
 from sealscope.diagnosis.inference.changes.motion_fit import fit_difference
 from sealscope.diagnosis.inference.changes.volumes import delay_observables, volume_observables
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
-from sealscope.diagnosis.inference.circuit.holds.hold import (
+from sealscope.diagnosis.inference.circuit.holds.hold_oil import CylinderSides
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     LockedHold,
     extend_rests,
     find_charge_pressure,
     find_locked_holds,
 )
-from sealscope.diagnosis.inference.circuit.holds.oil import CylinderSides
-from sealscope.diagnosis.inference.comparison.coefficients import block_weights
+from sealscope.diagnosis.inference.comparison.excess import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
@@ -67,7 +67,7 @@ from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakag
 from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, TotalFlow, estimate_total_flow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import RAREST
-from sealscope.diagnosis.verdict.machine import measures_flow
+from sealscope.diagnosis.verdict.machine_sizes import measures_flow
 from sealscope.recordings.channels import COUNTS, METERS, flow_source
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
@@ -174,7 +174,7 @@ class RecordedBalance:
     def block_weights(self, healthy: Sequence[RecordingSums]) -> Array:
         """Compute the weights (K,) of `running_blocks` in the rise of the leakage over `healthy` recordings.
 
-        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`coefficients.block_weights`). The
+        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`excess.block_weights`). The
         weights of all blocks have the sum 1.
         """
         grams = scale_grams(self.blocks, self.columns)

@@ -17,7 +17,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
-from sealscope.diagnosis.inference.comparison.coefficients import coefficient_level, marginal_difference
+from sealscope.diagnosis.inference.comparison.excess import coefficient_level, marginal_difference
 from sealscope.diagnosis.inference.comparison.laws import compare_laws, compare_with_leak
 from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses

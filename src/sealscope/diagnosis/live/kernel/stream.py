@@ -58,14 +58,6 @@ from sealscope.diagnosis.inference.rows.weak_form import (
     stride_samples,
     test_function,
 )
-from sealscope.diagnosis.live.balance import (
-    BLOCK_SECONDS,
-    LEARNED,
-    MIN_REST_PRECISION,
-    N_WAKING,
-    live_equations,
-    size_error,
-)
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
     STANDSTILL,
@@ -78,6 +70,14 @@ from sealscope.diagnosis.live.coefficients import (
     relative_motion,
 )
 from sealscope.diagnosis.live.kernel import step
+from sealscope.diagnosis.live.live_balance import (
+    BLOCK_SECONDS,
+    LEARNED,
+    MIN_REST_PRECISION,
+    N_WAKING,
+    live_equations,
+    size_error,
+)
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.parameters import Rig

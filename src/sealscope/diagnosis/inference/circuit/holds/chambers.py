@@ -37,7 +37,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.inference.blocks import offset_cost
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, estimate_hold_offsets, small_difference_factor
+from sealscope.diagnosis.inference.circuit.holds.hold_oil import (
+    CylinderSides,
+    OilRegression,
+    build_regression,
+    fit_leak,
+)
 from sealscope.diagnosis.inference.circuit.holds.leaks import (
     BOTH,
     NEITHER,
@@ -54,18 +59,17 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import (
     flow_of_side,
     growth_factor,
 )
-from sealscope.diagnosis.inference.circuit.holds.oil import (
-    CylinderSides,
-    OilRegression,
-    build_regression,
-    fit_leak,
-)
 from sealscope.diagnosis.inference.circuit.holds.onset_sums import (
     HoldSamples,
     OnsetPriors,
     score_offsets,
     score_onsets,
     sum_onset_products,
+)
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
+    LockedHold,
+    estimate_hold_offsets,
+    small_difference_factor,
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
 from sealscope.diagnosis.inference.onset import Estimate, Interval

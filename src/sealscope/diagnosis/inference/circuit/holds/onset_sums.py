@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel, large_law
-from sealscope.diagnosis.inference.circuit.holds.hold import LockedHold, small_difference_factor
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import LockedHold, small_difference_factor
 from sealscope.recordings.recording import Array
 
 #: Number of properties of the oil, and of the regressors whose products are summed: displaced volume and volumes that

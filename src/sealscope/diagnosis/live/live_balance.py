@@ -38,7 +38,7 @@ from sealscope.diagnosis.live.coefficients import (
     relative_motion,
 )
 from sealscope.diagnosis.live.joining import SampleRun, format_ways
-from sealscope.diagnosis.live.signals import MIN_BLOCKS, WINDOW, SignalWindow
+from sealscope.diagnosis.live.signal_window import MIN_BLOCKS, WINDOW, SignalWindow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause

@@ -17,7 +17,8 @@ from sealscope.diagnosis.inference.observable import Observable, Observed, Ringi
 from sealscope.diagnosis.inference.onset import Interval, StepTest, step_tests
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.rms_change.blocks import (
+from sealscope.diagnosis.rms_change.ringing import change_information, estimate_rises
+from sealscope.diagnosis.rms_change.rms_blocks import (
     JUDGED,
     RmsBlocks,
     column_names,
@@ -25,7 +26,6 @@ from sealscope.diagnosis.rms_change.blocks import (
     judged_chambers,
     measure_levels,
 )
-from sealscope.diagnosis.rms_change.ringing import change_information, estimate_rises
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
 from sealscope.recordings.chambers import chambers_of
 from sealscope.recordings.hydraulics import describe_missing_chambers

@@ -12,7 +12,7 @@ from contextlib import suppress
 import numpy as np
 
 from sealscope.diagnosis.inference.changes.features import BLOCKS, ORDER, observe_duty, observe_sensors
-from sealscope.diagnosis.inference.changes.levels import level_tests
+from sealscope.diagnosis.inference.changes.level_changes import level_tests
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Recording, compute_once

@@ -39,8 +39,8 @@ from sealscope.diagnosis.hold.regression import (
 )
 from sealscope.diagnosis.hold.result import HoldCurve
 from sealscope.diagnosis.hold.set_up import SetUp
-from sealscope.diagnosis.inference.circuit.holds.hold import estimate_hold_offsets, small_difference_factor
-from sealscope.diagnosis.inference.circuit.holds.oil import relative_compression
+from sealscope.diagnosis.inference.circuit.holds.hold_oil import relative_compression
+from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_hold_offsets, small_difference_factor
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD

@@ -19,14 +19,14 @@ from sealscope.diagnosis.inference.changes.features import (
     sensor_observables,
     time_in_motion,
 )
-from sealscope.diagnosis.inference.changes.levels import (
+from sealscope.diagnosis.inference.changes.level_changes import (
     fit_pressure_levels,
     motion_columns,
     pattern_tests,
     pressure_level_rows,
     top_speed,
 )
-from sealscope.diagnosis.inference.changes.signals import run_tests
+from sealscope.diagnosis.inference.changes.signal_tests import run_tests
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.live import LIVE

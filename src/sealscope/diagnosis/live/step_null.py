@@ -12,8 +12,8 @@ import math
 from functools import lru_cache
 
 from sealscope.diagnosis.decision.null import HealthyNull
-from sealscope.diagnosis.live.rise import STEP
-from sealscope.diagnosis.live.signals import WINDOW
+from sealscope.diagnosis.live.live_rise import STEP
+from sealscope.diagnosis.live.signal_window import WINDOW
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.storage.plain_state import SavedAttributes
 

@@ -28,7 +28,7 @@ from sealscope.diagnosis.trend.reading import (
 from sealscope.diagnosis.trend.trend_leak import decide_trend
 from sealscope.diagnosis.trend.wear import Episode, Levels, Wear, find_episodes, outlier_excess
 from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, Evidence, Verdict
-from sealscope.diagnosis.verdict.machine import AssumedMachine
+from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.diagnosis.verdict.states import LEAK_OVER_LIMIT, MachineState, state_of
 from sealscope.errors import InputError
