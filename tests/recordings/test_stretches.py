@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from sealscope.recordings import quality
-from sealscope.recordings.stretches import finite_range, iter_stretches, summarize_intervals, take_finite
+from sealscope.recordings.stretches import (
+    finite_range,
+    iter_stretches,
+    largest_steps,
+    summarize_intervals,
+    take_finite,
+)
 
 SIZES = (0, 1, 2, 3, 2**16 - 1, 2**16, 2**16 + 1, 150_000)
 
@@ -35,6 +41,13 @@ def test_intervals_and_ranges_equal_those_of_the_whole_array(size: int) -> None:
         finite = t[np.isfinite(t)]
         np.testing.assert_array_equal(take_finite(t), finite)
         assert finite_range(t) == ((finite.min(), finite.max()) if finite.size else None)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_the_largest_steps_are_those_of_the_whole_array(size: int) -> None:
+    values = np.random.default_rng(size).normal(size=size)
+    expected = np.argsort(np.abs(np.diff(values)), kind="stable")[-2:].tolist() if size else []
+    assert largest_steps(values, 2) == expected
 
 
 def _amplitudes(values: np.ndarray, n_fft: int) -> np.ndarray:

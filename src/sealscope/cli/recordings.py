@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 #: Levels of a leak's severity in rising order, which `--fail-on` accepts.
 _LEVELS = ("monitor", "plan", "repair")
 FailOn = StrEnum("FailOn", [(word.replace(" ", "_"), word) for word in (*opt.Verdict, *_LEVELS)])  # type: ignore[misc]
-#: Fewer files are diagnosed in this process, as starting others takes a second or two.
-_MIN_PARALLEL_FILES = 4
+#: Fewer and smaller files are diagnosed in this process, as starting others takes a second or two. The size is that of
+#: all files but the largest [bytes].
+_MIN_PARALLEL_FILES, _MIN_PARALLEL_SIZE = 4, 2**24
 #: Smallest number of files, and time between two of them [s], of a series over time.
 _MIN_SERIES_FILES, _MIN_SERIES_INTERVAL = 3, 3600.0
 _FAIL_ON = (
@@ -87,7 +88,7 @@ def diagnose(
     work = partial(_iter_dated_diagnoses, machine=stated, joined=join, false_alarm_probability=false_alarm)
     is_piped = _reads_standard_input([*files, *stated.baseline])
     # one process: joined files are one recording; others would read each baseline again, and have no standard input
-    is_serial = join or is_piped or stated.baseline or stated.commissioned or len(files) < _MIN_PARALLEL_FILES
+    is_serial = join or is_piped or stated.baseline or stated.commissioned or not _is_long_work(files)
     results: Iterable[tuple[str, Iterable[DatedDiagnosis | None]]]
     results = [("", work(files))] if is_serial else _diagnose_in_parallel(work, files)
     is_complete = True
@@ -107,6 +108,14 @@ def diagnose(
         opt.complain(f"these {len(files)} files are ordered in time: `sealscope trend` shows how the leakage developed")
     if not is_complete or is_failure:
         raise Exit(opt.FAILED_ON if is_failure else 1)
+
+
+def _is_long_work(files: Sequence[Path]) -> bool:
+    """Return True if several processes diagnose `files` sooner than this one: if they are many, or two are long."""
+    if len(files) >= _MIN_PARALLEL_FILES:
+        return True
+    sizes = sorted(file.stat().st_size if file.is_file() else 0 for file in files)
+    return sum(sizes[:-1]) >= _MIN_PARALLEL_SIZE
 
 
 def _diagnose_in_parallel(

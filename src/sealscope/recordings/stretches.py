@@ -60,3 +60,13 @@ def take_finite(values: NDArray[Any]) -> NDArray[Any]:
     """Take the finite ones of values (n,), which are the array itself if all are."""
     is_finite = np.isfinite(values)
     return values if is_finite.all() else values[is_finite]
+
+
+def largest_steps(values: NDArray[np.float64], count: int) -> list[int]:
+    """Find the indices of the `count` largest steps from sample to sample of finite values (n,), the largest last."""
+    candidates: list[tuple[float, int]] = []
+    for stretch in iter_stretches(values.size, overlap=1):
+        sizes = np.abs(np.diff(values[stretch]))
+        largest = np.argpartition(sizes, -count)[-count:] if sizes.size > count else np.arange(sizes.size)
+        candidates += [(float(sizes[index]), stretch.start + int(index)) for index in largest]
+    return [index for _, index in sorted(candidates)[-count:]]

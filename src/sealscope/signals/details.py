@@ -109,7 +109,8 @@ def mean_squares(transformed: Details, bounds: ArrayLike) -> Array:
 
     `bounds` (k + 1,): segment i has the samples bounds[i] to bounds[i + 1] - 1. The signal must have four levels.
     """
-    return segment_means(np.square(transformed.quantities()), bounds).T
+    quantities = (*transformed.values, transformed.product())  # squared one by one, as they are long
+    return np.concatenate([segment_means(np.square(quantity)[None], bounds) for quantity in quantities]).T
 
 
 def segment_means(values: Array, bounds: ArrayLike) -> Array:
@@ -133,4 +134,7 @@ def _atrous_details(x: Array, wavelet: Any, levels: int) -> Array:
     after += -(x.size + before + after) % 2**levels  # swt needs a multiple of 2^levels samples
     padded = pywt.pad(x, (before, after), _PADDING)
     _, *deepest_first = pywt.swt(padded, wavelet, level=levels, trim_approx=True, norm=False)
-    return np.array([detail[before : before + x.size] for detail in reversed(deepest_first)])
+    values = np.empty((levels, x.size))
+    for row in values:  # frees each detail before the next is copied
+        row[:] = deepest_first.pop()[before : before + x.size]
+    return values

@@ -82,18 +82,30 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 
     Its ends are left out, as the wavelet transform depends on padding there.
     """
-    transformed = [details(recording[chamber]) for chamber in judged_chambers(recording)]
-    inside = transformed[0].inside()
-    log_rms, duty = _measure_blocks(recording, transformed, bounds=np.array([inside.start, inside.stop]))
+    chambers = judged_chambers(recording)
+    transformed = details(recording[chambers[0]])
+    inside = transformed.inside()
+    bounds = np.array([inside.start, inside.stop])
+    log_rms, duty = _measure_blocks(recording, _measure_details(recording, chambers, transformed, bounds), bounds)
     return log_rms[0], duty[0]
 
 
-def _measure_blocks(recording: Recording, transformed: list[Details], bounds: IntArray) -> tuple[Array, Array]:
+def _measure_details(recording: Recording, chambers: Sequence[str], first: Details, bounds: IntArray) -> Array:
+    """Compute the mean squares (n, 5 c) of the details of c chamber pressures in blocks that end at `bounds` (n + 1,).
+
+    `first`: details of the first chamber; those of the others are computed one at a time, as they are long.
+    """
+    energies = [mean_squares(first, bounds)]
+    energies += [mean_squares(details(recording[chamber]), bounds) for chamber in chambers[1:]]
+    return np.concatenate(energies, axis=1)
+
+
+def _measure_blocks(recording: Recording, energies: Array, bounds: IntArray) -> tuple[Array, Array]:
     """Compute `RmsBlocks.log_rms` and `RmsBlocks.duty` of n blocks.
 
-    `transformed` are the wavelet details of each judged chamber, and `bounds` (n + 1,) the sample indices of the
-    blocks' ends. The load is p_A - p_B, even if one of them is clipped, or the pressure of the only recorded chamber
-    minus its mean. The log RMS is -inf for a detail that is 0, such as that of a stuck reading.
+    `energies` (n, 5 c): mean squares of the wavelet details of each judged chamber, `bounds` (n + 1,): sample indices
+    of the blocks' ends. The load is p_A - p_B, even if one of them is clipped, or the pressure of the only recorded
+    chamber minus its mean. The log RMS is -inf for a detail that is 0, such as that of a stuck reading.
     """
     chambers = chambers_of(recording)
     if len(chambers) == len(CHAMBERS):
@@ -101,11 +113,11 @@ def _measure_blocks(recording: Recording, transformed: list[Details], bounds: In
     else:
         load = recording[chambers[0]] - recording[chambers[0]].mean()
     command = recording.channels.get("u", np.zeros(len(recording)))  # without u: equal in all blocks
-    squares = np.stack([command, np.gradient(command) * recording.rate, load]) ** 2
+    squares = np.stack([command, np.gradient(command) * recording.rate, load])
+    squares *= squares
     # lower limit, so that the logarithm is finite in blocks at standstill
     floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
     with np.errstate(divide="ignore", over="ignore"):
-        energies = np.concatenate([mean_squares(signal, bounds) for signal in transformed], axis=1)
         log_rms = 0.5 * np.log(energies)
         duty_log_rms = 0.5 * np.log(segment_means(squares, bounds) + floor)  # rows: command, its rate, load
     direction = segment_means(load[None], bounds) / np.exp(duty_log_rms[-1:])  # mean over RMS of the load
@@ -120,13 +132,15 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     is stuck, whose log RMS has no mean.
     """
     chambers = judged_chambers(recording)
-    transformed = [details(recording[chamber]) for chamber in chambers]
+    transformed = details(recording[chambers[0]])
     cycle = find_cycle(recording)
-    bounds, phases = _block_bounds(transformed[0].inside(), recording.rate, cycle)
+    bounds, phases = _block_bounds(transformed.inside(), recording.rate, cycle)
     if len(bounds) == 1:  # too short for a block
         no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
         return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, cycle)
-    log_rms, duty = _measure_blocks(recording, transformed, bounds)
+    energies = _measure_details(recording, chambers, transformed, bounds)
+    del transformed
+    log_rms, duty = _measure_blocks(recording, energies, bounds)
     times = recording.t[0] + bounds / recording.rate
     is_complete = ~flag_bridged(recording, bounds)
     frozen = _find_frozen(recording, chambers, log_rms, is_complete, times)

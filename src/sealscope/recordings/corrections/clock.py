@@ -20,6 +20,7 @@ from sealscope.recordings.formats.times.timebase import interpolate_samples
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.stretches import summarize_intervals
 
 _PRIORS = RECORDINGS.clock
 #: Longest interval that is interpolated, in median intervals.
@@ -49,6 +50,8 @@ def order_recording(recording: Recording) -> OrderedRecording:
         Finding(event.code, event.severity, None, event.number, float(ordered.t[event.row]), f"time {event.text}")
         for event in ordered.events
     ]
+    if summarize_intervals(recording.t).shortest >= 0.0:
+        return OrderedRecording(recording, tuple(findings))
     timed = np.flatnonzero(np.isfinite(recording.t))
     starts = np.flatnonzero(np.diff(recording.t[timed]) < 0.0) + 1
     if not starts.size:
@@ -71,6 +74,10 @@ def resample_evenly(recording: Recording) -> Recording:
     to within `clock.scatter` of `priors.toml` (rms), rows of NaN are inserted for lost samples; else the samples are
     interpolated linearly. A recording that needs none of this is returned as it is.
     """
+    intervals = summarize_intervals(recording.t)
+    steps = np.array([intervals.shortest, intervals.longest]) * recording.rate
+    if intervals.number and np.abs(steps - 1.0).max() <= _PRIORS.scatter:
+        return recording
     timed = np.flatnonzero(np.isfinite(recording.t))
     latest_time = np.maximum.accumulate(recording.t[timed])
     rows = timed[np.diff(latest_time, prepend=-np.inf) > 0.0]

@@ -25,6 +25,7 @@ from sealscope.recordings.motion import find_runs
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import flag_impossible, uniform_segments
 from sealscope.recordings.recording import Recording
+from sealscope.recordings.stretches import largest_steps, take_finite
 from sealscope.units import P_ATM
 
 Flags = NDArray[np.bool_]
@@ -78,7 +79,8 @@ def remove_unsupplied(recording: Recording) -> Recording:
         is_off = _is_below_live_zero(recording["p_A"]) & _is_below_live_zero(recording["p_B"])
     unsupplied = dict.fromkeys(recording.channels, is_off)
     if "x" in recording:
-        unsupplied["x"] = is_off | _flag_dead_ends(np.where(is_off, np.nan, recording["x"]))
+        x = recording["x"]
+        unsupplied["x"] = is_off | _flag_dead_ends(np.where(is_off, np.nan, x) if is_off.any() else x)
     return set_missing(recording, unsupplied)
 
 
@@ -94,17 +96,19 @@ def _flag_dead_ends(position: Array) -> Flags:
     flagged if they are outside of all positions in that time by a distance of more than `gaps.live_zero` times the
     range of these, and vary by less than `gaps.dead` times this distance.
     """
-    known, is_dead = np.flatnonzero(np.isfinite(position)), np.zeros(len(position), dtype=bool)
-    if known.size < 2:
-        return is_dead
-    values = position[known]
+    values = take_finite(position)
+    is_dead = np.zeros(values.size, dtype=bool)
+    if values.size < 2:
+        return np.zeros(len(position), dtype=bool)
     # first samples after the two largest steps; 0 if there is only one step
-    *_, second, largest = 0, *np.argsort(np.abs(np.diff(values))) + 1
+    *_, second, largest = 0, *(index + 1 for index in largest_steps(values, 2))
     for start, stop in ((largest, values.size), (0, largest), (min(second, largest), max(second, largest))):
         live, ends = values[start:stop], [end for end in (values[:start], values[stop:]) if end.size]
         if all(_is_dead_end(end, live) for end in ends) and np.unique(live).size >= _MIN_POSITIONS:
-            is_dead[known[:start]] = is_dead[known[stop:]] = True
-    return is_dead
+            is_dead[:start] = is_dead[stop:] = True
+    flags = np.zeros(len(position), dtype=bool)
+    flags[np.isfinite(position)] = is_dead
+    return flags
 
 
 def _is_dead_end(end: Array, live: Array) -> bool:

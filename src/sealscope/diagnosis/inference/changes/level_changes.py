@@ -136,15 +136,21 @@ def pressure_level_rows(
     speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of it.
     """
     motion = motion_columns(channels, rate)
-    pressures = np.column_stack([channels["p_A"], channels["p_B"]]) - means
+    n_motion = 0 if motion is None else 1 + motion.shape[1]
+    rows = np.empty((len(channels["p_A"]), 3 + n_motion))  # filled in place: they are the largest array of a verdict
+    rows[:, 0] = 1.0
+    for place, (name, mean) in enumerate(zip(("p_A", "p_B"), means, strict=True)):
+        np.subtract(channels[name], mean, out=rows[:, 1 + n_motion + place])
     if motion is None:
-        return np.column_stack([np.ones(len(pressures)), pressures])
+        return rows
     is_known = np.asarray(np.isfinite(motion).all(axis=1))
-    motion = np.where(is_known[:, None], motion, 0.0)
+    motion[~is_known] = 0.0
     max_speed = top_speed(motion) if max_speed is None else max_speed
     is_moving = is_known & (np.abs(motion[:, 0]) > _PRIORS.slowest * max_speed)
-    columns = np.column_stack([np.ones(len(motion)), np.sign(motion[:, 0]), motion, pressures])
-    return np.asarray(columns * is_moving[:, None])
+    np.sign(motion[:, 0], out=rows[:, 1])
+    rows[:, 2 : 1 + n_motion] = motion
+    rows *= is_moving[:, None]
+    return rows
 
 
 def fit_pressure_levels(gram: Array, length: float, means: Array) -> Array | None:
