@@ -202,9 +202,11 @@ def run_test(seed, first):
     if plant["stop"] and random.random() < 0.5:
         lengths = plant["x"] + plant["dead"], plant["stroke"] - plant["x"] + plant["dead"]
         volumes = tuple(f"{plant[side] * length} m^3" for side, length in zip("AB", lengths, strict=True))
+    # a workshop knows which way the load pushes, which a position alone does not tell
+    loaded = None if any(name.startswith("p_") for name in recording.channels) else plant["loaded"]
     begin = time.process_time()
     try:
-        (result,) = ss.hold_test(recording, area=areas, volume=volumes, limit=f"{limit / ML_MIN} mL/min")
+        (result,) = ss.hold_test(recording, area=areas, volume=volumes, limit=f"{limit / ML_MIN} mL/min", loaded=loaded)
     except Exception as error:
         return {"seed": seed, "error": f"{type(error).__name__}: {error}", "plant": plant, "logger": logger}
     seconds = time.process_time() - begin

@@ -23,6 +23,7 @@ _OIL = "Oil that is not logged: '45 degC falling', 'rising' or 'steady'."
 _AT = "Pressure to which the leak is converted, '200 bar'."
 _COLLECTED = "Oil collected at the port of the unloaded side: '12 mL in 10 min'."
 _VALVE = "Sides with a load-holding valve: A, B, 'A,B' or none. [default: not known]"
+_LOADED = "Side that carries the load: A or B. [default: by the pressures, or by the motion]"
 _CAPPED = "Sides whose port is capped at the cylinder: A, B, 'A,B' or none."
 
 
@@ -38,6 +39,7 @@ def hold(
     collected: Annotated[str | None, Option("--collected", metavar="TEXT", help=_COLLECTED)] = None,
     valve: Annotated[str | None, Option("--valve", metavar="SIDES", help=_VALVE)] = None,
     capped: Annotated[str | None, Option("--capped", metavar="SIDES", help=_CAPPED)] = None,
+    loaded: Annotated[str | None, Option("--loaded", metavar="SIDE", help=_LOADED)] = None,
     start: Annotated[str | None, Option("--from", metavar="TIME", help="Start of the hold. [default: found]")] = None,
     end: Annotated[str | None, Option("--until", metavar="TIME", help="End of the hold. [default: found]")] = None,
     form: Annotated[Literal["text", "jsonl"], Option("--format", help="Text, or one JSON object a hold.")] = "text",
@@ -55,7 +57,7 @@ def hold(
 
     settings: dict[str, Any] = {
         "area": area or None, "volume": volume or None, "limit": limit, "oil": oil, "reference": reference,
-        "collected": collected, "valve": valve, "capped": capped,
+        "collected": collected, "valve": valve, "capped": capped, "loaded": loaded,
     }  # fmt: skip
     parse_set_up(**settings)  # a wrong option is an error of the call, not of its first file
     if not files and collected is None:

@@ -15,7 +15,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -25,6 +25,7 @@ from sealscope.diagnosis.hold.readings import (
     N_PARTS,
     Readings,
     average_parts,
+    course_basis,
     read_channel,
     sample_course,
     smooth_course,
@@ -62,6 +63,8 @@ SMOOTH_DEGREE = 3
 #: Time constants [durations of the hold] of the exponentials that such a smooth course has as well, and the number of
 #: its passages from step to step, or of its means, that are needed for them.
 COURSE_TIMES, MIN_PASSAGES = (0.2,), 24
+#: Number of time constants of what settles that are tried, to find the best.
+N_TIMES = 30
 #: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
 AT_STOP = 3.0
 #: Error of the change of a rounded temperature over a hold, in steps.
@@ -104,17 +107,22 @@ def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0
     return Column(course, mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
 
 
-def _fit_course(
-    z: Array, values: Array, weights: Array, degree: int, times: Sequence[float]
-) -> Callable[[Array], Array]:
-    """Fit a polynomial of a `degree` and exponentials of `times` to values at z, with `weights` (m,); return it."""
+def _refine_times(readings: Readings, times: Sequence[float]) -> list[float]:
+    """Replace the nearest of some time constants [s] by that of the exponential that fits the readings best.
 
-    def basis(z: Array) -> Array:
-        powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, degree)
-        return np.column_stack([powers, *(np.exp(-z / time) for time in times)])
-
-    coefficients = np.linalg.lstsq(weights[:, None] * basis(z), weights * values, rcond=None)[0]
-    return lambda z: np.asarray(basis(z) @ coefficients)
+    The rest of the readings is a polynomial meanwhile. Passages between the steps of an encoder are too few for it.
+    """
+    if readings.quantum or not times or len(readings.t) < MIN_PASSAGES:
+        return list(times)
+    tried = np.geomspace(times[0], times[-1], N_TIMES)
+    basis = np.linalg.qr(course_basis(readings.t / readings.t[-1], SMOOTH_DEGREE))[0]
+    rest = readings.values - basis @ (basis.T @ readings.values)
+    courses = np.array([readings.decay(time) for time in tried])
+    courses -= (courses @ basis) @ basis.T
+    explained = (courses @ rest) ** 2 / np.maximum((courses**2).sum(axis=1), np.finfo(float).tiny)
+    best = float(tried[int(explained.argmax())])
+    nearest = int(np.abs(np.log(np.array(times) / best)).argmin())
+    return [*times[:nearest], best, *times[nearest + 1 :]]
 
 
 class HeldLoad:
@@ -140,7 +148,9 @@ class HeldLoad:
 
     @cached_property
     def loaded(self) -> str:
-        """Side of the higher pressure or, without pressures, the side towards which the piston moves."""
+        """Side of the load: stated, of the higher pressure or, without pressures, ahead of the moving piston."""
+        if self.set_up.loaded:
+            return self.set_up.loaded
         pressures = (
             {} if self.recording is None else {name[-1]: self.recording[name] for name in chambers_of(self.recording)}
         )
@@ -188,7 +198,7 @@ class HeldLoad:
     def _settling(self, readings: Readings, sizes: Sequence[float]) -> list[Alternative]:
         """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude."""
         prior = HOLD.settling
-        times = [time for time in prior.times if time <= prior.longest * self.duration]
+        times = _refine_times(readings, [time for time in prior.times if time <= prior.longest * self.duration])
         weight = prior.present / max(len(times) * len(sizes), 1)
         terms = [_exponential(readings, time, size) for time in times for size in sizes]
         return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
@@ -203,11 +213,13 @@ class HeldLoad:
         n_exact = int(np.count_nonzero(logged.loose == 0.0))
         degree = max(min(SMOOTH_DEGREE, n_exact - 1), 1)
         times = COURSE_TIMES if n_exact >= MIN_PASSAGES else ()
-        course = _fit_course(logged.t / self.duration, logged.values, weights, degree, times)
+        basis = weights[:, None] * course_basis(logged.t / self.duration, degree, times)
+        coefficients = np.linalg.lstsq(basis, weights * logged.values, rcond=None)[0]
         length, deviation = self.column
         scale = -HOLD.cooling.expansion * length
         self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
-        travel = scale * (course(t / self.duration) - course(np.zeros(1)))
+        change = course_basis(t / self.duration, degree, times) - course_basis(np.zeros(1), degree, times)
+        travel = scale * np.asarray(change @ coefficients)
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
         size = HOLD.cooling.misfit * float(np.ptp(travel))
         misfit = self._misfit(t, t, size) + [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]

@@ -42,6 +42,7 @@ def hold_test(
     collected: str | None = None,
     valve: str | None = None,
     capped: str | None = None,
+    loaded: str | None = None,
     start: str | float | None = None,
     end: str | float | None = None,
     file: str | os.PathLike[str] | None = None,
@@ -67,6 +68,9 @@ def hold_test(
         Volume that was collected at the port of the unloaded side, such as ``"12 mL in 10 min"``.
     valve, capped : str, optional
         Sides with a load-holding valve, and sides whose port is capped: ``"A"``, ``"B"``, ``"A,B"`` or ``"none"``.
+    loaded : str, optional
+        Side that carries the load, ``"A"`` or ``"B"``; by default that of the higher pressure or, of a position alone,
+        the side towards which the piston moves.
     start, end : str or float, optional
         Times of the hold (``"10 s"``, or s); by default it is found.
     file : str or path-like, optional
@@ -93,7 +97,7 @@ def hold_test(
     >>> result.result, round(result.creep_mm_per_min, 2)
     ('pass', 0.67)
     """
-    set_up = parse_set_up(area, volume, limit, oil, reference, collected, valve, capped)
+    set_up = parse_set_up(area, volume, limit, oil, reference, collected, valve, capped, loaded)
     if recording is None:
         if set_up.collected is None:
             raise InputError("a hold test needs a recording, or the volume that was collected (collected)")

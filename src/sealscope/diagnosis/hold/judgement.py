@@ -51,7 +51,9 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
     causes = _list_causes(hold) if has_leak else (COOLING,) if by_cooling else ()
     minutes = None
     if result == "undecided" and compared is not None and bound is not None:
-        minutes = find_minutes(hold, abs(compared.mean - bound) * scale / _flow_scale(hold, limit))
+        # to mm/min; without an area a flow has no speed
+        area = set_up.area(hold.loaded) if limit is not None and limit.kind == "flow" else 1.0
+        minutes = find_minutes(hold, abs(compared.mean - bound) * scale / (MM_PER_MINUTE * (area or math.inf)))
     elif by_cooling and leak.rate is not None:
         minutes = find_minutes(hold, abs(leak.rate.mean))
     curve = leak.curve
@@ -80,13 +82,6 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
         quality=tuple(hold.findings),
         curve=curve,
     )
-
-
-def _flow_scale(hold: HeldLoad, limit: object) -> float:
-    """Return the factor from a speed [mm/min] to the limit's unit."""
-    kind = getattr(limit, "kind", "creep")
-    area = hold.set_up.area(hold.loaded) if kind == "flow" else 1.0
-    return MM_PER_MINUTE * (area or math.inf)
 
 
 def _interval_lpm(flow: Mixture | None) -> tuple[float, float] | None:

@@ -8,6 +8,7 @@ otherwise only that it is within a step: its readings are these passages, and bo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -131,6 +132,12 @@ def _read_passages(t: Array, fine_t: Array, position: Array, origin: float, quan
     return Readings(all_t[order_t], values[order_t], loose[order_t], quantum)
 
 
+def course_basis(z: Array, degree: int, times: Sequence[float] = ()) -> Array:
+    """Compute polynomials up to a `degree`, and exponentials of `times`, at z (m,) from 0 to 1: columns of a matrix."""
+    powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, degree)
+    return np.column_stack([powers, *(np.exp(-z / time) for time in times)])
+
+
 def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
     """Average samples (n,) over fine parts of a hold, and smooth the means unless they wander; return times and values.
 
@@ -142,8 +149,7 @@ def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
     if len(means) <= 2 * (SMOOTH_DEGREE + 1 + len(SMOOTH_TIMES)):
         return part_t, means
     z = (part_t - part_t[0]) / (part_t[-1] - part_t[0])
-    powers = np.polynomial.chebyshev.chebvander(2.0 * z - 1.0, SMOOTH_DEGREE)
-    basis = np.column_stack([powers, *(np.exp(-z / time) for time in SMOOTH_TIMES)])
+    basis = course_basis(z, SMOOTH_DEGREE, SMOOTH_TIMES)
     starts = np.arange(0, len(means) - size + 1, size)
     noise = 1.4826 * float(np.median(np.abs(np.diff(np.add.reduceat(means, starts) / size, 2)))) / 6.0**0.5
     for n_columns in (1, 2, basis.shape[1]):  # the simplest course that suffices

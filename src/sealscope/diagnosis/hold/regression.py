@@ -38,7 +38,7 @@ MAX_DECREASE = 14.0
 #: Smallest weight of a component of a mixture, relative to the largest.
 LEAST_WEIGHT = 1e-5
 #: Half of an interval's probability outside, and iterations of a bisection for a quantile.
-TAIL, N_BISECTIONS = 0.025, 50
+TAIL, N_BISECTIONS = 0.025, 30
 #: Number of factors into which an uncertain one is divided.
 N_FACTORS = 15
 #: Smallest standard deviation of the noise of a mean, in the readings' unit.

@@ -20,7 +20,7 @@ class SetUp(NamedTuple):
 
     `areas`, `volumes`: of one side, or of A and B; `valves`: sides with a load-holding valve, None if not stated;
     `capped`: sides whose port is capped; `reference`: pressure [Pa] to which the leak is converted; `oil_temperature`
-    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s].
+    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s]; `loaded`: side, or "".
     """
 
     areas: tuple[float, ...]
@@ -32,6 +32,7 @@ class SetUp(NamedTuple):
     oil_temperature: float | None
     oil_course: str
     collected: tuple[float, float] | None
+    loaded: str
 
     def area(self, side: str) -> float | None:
         """Return the area of a side [m^2]; None if it is not stated."""
@@ -52,7 +53,7 @@ class SetUp(NamedTuple):
 
 def parse_set_up(
     area: Any = None, volume: Any = None, limit: str | None = None, oil: str | None = None, reference: Any = None,
-    collected: str | None = None, valve: str | None = None, capped: str | None = None,
+    collected: str | None = None, valve: str | None = None, capped: str | None = None, loaded: str | None = None,
 ) -> SetUp:  # fmt: skip
     """Parse the arguments of `hold_test`; raise InputError for one that is out of its range."""
     areas = _parse_sides(area, "m^2", "area")
@@ -64,6 +65,9 @@ def parse_set_up(
                     f"{name} must be {low:g} to {high:g} {unit}, got {number:g} {unit}: is its unit right?"
                 )
     temperature, course = _parse_oil(oil)
+    side = "" if loaded is None else str(loaded).strip().upper()
+    if side not in ("", "A", "B"):
+        raise InputError(f"loaded must be A or B, got {loaded}")
     return SetUp(
         areas,
         volumes,
@@ -74,6 +78,7 @@ def parse_set_up(
         temperature,
         course,
         None if collected is None else parse_collected(collected),
+        side,
     )
 
 
