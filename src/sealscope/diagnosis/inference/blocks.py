@@ -18,6 +18,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -561,9 +562,15 @@ def _fit_equation(blocks: Blocks, equation: int, roles: ColumnRoles, test: int |
     g between blocks also changes the constant flow -g z, and so reveals z. z is small, since a first estimate of the
     offset is already removed from the Gram matrices (`pressure_offset.remove_pressure_offset`).
 
-    `test`: column of g, by default the leak's.
+    `test`: column of g, by default the leak's. The result is cached for the last blocks.
     """
-    gram, test = blocks.gram[:, equation], roles.leak if test is None else test
+    return _fit_equation_once(blocks, equation, roles, roles.leak if test is None else test)
+
+
+@lru_cache(maxsize=64)
+def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: int) -> _EquationFit:
+    """Fit the nuisance coefficients of an equation and the sensor offset (`_fit_equation`)."""
+    gram = blocks.gram[:, equation]
     nuisance = [k for k in roles.nuisance if k != test]
     seconds = max(float(blocks.end[-1] - blocks.start[0]), 1e-9)
     position = (blocks.time - blocks.start[0]) / seconds * 2.0 - 1.0  # -1 to 1, the range of Legendre polynomials
@@ -665,13 +672,12 @@ def estimate_leak_and_bias(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, A
     """
     leak, bias = roles.leak, roles.bias
     assert bias is not None
-    blocks = replace(blocks, gram=blocks.gram.copy())
-    gram = blocks.gram[:, 0]
+    fit = _fit_equation(blocks, 0, roles)
+    gram = blocks.gram[:, 0].copy()
     bias_energy = gram[:, bias, bias]
     has_bias = bias_energy > RIDGE * bias_energy.max()  # false if the flow offset's column is zero, as at rest
     # the leak's column is (p_A - p_B) dt, that of the flow offset is dt
     mean_pressure = np.where(has_bias, gram[:, leak, bias], 0.0) / np.where(has_bias, bias_energy, 1.0)
-    fit = _fit_equation(blocks, 0, roles)  # before `gram`, a view of these blocks, changes
     gram[:, leak] -= mean_pressure[:, None] * gram[:, bias]
     gram[:, :, leak] -= mean_pressure[:, None] * gram[:, :, bias]
     nuisance = [k for k in roles.nuisance if k not in (leak, bias)]

@@ -350,10 +350,10 @@ class RecordedBalance:
         since a large leak equalises the pressures while the valves are shutting.
         """
         oil, t = INFERENCE.held_oil, self.recording.t
-        difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         # just before the hold the pump stops and the valves shut
         first, last = np.searchsorted(t, hold.t[0] - np.array([oil.settles, 0.0]))
-        difference_before = np.nanmedian(difference[first : last + 1])
+        before = slice(first, last + 1)
+        difference_before = np.nanmedian(np.abs(self.recording["p_A"][before] - self.recording["p_B"][before]))
         pressure = float(np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), difference_before]))
         return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
 
@@ -364,10 +364,14 @@ class RecordedBalance:
         """
         # an offset z has the log probability density -offset_cost(z) / 2 - log_offset_norm
         log_offset_norm = float(np.log(INFERENCE.zero.pressure * np.sqrt(2.0 * np.pi)))
+        return np.asarray(0.5 * offset_cost(pressure) + log_offset_norm - self._log_max_load)
+
+    @cached_property
+    def _log_max_load(self) -> float:
+        """Logarithm of the largest load of the recording, a difference of the pressures [Pa]."""
         difference = np.abs(self.recording["p_A"] - self.recording["p_B"])
         max_load = float(np.nanquantile(difference, 1.0 - END_QUANTILE))
-        log_load_density = -float(np.log(max(max_load, np.finfo(float).tiny)))
-        return np.asarray(log_load_density + 0.5 * offset_cost(pressure) + log_offset_norm)
+        return float(np.log(max(max_load, np.finfo(float).tiny)))
 
     def locked_log_odds(self, conductance: Interval) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.

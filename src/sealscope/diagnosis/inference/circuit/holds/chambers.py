@@ -86,6 +86,8 @@ AREA_NODES, AREA_WEIGHTS = (0.0, 3.0**0.5, -(3.0**0.5)), (2.0 / 3.0, 1.0 / 6.0, 
 MIN_LOG_PRIOR = -30.0
 #: Number of evenly spaced onsets within a hold.
 N_ONSETS = 4
+#: Largest number of last readings of holds that are tried as the sensor offset.
+MAX_ENDS = 64
 #: Probability outside of the interval of an onset.
 TAIL = 0.05
 
@@ -302,7 +304,7 @@ class HeldChambers:
         for hold, hold_offset in zip(self.holds, hold_offsets, strict=True):
             # `hold.t` leaves out the end of the rest, in which the valves open and over which the flow was averaged
             begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
-            offsets[(t >= begin) & (t <= end)] = hold_offset
+            offsets[slice(*np.searchsorted(t, [begin, np.nextafter(end, np.inf)]))] = hold_offset
         return np.asarray(difference - offsets)
 
     def _unit_outside_leak(self, is_A: bool, supplies: SideSupplies = BOTH) -> UnitLeak:
@@ -457,9 +459,12 @@ class HeldChambers:
     def _offset_grid(self) -> Array:
         """Candidates for the sensor offset of p_A - p_B [Pa], sorted: a fixed grid and the last reading of each hold.
 
-        The latter is the offset if a leak has equalised the pressures by then.
+        The latter is the offset if a leak has equalised the pressures by then. Of more than `MAX_ENDS` readings, so
+        many with equally spaced ranks are used: the offset of a hold may differ a little from the recording's.
         """
-        ends = [hold.mean(hold.difference)[-1] for hold in self.holds]
+        ends = np.sort([hold.mean(hold.difference)[-1] for hold in self.holds])
+        if len(ends) > MAX_ENDS:
+            ends = ends[np.linspace(0, len(ends) - 1, MAX_ENDS).round().astype(int)]
         return np.unique(np.concatenate([np.append(-OFFSET_GRID, OFFSET_GRID) * INFERENCE.zero.pressure, ends]))
 
     @cached_property
