@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import base64
+import os
+import re
 import shutil
+import subprocess
+import sys
 import time
 import zipfile
 from pathlib import Path
@@ -11,13 +16,15 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.app.server import AppServer, replay_session
+from sealscope.app.server import AppServer
+from sealscope.monitor.settings import read_settings
 from sealscope.reporting.printing import BROWSERS
 
 from .conftest import HEADING, write_log
 
 pytestmark = pytest.mark.slow
 BROWSER = next(filter(None, map(shutil.which, BROWSERS)), None)
+UNDATED = re.compile(r'^written = "[^"]*"$', re.MULTILINE)
 SCREENS = ("logs", "channels", "healthy", "verdict", "trend", "hold")
 
 
@@ -85,6 +92,42 @@ class Page:
         self.view.click(f"[data-screen={screen}]")
         self.until(f"!document.getElementById('{screen}').hidden")
 
+    def programs(self, screen: str, command: str) -> list[list[str]]:
+        """Return the programs that run the command, and the lines of Python, of a screen as they stand in its text.
+
+        `command`: the word after `sealscope`, by which the text is known to be that of the screen.
+        """
+        self.open(screen)
+        if self.view.locator("#script[open]").count() == 0:
+            self.view.click("#script summary")
+        self.until(f"document.getElementById('script-command').textContent.startsWith('sealscope {command} ')")
+        self.folder = self.view.text_content("#script-folder")
+        command, lines = (self.view.text_content(f"#script-{name}") for name in ("command", "python"))
+        return [["sh", "-c", command], [sys.executable, "-c", lines]]
+
+    def run(self, program: list[str]) -> str:
+        """Run a program of `programs` in the folder that the page names, and return what it prints."""
+        path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+        done = subprocess.run(
+            program, check=False, cwd=self.folder, env=os.environ | {"PATH": path}, capture_output=True, text=True
+        )
+        assert done.returncode == 0, (program, done.stderr)
+        return done.stdout.strip()
+
+    def drop(self, files: list[Path]) -> None:
+        """Drop files on the page, as from a file manager."""
+        contents = [[file.name, base64.b64encode(file.read_bytes()).decode()] for file in files]
+        transfer = self.view.evaluate_handle(
+            """(files) => {
+                const transfer = new DataTransfer();
+                for (const [name, text] of files)
+                    transfer.items.add(new File([Uint8Array.from(atob(text), (c) => c.charCodeAt(0))], name));
+                return transfer;
+            }""",
+            contents,
+        )
+        self.view.dispatch_event("#drop", "drop", {"dataTransfer": transfer})
+
     def settle(self) -> None:
         self.until("!document.querySelector('#jobs progress')")
 
@@ -108,9 +151,8 @@ def test_from_an_empty_folder_to_the_verdict(browser, material: Path, tmp_path: 
         view.fill("#open-path", str(material / "press 7"))
         view.press("#open-path", "Enter")
         page.until("document.querySelectorAll('#log-table tbody tr').length === 6")
-        view.set_input_files(
-            "#drop-files", [material / name for name in ("odd.txt", "run.nc", "packed.zip", "hold.csv")]
-        )
+        page.drop([material / name for name in ("odd.txt", "run.nc", "packed.zip")])
+        view.set_input_files("#drop-files", [material / "hold.csv"])
         page.until("document.querySelectorAll('#log-table tbody tr').length === 10")
         page.settle()
         page.until("document.getElementById('log-count').textContent.includes('1 cannot be read')")
@@ -136,8 +178,9 @@ def test_from_an_empty_folder_to_the_verdict(browser, material: Path, tmp_path: 
         page.until("document.getElementById('machine').value === 'press 7'")
         page.until("document.querySelectorAll('.column-card').length === 4")
         view.drag_and_drop(".column-card:has-text('PG_1')", "#drawing [data-channel=p_A] circle")
-        page.until("[...document.querySelectorAll('#map-table th')].some((cell) => cell.textContent === 'p_A')")
+        page.until("/p_A.*by hand/.test(document.getElementById('map-table').textContent)")
         view.get_by_label("PG_2 [bar] is").select_option("p_B")
+        page.until("(document.getElementById('map-table').textContent.match(/by hand/g) || []).length === 2")
         page.until("document.getElementById('checks').textContent.includes('p_B [bar]')")
         view.fill("#sizes [name=displacement]", "1,02 cm^3/rev")
         view.press("#sizes [name=displacement]", "Tab")
@@ -158,11 +201,14 @@ def test_from_an_empty_folder_to_the_verdict(browser, material: Path, tmp_path: 
             page.until(f"document.getElementById('day-count').textContent.includes('{day} ticked')")
         view.click("#commission")
         page.until("!document.getElementById('learnt').hidden", 300)
-        assert (tmp_path / "session" / "press 7.toml").exists()
+        machine = tmp_path / "session" / "press 7.toml"
+        with view.expect_download() as download:
+            view.get_by_role("link", name="press 7.toml", exact=True).click()
+        assert download.value.path().read_bytes() == machine.read_bytes()
         # verdict, its evidence, cursor and zoom by the keyboard
         page.open("verdict")
         view.select_option("#verdict-file", label="suspect <b>.csv")
-        page.until("document.getElementById('verdict-head').textContent.includes('not judged')")
+        page.until("document.getElementById('verdict-head').textContent.includes('suspect <b>.csv is not judged')")
         view.get_by_role("button", name="Judge this log").click()
         page.until("document.getElementById('verdict-head').textContent.includes('suspect <b>.csv: leak')", 300)
         page.until("document.querySelectorAll('#evidence-charts canvas').length >= 4")
@@ -188,12 +234,57 @@ def test_from_an_empty_folder_to_the_verdict(browser, material: Path, tmp_path: 
         view.fill("#hold-form [name=limit]", "24 mm in 3 min")
         view.get_by_role("button", name="Judge the hold").click()
         page.until("document.getElementById('hold-results').textContent.includes('passes, limit 24 mm in 3 min')")
+        check_commands(page, server)
+        # the folder is watched from now on
+        page.open("trend")
+        view.fill("#watch-folder", str(material / "press 7"))
+        view.get_by_role("button", name="Write the monitor's settings").click()
+        page.until("document.getElementById('watch-answer').textContent.includes('monitor press 7.toml')")
+        (watched,) = read_settings(tmp_path / "session" / "monitor press 7.toml").actuator
+        assert watched.name == "press 7" and "limit" in machine.read_text(encoding="utf-8")
         assert page.errors == [], page.errors
         page.context.close()
         check_screens(browser, server)
     finally:
         server.close()
-    assert replay_session(tmp_path / "session", lambda line: None)
+    replayed = subprocess.run(
+        [sys.executable, "-m", "sealscope", "app", str(tmp_path / "session"), "--replay"],
+        check=True, capture_output=True, text=True, timeout=300,
+    )  # fmt: skip
+    assert replayed.stdout.strip().endswith("1 verdicts, equal to those of the session")
+
+
+def check_commands(page: Page, server: AppServer) -> None:
+    """What the page offers to be copied gives the same machine's file but its date, and the same verdicts."""
+    folder = server.workbench.folder.folder
+    names = ("press 7.toml", "press 7.healthy")
+    of_the_page = [UNDATED.sub("", (folder / name).read_text("utf-8")) for name in names]
+    page.open("verdict")
+    page.view.select_option("#verdict-file", label="suspect <b>.csv: leak")
+    page.until("document.getElementById('verdict-head').textContent.includes('suspect <b>.csv: leak')", 300)
+    (key,) = [log for log in server.workbench.folder.list_keys()[0] if log.endswith("suspect <b>.csv")]
+    kept = server.workbench.verdict("press 7", key)
+    assert kept is not None
+    shell, python = map(page.run, page.programs("verdict", "diagnose"))
+    assert shell == kept["text"].strip()
+    assert python == f"{key}: leak since {kept['onset_s']:.1f} s ({kept['reason']})"
+    shell, python = map(page.run, page.programs("trend", "trend"))
+    words = server.workbench.trend("press 7")["words"].split("means: ")[-1]
+    assert shell == python and " ".join(shell.split()).startswith(words.split(".")[0])
+    page.open("hold")
+    page.view.select_option("#hold-file", label="run.nc")
+    page.view.select_option("#hold-file", label="hold.csv")  # the command follows the choice
+    page.until("document.getElementById('script-command').textContent.includes('hold dropped/hold.csv')")
+    shell, python = map(page.run, page.programs("hold", "hold"))
+    result = page.view.locator("#hold-results pre").first.text_content()
+    assert shell == python == result.strip().replace(f"{folder}/", "")
+    for program in page.programs("channels", "inspect"):
+        assert "p_A" in page.run(program)
+    for program in page.programs("healthy", "commission"):
+        for name in names:
+            (folder / name).unlink()
+        page.run(program)
+        assert [UNDATED.sub("", (folder / name).read_text("utf-8")) for name in names] == of_the_page, program
 
 
 def check_screens(browser, server: AppServer) -> None:

@@ -4,15 +4,23 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from sealscope.app.session import HOLD_FIELDS, REPORTS, SessionMachine
 from sealscope.app.workbench import Workbench
-from sealscope.recordings.formats.columns import GROUP, REST
+from sealscope.recordings.formats.columns import GROUP, REST, find_missing_entries
+from sealscope.recordings.formats.headings.labels import Label
 
 _IMPORT = "import sealscope as ss"
-_IMPORT_RIG = "from sealscope.diagnosis.verdict.machine_sizes import build_stated_rig"
+#: Functions in the lines of Python that are not of `sealscope` itself, and their packages.
+_PACKAGES = {
+    "build_stated_rig": "sealscope.diagnosis.verdict.machine_sizes",
+    "check_channels": "sealscope.diagnosis.channel_checks",
+    "hold_text": "sealscope.reporting.hold",
+    "trend_text": "sealscope.reporting.trend.text",
+}
 
 
 def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict[str, str]:
@@ -24,6 +32,8 @@ def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict
     machine = next((m for m in session.machine if m.name == name), SessionMachine(name="machine"))
     paths = {log: workbench.folder.path_of(log) for log in workbench.folder.list_keys()[0]}
     chosen = [paths[key]] if key in paths else list(paths.values())[:1]
+    if key in paths and (screen in ("hold", "channels") or not machine.commissioned):
+        machine = _fit_map(workbench, machine, key)
     if screen == "healthy":
         files = [path for log, path in paths.items() if log in machine.healthy]
         target = f"{machine.name}.toml"
@@ -64,7 +74,7 @@ def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict
         reading = f"ss.read(file, map={machine.channel_map!r}{_rate(machine)})"
         python = [
             f"days = [{reading} for file in {_list(workbench, files)}]",
-            f"print(ss.trend(days, {rig}healthy={max(1, len(machine.healthy))}{limit}))",
+            f"print(trend_text(ss.trend(days, {rig}healthy={max(1, len(machine.healthy))}{limit})))",
         ]
     elif screen == "hold":
         areas = [text for area in machine.area for text in ("--area", area)]
@@ -77,14 +87,18 @@ def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict
         python = [
             f"for file in {_list(workbench, chosen)}:",
             f"    recording = ss.read(file, map={machine.channel_map!r}{_rate(machine)})",
-            f"    print(*ss.hold_test(recording, {area}{settings}, file=file), sep='\\n')",
+            f"    print(*map(hold_text, ss.hold_test(recording, {area}{settings}, file=file)), sep='\\n')",
         ]
+        if not is_log:
+            python = [f"print(*map(hold_text, ss.hold_test({area}{settings})), sep='\\n')"]
     elif screen == "channels":
         command = ["sealscope", "inspect", *chosen, *_map_options(machine)]
+        rig = f", {_rig(machine)}" if _rig(machine) else ""
         python = [
             f"for file in {_list(workbench, chosen)}:",
             f"    recording = ss.read(file, map={machine.channel_map!r}{_rate(machine)})",
             "    print(recording, *ss.inspect(recording), sep='\\n')",
+            f"    print(*(check.text for check in check_channels(recording{rig})), sep='\\n')",
         ]
     else:
         mended = [log for log in session.mended if log.file == key]
@@ -100,9 +114,18 @@ def write_script(workbench: Workbench, screen: str, name: str, key: str) -> dict
                 f"mend({mended[0].file!r}, {mended[0].target!r}{arguments})",
             ]
     words = [_short(workbench, word) if isinstance(word, Path) else str(word) for word in command]
-    imports = [_IMPORT, *([_IMPORT_RIG] if any("build_stated_rig" in line for line in python) else [])]
+    helpers = [name for name in _PACKAGES if any(name in line for line in python)]
+    imports = [_IMPORT, *(f"from {_PACKAGES[name]} import {name}" for name in helpers)]
     lines = "\n".join([*imports, *python])
     return {"command": shlex.join(words), "python": lines, "folder": str(workbench.folder.folder)}
+
+
+def _fit_map(workbench: Workbench, machine: SessionMachine, key: str) -> SessionMachine:
+    """Leave the entries out of a machine's map whose columns a log lacks, as its reading does (`read_by_map`)."""
+    labels = [Label.parse(name) for name in workbench.table("columns", key, stated_time="").names]
+    entries = {name: text for name, text in machine.map.items() if name not in (GROUP, REST, "t")}
+    missing = set(find_missing_entries(entries, labels)) if labels else set[str]()
+    return replace(machine, map={name: text for name, text in machine.map.items() if name not in missing})
 
 
 def write_watch(workbench: Workbench, name: str, folder: str) -> str:

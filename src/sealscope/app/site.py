@@ -198,15 +198,15 @@ class _Screens:
         return await self._try(lambda: {"offset": self._bench.receive(name, size, offset, data)})
 
     async def read(self, request: Request) -> Response:
-        """Answer with what a screen shows; `_READERS` lists the addresses."""
-        reader = _READERS.get(request.path_params["what"])
+        """Answer with what a screen shows; `READERS` lists the addresses."""
+        reader = READERS.get(request.path_params["what"])
         if reader is None:
             return make_refusal("no such address", 404)
         return await self._try(lambda: reader(self._bench, _Query(request.query_params)))
 
     async def change(self, request: Request) -> Response:
-        """Do what a screen asks for; `_CHANGES` lists the addresses. The body is a JSON mapping."""
-        change = _CHANGES.get(request.path_params["what"])
+        """Do what a screen asks for; `CHANGES` lists the addresses. The body is a JSON mapping."""
+        change = CHANGES.get(request.path_params["what"])
         if change is None:
             return make_refusal("no such address", 404)
         try:
@@ -291,7 +291,8 @@ def _say_limit(bench: Workbench, query: _Query) -> Any:
     return bench.limit_lpm(query("text"), query("machine"), query("rpm"))
 
 
-_READERS: dict[str, Callable[[Workbench, _Query], Any]] = {
+#: What a screen asks for, by the address.
+READERS: dict[str, Callable[[Workbench, _Query], Any]] = {
     "state": lambda bench, query: bench.state(int(query.number("since") or -1)),
     "preview": lambda bench, query: bench.preview(query("file"), _layout_of(query._values)),
     "window": _read_window,
@@ -352,7 +353,8 @@ def _cancel(bench: Workbench, values: Mapping[str, Any]) -> Any:
     return {"cancelled": queue.cancel(number)}
 
 
-_CHANGES: dict[str, Callable[[Workbench, Mapping[str, Any]], Any]] = {
+#: What a screen asks to be done, by the address.
+CHANGES: dict[str, Callable[[Workbench, Mapping[str, Any]], Any]] = {
     "open": lambda bench, values: bench.open_paths([_text(values, "path")]),
     "close": lambda bench, values: bench.close_source(_text(values, "source")),
     "mend": lambda bench, values: {"rows": bench.mend_log(_text(values, "file"), _layout_of(values.get("layout", {})))},

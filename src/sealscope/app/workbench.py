@@ -59,6 +59,7 @@ from sealscope.reporting.messages import short_text
 from sealscope.reporting.page import report
 from sealscope.reporting.schematic import build_circuit, draw_circuit
 from sealscope.reporting.trend.page import write_trend_page
+from sealscope.reporting.trend.text import headline
 from sealscope.storage.folders import make_folder
 from sealscope.storage.plain_values import to_plain
 from sealscope.units import BAR, LITRE_PER_MINUTE, parse_quantity
@@ -706,7 +707,7 @@ class Workbench:
                 if p.value is not None
             ]
         leaking = [Path(v.file).name for v in stated.verdicts if v.verdict == "leak"]
-        text = "Not estimated yet." if result is None else f"{result.verdict}: {result.reason}."
+        text = "Not estimated yet." if result is None else f"{headline(result)}. {result.reason.capitalize()}."
         if leaking:
             text = f"Judged a leak by itself: {', '.join(leaking)}; see Verdict. The trend compares means: {text}"
         elif result is not None:

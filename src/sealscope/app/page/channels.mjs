@@ -1,10 +1,10 @@
 // The screen of the channels: every column drawn, given a place in the machine's drawing, and checked.
-import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, miniature, refresh, tell } from "./main.mjs";
+import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, miniature, refresh, say, tell } from "./main.mjs";
 import { Linked, Trace, checkPlot, settled } from "./charts.mjs";
 let link = new Linked();
 let columns = [];
 let proposal = { map: {}, groups: [], problem: "" };
-let held = null, seen = { channels: [] }, drawnFor = "", counted = "";
+let held = null, seen = { channels: [] }, drawnFor = "", counted = "", changing = Promise.resolve();
 
 export async function show() {
   const file = app.file;
@@ -107,22 +107,24 @@ function place(target, channel) {
   target.addEventListener("keydown", (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); find(); } });
 }
 
-async function assign(channel, column, earlier) {
-  const stated = { ...(machineNow().map || {}) };
+function assign(channel, column, earlier) {
   const same = columns.filter((other) => bare(other.name) === bare(column.name)).length > 1 || / \(column \d+\)$/.test(column.name);
-  const text = same ? `#${column.index + 1}` : column.name;
-  let map = Object.keys(stated).length ? stated : { "*": "auto" };
-  if (earlier && (!channel || earlier !== channel)) { map = { ...mapNow() }; delete map[earlier]; }
-  if (channel) map[channel] = text;
-  await change({ map });
+  const drops = earlier && earlier !== channel;
+  return change(() => {
+    const map = drops ? { ...mapNow() } : statedMap();
+    if (drops) delete map[earlier];
+    return { map: channel ? { ...map, [channel]: same ? `#${column.index + 1}` : column.name } : map };
+  });
 }
-
-async function change(values) {
-  const done = await attempt(() => tell("machine", { machine: app.machine, values }));
-  if (!done) return;
-  if (done.name && done.name !== app.machine) { go("channels", app.file, done.name); return; }
-  showColumns();
-  await showMap();
+const statedMap = () => (Object.keys(machineNow().map).length ? { ...machineNow().map } : { "*": "auto" });
+// one change after the other, each of what the one before has left
+function change(values) {
+  changing = changing.then(async () => {
+    const done = await attempt(() => tell("machine", { machine: app.machine, values: values() }));
+    if (done && done.name !== app.machine) go("channels", app.file, done.name);
+    else if (done) { showColumns(); await showMap(); }
+  }).catch((error) => say(error.message));
+  return changing;
 }
 
 async function showMap() {
@@ -130,14 +132,14 @@ async function showMap() {
   const map = mapNow();
   const rows = Object.entries(map).map(([channel, text]) => {
     const input = make("input", { value: text, "aria-label": `column or formula of ${channel}` });
-    input.addEventListener("change", () => change({ map: { ...(Object.keys(machine.map).length ? machine.map : { "*": "auto" }), [channel]: input.value } }));
+    input.addEventListener("change", () => change(() => ({ map: { ...statedMap(), [channel]: input.value } })));
     return make("tr", {}, make("th", { scope: "row", text: channel }), make("td", {}, input), make("td", {}, make("span", { class: "quiet", text: machine.map[channel] ? "by hand" : "proposed" })));
   });
   const adder = make("select", { "aria-label": "add a channel" }, make("option", { value: "", text: "add a channel by a formula …" }), ...[...byId("channel-options").content.cloneNode(true).children].filter((option) => !map[option.value]));
   adder.addEventListener("change", () => {
     const input = make("input", { placeholder: "ch2*0.0625-0.625 bar", "aria-label": `formula of ${adder.value}` });
     const channel = adder.value;
-    input.addEventListener("change", () => change({ map: { ...(Object.keys(machine.map).length ? machine.map : { "*": "auto" }), [channel]: input.value } }));
+    input.addEventListener("change", () => change(() => ({ map: { ...statedMap(), [channel]: input.value } })));
     byId("map-table").tBodies[0].append(make("tr", {}, make("th", { scope: "row", text: channel }), make("td", {}, input), make("td")));
     input.focus();
   });
@@ -201,25 +203,25 @@ async function draw() {
     new Trace(place, link, { title: members.map((member) => member.name).join(", "), unit, lines, fetch: query("channels", members.map((member) => member.column)), marks: marks.filter((mark) => members.some((member) => member.name === mark.channel) || mark.channel === null), height: 150 });
   }
   if (!head.names.length) place.append(make("p", { class: "quiet", text: head.error || "Nothing to draw." }));
-  const list = byId("compared"), say = (text, kind) => list.append(make("li", { class: kind || "fine", text }));
+  const list = byId("compared"), note = (text, kind) => list.append(make("li", { class: kind || "fine", text }));
   try {
     const { about, error } = await settled({ ...base, table: "balance" }, () => drawnFor === now);
     if (drawnFor !== now) return;
     checks.replaceChildren();
-    if (error || about.problem) say(error || about.problem, "warning");
+    if (error || about.problem) note(error || about.problem, "warning");
     for (const check of about.checks || []) {
       const plot = checkPlot(check);
       if (plot) checks.append(plot);
-      if (!plot || check.severity) say(check.text, check.severity);
+      if (!plot || check.severity) note(check.text, check.severity);
     }
     for (const { chamber, names, first, moved_by: moved, closure, leaked } of about.groups || []) {
       if (closure === null) continue;
       const where = chamber ? ` of chamber ${chamber}` : "", title = `Volume${where}: ${names[0]} and ${moved} must close`;
-      say(`${title}; they do within ${Number((100 * closure).toPrecision(2))} % of the largest volume, beside ${litres(leaked)} ${about.volume_unit} that leaks.`, closure < 0.05 ? "fine" : "warning");
+      note(`${title}; they do within ${Number((100 * closure).toPrecision(2))} % of the largest volume, beside ${litres(leaked)} ${about.volume_unit} that leaks.`, closure < 0.05 ? "fine" : "warning");
       const lines = [{ name: names[0], colour: "--total", column: 0, width: 2 }, { name: moved, colour: "--side-b", column: 1, dash: [6, 4] }];
       new Trace(volumes, link, { title, unit: about.volume_unit, lines, fetch: query("volumes", [first, first + names.indexOf(moved)]), height: 200 });
     }
-  } catch (error) { say(error.message, "warning"); }
+  } catch (error) { note(error.message, "warning"); }
 }
 
 function fillSizes(machine) {
@@ -237,11 +239,11 @@ byId("sizes").addEventListener("change", async (event) => {
     try {
       const limit = await ask("limit", { text: fields.limit.value, machine: app.machine, rpm: fields.rpm.value });
       byId("limit-words").textContent = `Repair at ${limit.words}${limit.lpm === null ? "" : `, ${Number(limit.lpm.toPrecision(3))} L/min`}.`;
-      await change({ limit: limit.text || "" });
+      await change(() => ({ limit: limit.text || "" }));
     } catch (error) { byId("limit-words").textContent = error.message; }
     return;
   }
   const values = name.startsWith("area") ? { area: [fields.area_a.value, fields.area_b.value].filter(Boolean) } : { [name]: event.target.value };
-  await change(values);
+  await change(() => values);
   if (machineNow()) fillSizes(machineNow());
 });

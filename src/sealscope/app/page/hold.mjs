@@ -1,7 +1,7 @@
 // The screen of the hold test: a clock, what is stated, the result against the limit, and its page.
-import { app, ask, attempt, ensureMachine, fillSelect, machineNow, make, tell } from "./main.mjs";
+import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, tell } from "./main.mjs";
 import { Linked, Trace } from "./charts.mjs";
-let link = new Linked(), ticking = 0;
+let link = new Linked(), ticking = 0, withoutLog = false;
 
 export async function show() {
   const machine = await ensureMachine();
@@ -9,7 +9,7 @@ export async function show() {
   update();
 }
 
-export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], byId("hold-file").value || app.file); }
+export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], withoutLog ? "" : app.file); }
 
 async function judge(again) {
   const file = byId("hold-file").value;
@@ -42,6 +42,7 @@ byId("hold-form").addEventListener("submit", (event) => {
   const hold = Object.fromEntries([...byId("hold-form").querySelectorAll("input")].map((input) => [input.name, input.value]));
   attempt(async () => { await tell("machine", { machine: app.machine, values: { hold } }); await judge(false); });
 });
+byId("hold-file").addEventListener("change", ({ target }) => { withoutLog = !target.value; if (target.value) go("hold", target.value); });
 byId("hold-start").addEventListener("click", () => {
   clearInterval(ticking);
   const end = Date.now() + 60000 * (Number(byId("hold-minutes").value.replace(",", ".")) || 10);
@@ -49,9 +50,8 @@ byId("hold-start").addEventListener("click", () => {
   ticking = setInterval(() => {
     const left = Math.max(0, Math.round((end - Date.now()) / 1000));
     byId("hold-clock").textContent = `${Math.floor(left / 60)}:${String(left % 60).padStart(2, "0")}`;
-    count += 1;
     const live = byId("hold-file").value && byId("hold-results").childElementCount;
-    if (live && (count % 15 === 0 || !left)) judge(true).catch((error) => (byId("hold-state").textContent = error.message));
+    if (live && (++count % 15 === 0 || !left)) judge(true).catch((error) => (byId("hold-state").textContent = error.message));
     if (!left) { clearInterval(ticking); byId("hold-state").textContent = "The time is over: judge the hold."; }
   }, 1000);
 });

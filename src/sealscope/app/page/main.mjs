@@ -101,8 +101,8 @@ function follow() {
 }
 
 async function showScript() {
-  if (!byId("script").open) return;
-  const script = await ask("script", { screen: app.screen, machine: app.machine, file: app.file }).catch((error) => ({ command: error.message, python: "", folder: "" }));
+  const wanted = shown, script = byId("script").open && await ask("script", { screen: app.screen, machine: app.machine, file: app.file }).catch((error) => ({ command: error.message, python: "", folder: "" }));
+  if (!script || wanted !== shown) return; // closed, or another screen's
   byId("script-command").textContent = script.command;
   byId("script-python").textContent = script.python;
   byId("script-folder").textContent = script.folder;

@@ -502,6 +502,17 @@ def _choose_every_column(labels: Sequence[Label], request: Request, stated_rate:
     return choice
 
 
+def find_missing_entries(columns: Mapping[str, str], labels: Sequence[Label]) -> list[str]:
+    """Find the channels of a map whose columns a table lacks; `labels`: headings of the table."""
+    missing = []
+    for channel, column in columns.items():
+        try:
+            _parse_mapping(labels, channel, column)
+        except _MissingColumnError:
+            missing.append(channel)
+    return missing
+
+
 def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float | None = None) -> ColumnMap:
     """Choose the columns of a table to read, and the channel of each.
 
@@ -515,12 +526,9 @@ def choose_columns(labels: Sequence[Label], request: Request, stated_rate: float
         return _choose_every_column(labels, request, stated_rate)
     choice = ColumnMap(labels, stated_rate)
     columns, rate = explicit_columns(request.map), request.rate
-    for channel in request.optional & columns.keys():
-        try:
-            _parse_mapping(labels, channel, columns[channel])
-        except _MissingColumnError:
-            choice.notes.append(f"{columns[channel]}, which the machine's map reads as {channel}, is not in this file")
-            del columns[channel]
+    for channel in find_missing_entries({name: columns[name] for name in request.optional & columns.keys()}, labels):
+        choice.notes.append(f"{columns[channel]}, which the machine's map reads as {channel}, is not in this file")
+        del columns[channel]
     mapped_columns: dict[int, str] = {}
     for channel, column_text in columns.items():
         with suppress(InputError):  # raised again by `_apply_map`
