@@ -44,7 +44,7 @@ def test_what_is_integrated_out_leaves_the_covariance_of_the_others(seed):
     assert marginal.residual_square == pytest.approx(likelihood.residual_square, rel=1e-7)
     placed = likelihood.drop(dropped)
     assert not placed.precision[dropped].any() and not placed.moment[dropped].any()
-    np.testing.assert_array_equal(placed.precision[np.ix_(kept, kept)], marginal.precision)
+    np.testing.assert_allclose(placed.precision[np.ix_(kept, kept)], marginal.precision, rtol=1e-9)
     one_by_one = likelihood.drop([0]).drop([3]).drop([2])
     np.testing.assert_allclose(one_by_one.mean[kept], marginal.mean, rtol=1e-6)
     assert likelihood.marginal(kept, []).precision.tolist() == likelihood.among(kept).precision.tolist()
@@ -79,6 +79,32 @@ def test_errors_of_the_coefficients_add_to_their_covariance(seed):
     wide = likelihood.widen(variances)
     np.testing.assert_allclose(wide.covariance, likelihood.covariance + np.diag(variances), rtol=1e-5)
     np.testing.assert_allclose(wide.mean, likelihood.mean, rtol=1e-5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_coefficients_that_are_sums_of_fewer_are_a_regression_on_fewer_columns(seed):
+    columns, left, likelihood = regression(seed)
+    matrix = np.random.default_rng(seed).integers(0, 2, (6, 3)) + np.eye(6, 3)
+    rows = np.column_stack([columns @ matrix, left])
+    expected, fewer = Gaussian.from_gram(rows.T @ rows), likelihood.transform(matrix)
+    np.testing.assert_allclose(fewer.precision, expected.precision, rtol=1e-9)
+    np.testing.assert_allclose(fewer.moment, expected.moment, rtol=1e-9)
+    assert fewer.square == expected.square
+
+
+def test_robust_covariance_is_that_of_errors_which_differ_between_blocks():
+    """Over many draws of errors with another deviation in each block, the coefficients scatter as stated."""
+    random = np.random.default_rng(3)
+    columns, deviations = random.standard_normal((60, 20, 2)), np.geomspace(0.1, 3.0, 60)
+    coefficients, stated = [], []
+    for _ in range(400):
+        left = deviations[:, None] * random.standard_normal((60, 20)) * np.abs(columns[..., 0])
+        fit = Gaussian(np.einsum("kri,krj->ij", columns, columns), np.einsum("kri,kr->i", columns, left))
+        residual = left - columns @ fit.mean
+        scores = np.einsum("kri,kr->ki", columns, residual)
+        coefficients.append(fit.mean)
+        stated.append(np.diag(fit.robust_covariance(scores.T @ scores)))
+    np.testing.assert_allclose(np.mean(stated, axis=0), np.var(coefficients, axis=0), rtol=0.2)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

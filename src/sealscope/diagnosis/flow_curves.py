@@ -16,7 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.observation import limit_threads
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.balance import (
     CLIPPED_DIFFERENCE,
     HOLE,
@@ -109,9 +109,9 @@ def compute_flow_curves(
         history = balance.total_history.mean
         fitted = [column for column in roles.nuisance if column != roles.leak]
         gram = blocks.gram[:, number]
-        matrix = gram[:, fitted][:, :, fitted].sum(axis=0)
-        right = (gram[:, fitted, roles.left] - gram[:, fitted, roles.leak] * history[:, None]).sum(axis=0)
-        coefficients = dict(zip(fitted, solve(matrix, right), strict=True))
+        precision = gram[:, fitted][:, :, fitted].sum(axis=0)
+        moment = (gram[:, fitted, roles.left] - gram[:, fitted, roles.leak] * history[:, None]).sum(axis=0)
+        coefficients = dict(zip(fitted, Gaussian(precision, moment).mean, strict=True))
         increments: dict[str, Array] = {}
         for column, term in enumerate(equation.terms):
             if column == roles.leak:

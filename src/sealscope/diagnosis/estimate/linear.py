@@ -124,15 +124,17 @@ class Gaussian:
 
     def drop(self, dropped: Sequence[int]) -> Gaussian:
         """Integrate out the coefficients `dropped`, which keep their places, with zeros."""
-        kept = np.setdiff1d(np.arange(len(self.moment)), dropped).tolist()
-        marginal = self.marginal(kept, dropped)
-        precision, moment = np.zeros_like(self.precision), np.zeros_like(self.moment)
-        precision[np.ix_(kept, kept)], moment[kept] = marginal.precision, marginal.moment
-        return Gaussian(precision, moment, marginal.square)
+        marginal = self.among(dropped).integrate_out(self.precision[:, dropped], self)
+        marginal.precision[dropped] = marginal.precision[:, dropped] = marginal.moment[dropped] = 0.0
+        return marginal
 
     def among(self, columns: Sequence[int]) -> Gaussian:
         """Compute the likelihood of some coefficients, by their places `columns`, where all others are 0."""
         return Gaussian(self.precision[np.ix_(columns, columns)], self.moment[columns], self.square)
+
+    def transform(self, matrix: Array) -> Gaussian:
+        """Compute the likelihood of k coefficients d, of which c = T d, with the `matrix` T (n, k)."""
+        return Gaussian(matrix.T @ self.precision @ matrix, matrix.T @ self.moment, self.square)
 
     def widen(self, variances: Array) -> Gaussian:
         """Add independent errors of the coefficients, with `variances` (n,), to the covariance.
@@ -152,6 +154,16 @@ class Gaussian:
     def covariance(self) -> Array:
         """The covariance (n, n) of the coefficients, A^-1."""
         return solve(self.precision, np.eye(len(self.moment)))
+
+    def robust_covariance(self, spread: Array) -> Array:
+        """Compute White's covariance (n, n) of the coefficients from the `spread` (n, n) of the scores over blocks.
+
+        A score is a block's product of the columns with the residual; with the sum S of s s' it is A^-1 S A^-1.
+
+        Source: H. White, Econometrica 48 (1980) 817.
+        """
+        inverse = self.covariance
+        return np.asarray(inverse @ spread @ inverse)
 
     def contrast(self, weights: Array) -> tuple[float, float]:
         """Compute the mean and the variance of the weighted sum of the coefficients, with `weights` (n,)."""

@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
@@ -174,6 +174,7 @@ def _free_in_blocks(blocks: Blocks, columns: Sequence[ColumnRoles], free: Sequen
     for e in range(len(columns)):
         indices = sorted({index for index in free[e] if index is not None})
         for k, block in enumerate(gram[:, e]):
+            # not `Gaussian.drop`: where two channels explain a delay alike, the last digits choose between them
             gram[k, e] -= block[:, indices] @ solve(block[np.ix_(indices, indices)], block[indices])
         gram[:, e, indices] = 0.0
         gram[:, e, :, indices] = 0.0
@@ -213,7 +214,7 @@ def _coefficient_per_second(total: Array, roles: ColumnRoles, channel: str) -> f
     if not parts:
         return 0.0
     nuisance = list(roles.nuisance)
-    fitted = dict(zip(nuisance, solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left]), strict=True))
+    fitted = dict(zip(nuisance, Gaussian.from_gram(total).among(nuisance).mean, strict=True))
     products = total[np.ix_(parts, reference)].sum(axis=1) @ [fitted[k] for k in parts]
     return float(products) / max(float(total[np.ix_(reference, reference)].sum()), np.finfo(float).tiny)
 
@@ -325,8 +326,7 @@ def _residual_square(blocks: Blocks, columns: Sequence[ColumnRoles]) -> float:
     square = 0.0
     for equation, roles in zip(total, columns, strict=True):
         nuisance = [k for k in roles.nuisance if k not in (roles.leak, roles.bias)]
-        fitted = solve(equation[np.ix_(nuisance, nuisance)], equation[nuisance, roles.left])
-        square += float(equation[roles.left, roles.left] - fitted @ equation[nuisance, roles.left])
+        square += Gaussian.from_gram(equation).among(nuisance).residual_square
     return max(square, 0.0) / max(float(blocks.rows.sum()), 1.0)
 
 

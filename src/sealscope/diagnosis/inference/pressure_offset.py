@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost, sum_blocks
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
 from sealscope.diagnosis.inference.equations.terms import Equation
@@ -152,9 +152,8 @@ def area_mismatch(blocks: Blocks, columns: Sequence[ColumnRoles], equation: Equa
     if not roles.piston:
         return 0.0
     nuisance = list(roles.nuisance)
-    normal, diagonal = total[np.ix_(nuisance, nuisance)], np.eye(len(nuisance))
-    coefficients = solve(normal, total[nuisance, roles.left])
-    variances = np.diag(solve(normal, diagonal))
+    fit = Gaussian.from_gram(total).among(nuisance)
+    coefficients, variances = fit.mean, np.diag(fit.covariance)
     places = [nuisance.index(column) for column in roles.piston if total[column, column] > 0.0]
     areas, names = coefficients[places], [roles.names[nuisance[place]] for place in places]
     # a coefficient that is not known to its order of magnitude tells nothing

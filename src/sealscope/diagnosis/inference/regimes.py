@@ -29,7 +29,7 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -177,12 +177,10 @@ def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tu
     left side.
     """
     grams, moments = gram[:, columns][:, :, columns], gram[:, columns, left]
-    total = grams.sum(axis=0)
-    coefficients = solve(total, moments.sum(axis=0))
+    fit = Gaussian(grams.sum(axis=0), moments.sum(axis=0))
+    coefficients = fit.mean
     scores = moments - grams @ coefficients  # (K, c), products of the residual with the columns
-    inverse = solve(total, np.eye(len(total)))
-    small_sample_factor = len(grams) / (len(grams) - 1.0)  # K / (K - 1)
-    return coefficients, inverse @ (scores.T @ scores) @ inverse * small_sample_factor
+    return coefficients, fit.robust_covariance(scores.T @ scores * (len(grams) / (len(grams) - 1.0)))
 
 
 def normal_log_density(value: Any, variance: Any) -> Any:

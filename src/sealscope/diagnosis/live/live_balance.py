@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import kernel
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
@@ -308,8 +308,7 @@ class LiveBalance(SavedAttributes):
             return list(block.gram[0])
         grams = []
         for gram, columns in zip(block.gram[0], self._pump_columns, strict=True):
-            coefficients = solve(gram[np.ix_(columns, columns)], gram[columns])
-            grams.append(gram - gram[:, columns] @ coefficients)
+            grams.append(Gaussian.from_gram(gram).drop(columns).gram)
         return grams
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:

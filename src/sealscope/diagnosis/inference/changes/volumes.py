@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -269,7 +269,7 @@ def _insert_fitted_motion(blocks: Blocks, columns: Sequence[ColumnRoles], index:
     for equation, (roles, total) in enumerate(zip(columns, sum_blocks(blocks, columns), strict=True)):
         nuisance, motion = list(roles.nuisance), list(roles.motion)
         coefficients = np.zeros(len(total))
-        coefficients[nuisance] = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
+        coefficients[nuisance] = Gaussian.from_gram(total).among(nuisance).mean
         transform = np.eye(len(total))  # matrix from the old columns to the new ones
         transform[:, index] = 0.0
         transform[motion, index] = coefficients[motion]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.balance import (
     RegimeBlocks,
     derive_drive_signals,
@@ -427,8 +427,7 @@ class RecordedBalance:
         """
         roles, total = self.columns[0], self.blocks.gram[:, 0].sum(axis=0)
         nuisance = list(roles.nuisance)
-        fitted = solve(total[np.ix_(nuisance, nuisance)], total[nuisance, roles.left])
-        coefficients = dict(zip(nuisance, fitted, strict=True))
+        coefficients = dict(zip(nuisance, Gaussian.from_gram(total).among(nuisance).mean, strict=True))
         areas, energies = [], []  # for A and B
         for side in "AB":  # columns of the motion with the area of this side
             motion = [k for k in roles.motion if roles.names[k] in motions_of_side(self.equations[0], side)]

@@ -28,7 +28,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.estimate.linear import solve
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING
 from sealscope.diagnosis.inference.rows.weak_form import OVERLAP
@@ -172,14 +172,14 @@ def _weigh_coefficients(
     gram, left = blocks.gram[:, 0], roles.left
     total = gram.sum(axis=0)
     columns = [k for k in sorted({*roles.nuisance, *weights}) if total[k, k] > 0.0]
-    normal, moment = total[np.ix_(columns, columns)], total[columns, left]
-    unweighted = solve(normal, moment)
+    data = Gaussian(total[np.ix_(columns, columns)], total[columns, left], float(total[left, left]))
     n_rows = max(float(blocks.rows.sum()), 1.0)
-    min_variance = 1e-14 * float(total[left, left]) / n_rows  # rounding errors of the sums
-    variance = OVERLAP * max((float(total[left, left]) - float(moment @ unweighted)) / n_rows, min_variance)
-    precision = _prior_precision(roles, total, columns, states, variance)
-    inverse = solve(normal + precision, np.eye(len(columns)))
-    coefficients = inverse @ moment
+    min_variance = 1e-14 * data.square / n_rows  # rounding errors of the sums
+    variance = OVERLAP * max(data.residual_square / n_rows, min_variance)
+    prior = Gaussian(_prior_precision(roles, total, columns, states, variance), np.zeros(len(columns)))
+    posterior = data + prior
+    inverse = posterior.covariance
+    coefficients = inverse @ data.moment
     scores = gram[:, columns, left] - gram[:, columns][:, :, columns] @ coefficients  # (K, c)
     spread = scores.T @ scores
     for lag in range(1, min(N_CORRELATED, len(scores))):
@@ -187,9 +187,9 @@ def _weigh_coefficients(
         spread += (1.0 - lag / N_CORRELATED) * (product + product.T)
     contrast = inverse @ np.array([weights.get(k, 0.0) for k in columns])
     robust = float(contrast @ spread @ contrast) * len(scores) / max(len(scores) - 1.0, 1.0)
-    by_rows = float(contrast @ (normal + precision) @ contrast) * variance
+    by_rows = float(contrast @ posterior.precision @ contrast) * variance
     fitted = dict(zip(columns, coefficients.tolist(), strict=True))
-    return fitted, float(contrast @ moment), float(np.sqrt(max(robust, by_rows, 0.0)))
+    return fitted, float(contrast @ data.moment), float(np.sqrt(max(robust, by_rows, 0.0)))
 
 
 def _prior_precision(roles: ColumnRoles, total: Array, columns: list[int], states: list[int], variance: float) -> Array:
@@ -208,8 +208,8 @@ def _prior_precision(roles: ColumnRoles, total: Array, columns: list[int], state
         # one coefficient for both states: the sum of their columns takes the place of the first
         joint = np.delete(np.eye(len(columns)), pair[1], axis=1)
         joint[pair[1], pair[0] - (pair[1] < pair[0])] = 1.0
-        normal = joint.T @ total[np.ix_(columns, columns)] @ joint
-        common = solve(normal, joint.T @ total[columns, roles.left])[pair[0] - (pair[1] < pair[0])]
+        data = Gaussian(total[np.ix_(columns, columns)], total[columns, roles.left])
+        common = data.transform(joint).mean[pair[0] - (pair[1] < pair[0])]
         difference = np.zeros(len(columns))
         difference[pair] = 1.0, -1.0
         deviation = max(INFERENCE.rest.open * abs(float(common)), _TINY**0.25)
