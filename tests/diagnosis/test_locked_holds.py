@@ -450,6 +450,21 @@ def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(
     assert scores == pytest.approx(-0.5 * n_readings * np.log(squares), rel=1e-6)
 
 
+@pytest.mark.parametrize(("piston", "gain"), [(10.0, 0.995), (0.3, 1.0), (0.0, 1.0)])
+def test_some_of_the_last_readings_tell_the_offset_as_all_do(
+    piston: float, gain: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each hold has an offset of its own, near that of the recording: not every last reading need be tried."""
+    loads = (1.0, 0.8, 0.6, 0.4)
+    by_all = held_press(piston=piston * SEAL, gain=gain, loads=loads)
+    expected, n_offsets = by_all.piston_leak.fit, len(by_all._offset_grid)
+    monkeypatch.setattr("sealscope.diagnosis.inference.circuit.holds.chambers.MAX_ENDS", 2)
+    by_some = held_press(piston=piston * SEAL, gain=gain, loads=loads)
+    assert len(by_some._offset_grid) == n_offsets - 2
+    difference = by_some.piston_leak.fit.value - expected.value
+    assert abs(difference) < 0.2 * math.hypot(expected.deviation, expected.by_oil)
+
+
 def test_a_rest_begins_as_the_flow_has_fallen_to_half() -> None:
     """The flow, averaged over 0.2 s, finds it 0.15 s too late."""
     t = np.arange(0.0, 10.0, 1.0 / RATE)
