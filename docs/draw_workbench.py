@@ -27,7 +27,7 @@ DAYS = (
     ("2026-03-05", 1700, None), ("2026-03-19", 2000, None), ("2026-05-07", 2000, "0.01 L/min"),
     ("2026-05-28", 1900, "0.035 L/min from 30 s"),
 )  # fmt: skip
-SCREENS = {"logs": 900, "channels": 900, "healthy": 1000, "verdict": 1500, "trend": 700, "hold": 1150}
+SCREENS = {"logs": 900, "channels": 900, "healthy": 1000, "verdict": 1700, "trend": 700, "hold": 1150}
 
 
 def write_logs(folder: Path) -> None:
@@ -149,17 +149,17 @@ def draw(folder: Path) -> None:
                 if width == 400:
                     narrow.append(picture)
                 else:
-                    picture.quantize(128).save(HERE / f"workbench-{screen}.png", optimize=True)
+                    picture.quantize(256).save(HERE / f"workbench-{screen}.png", optimize=True)
                 if screen == "channels" and width == 1280:
                     view.set_viewport_size({"width": 1280, "height": 1150})
                     view.locator("#checks").evaluate("(list) => list.previousElementSibling.scrollIntoView()")
                     view.wait_for_timeout(500)
                     picture = Image.open(BytesIO(view.screenshot()))
-                    picture.quantize(128).save(HERE / "workbench-checks.png", optimize=True)
+                    picture.quantize(256).save(HERE / "workbench-checks.png", optimize=True)
         strip = Image.new("RGB", (420 * len(narrow) - 20, 1000), "white")
         for number, picture in enumerate(narrow):
             strip.paste(picture, (420 * number, 0))
-        strip.quantize(128).save(HERE / "workbench-narrow.png", optimize=True)
+        strip.quantize(256).save(HERE / "workbench-narrow.png", optimize=True)
         browser.close()
     server.close()
 

@@ -33,7 +33,7 @@ _MAX_ENTRIES = 20_000
 _WAIT_S = 20.0
 #: What may be stated of a hold test, by the arguments of `sealscope.hold_test`, and by the command line's options.
 HOLD_FIELDS = {
-    **{name: f"--{name}" for name in ("limit", "volume", "oil", "collected", "valve", "capped")},
+    **{name: f"--{name}" for name in ("limit", "volume", "oil", "collected", "valve", "capped", "loaded")},
     "reference": "--at",
     "start": "--from",
     "end": "--until",

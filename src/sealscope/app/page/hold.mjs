@@ -32,7 +32,7 @@ async function judge(again) {
     const { t, values, fit, low, high, channel, unit } = result.curve;
     const held = new Linked();
     Object.assign(held, { first: t[0], last: t[t.length - 1], begin: t[0], end: t[t.length - 1] });
-    const lines = [["read", "--total"], ["fit", "--leak"], ["from", "--quiet"], ["to", "--quiet"]].map(([name, tone], column) => ({ name, colour: tone, column, dash: column > 1 ? [3, 3] : undefined }));
+    const lines = [["read", "--total"], ["fit", "--leak"], ["lower bound", "--quiet"], ["upper bound", "--quiet"]].map(([name, tone], column) => ({ name, colour: tone, column, dash: column > 1 ? [3, 3] : undefined }));
     link.charts.push(new Trace(place, held, { title: `${channel} of the held load, and its fit`, unit, lines, fetch: async () => ({ t, lines: [values, fit, low, high], first: held.first, last: held.last, complete: true }) }));
   }
   byId("hold-state").textContent = again ? "Judged again while the log grows." : `${results.length} ${results.length === 1 ? "hold" : "holds"} judged.`;

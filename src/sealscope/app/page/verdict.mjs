@@ -135,7 +135,7 @@ async function draw(machine, key) {
   if (result && result.course) {
     const { t, lpm, low, high } = result.course;
     const title = result.course.whole ? "Leakage estimated block by block" : "Leak since its onset, block by block";
-    new Trace(place, link, { title, unit: "L/min", marks, level: result.limit_lpm === null ? null : { value: result.limit_lpm, label: "limit" }, lines: [{ name: "leak", colour: "--leak", column: 0, width: 2 }, { name: "from", colour: "--quiet", column: 1, dash: [3, 3] }, { name: "to", colour: "--quiet", column: 2, dash: [3, 3] }], fetch: async () => ({ t, lines: [lpm, low, high], first: link.first, last: link.last, complete: true }) });
+    new Trace(place, link, { title, unit: "L/min", marks, level: result.limit_lpm === null ? null : { value: result.limit_lpm, label: "limit" }, lines: [{ name: "leak", colour: "--leak", column: 0, width: 2 }, { name: "lower bound", colour: "--quiet", column: 1, dash: [3, 3] }, { name: "upper bound", colour: "--quiet", column: 2, dash: [3, 3] }], fetch: async () => ({ t, lines: [lpm, low, high], first: link.first, last: link.last, complete: true }) });
   }
   const more = head.names.map((name, column) => ({ name: name.replace(/ \[.*/, ""), unit: /\[(.*)\]$/.exec(name)[1], column })).filter((line) => !pressures.includes(line.name));
   for (const line of more) add(line.name, [line.name], "channels", line.unit, [line.column], { height: 130 });
