@@ -100,8 +100,10 @@ class SampleJoiner(SavedAttributes):
             self.rate, self.changed = samples.rate, True
         for first, stop in self._iter_runs(samples.t):
             has_no_gap = bool(are_successive(float(samples.t[first]) - self.newest, self.rate))
-            if math.isfinite(self.newest) and not has_no_gap:
-                self.count("gap")
+            if not has_no_gap:
+                self.angle.interrupt()
+                if math.isfinite(self.newest):
+                    self.count("gap")
             self.newest = float(samples.t[stop - 1])
             channels = {name: samples[name][first:stop] for name in self.names}
             if "theta" in channels:

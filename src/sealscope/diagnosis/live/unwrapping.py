@@ -20,6 +20,8 @@ from sealscope.storage.plain_state import SavedAttributes
 _TURN = 2.0 * math.pi  # [rad]
 #: Largest part of a wrap's step that remains without whole turns.
 _MAX_REMAINDER = 0.25
+#: Largest step or range [rad] whose number of turns doubles can tell.
+_MAX_ANGLE = _TURN * 1e-3 / float(np.finfo(float).eps)
 #: Largest excess of the angle's range over its period, by rounding, relative.
 _TOLERANCE = 1e-3
 
@@ -36,6 +38,10 @@ class AngleUnwrapper(SavedAttributes):
     missing: int = 0  # number of missing samples since
     step: float = 0.0  # last step from sample to sample, without wraps [rad]
     turns: int = 0  # sum of the wraps so far
+
+    def interrupt(self) -> None:
+        """Forget the last angle, as after a gap in time over which the shaft may have turned by any angle."""
+        self.last, self.missing, self.step = math.nan, 0, 0.0
 
     def unwrap(self, values: Array) -> tuple[Array, int]:
         """Return the next angles (n,) [rad] without wraps, and the number of wraps; missing values (NaN) stay so."""
@@ -73,6 +79,8 @@ def _find_wrap(step: float, predicted: float, span: float) -> int:
     which fills the period at most. In a range of one turn the shaft may turn by half a turn from sample to sample.
     """
     excess = step - predicted
+    if not max(abs(excess), span) < _MAX_ANGLE:  # True for NaN, too
+        return 0
     turns = max(1, round(span / _TURN), round(abs(excess) / _TURN))
     period = _TURN * turns
     is_far = abs(excess) > 0.5 * _TURN and abs(excess) > 0.5 * span and span <= (1.0 + _TOLERANCE) * period
