@@ -20,8 +20,10 @@ from collections.abc import Callable, Sequence
 from datetime import date
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
 
 import numpy as np
+from bench_diagnosis import of_many
 
 import sealscope as ss
 
@@ -67,10 +69,27 @@ else:
     diagnose(recordings)
 print(json.dumps(time.process_time() - start))
 """
-#: Program that runs a command of `sealscope`, or after the word `-` another program, and then prints the processor's
-#: seconds of the process and its peak memory [kB], which Linux knows.
+#: Program that runs a command of `sealscope`, or after the word `-` another program, and then prints the largest shares
+#: of the time by the part of the package that runs or calls, from a look every 5 ms; the processor's seconds of the
+#: process; and its peak memory [kB], which Linux knows.
 _COMMAND = """
-import runpy, sys, time
+import collections, json, runpy, sys, threading, time
+counts, main = collections.Counter(), threading.main_thread().ident
+def find_area(frame):
+    area = None
+    while frame is not None:
+        file = frame.f_code.co_filename
+        if file.startswith("<frozen importlib"):
+            return "imports"
+        if area is None and "/sealscope/" in file:
+            area = "/".join(file.rpartition("/sealscope/")[2].removesuffix(".py").split("/")[:2])
+        frame = frame.f_back
+    return area or "other"
+def watch():
+    while True:
+        time.sleep(0.005)
+        counts[find_area(sys._current_frames().get(main))] += 1
+threading.Thread(target=watch, daemon=True).start()
 first, sys.argv = sys.argv[1], ["sealscope", *sys.argv[1:]]
 try:
     if first == "-":
@@ -82,48 +101,58 @@ except SystemExit as end:
     if end.code:
         raise
 peak = next(line for line in open("/proc/self/status") if line.startswith("VmHWM"))
-print(f"\\n{time.process_time()} {peak.split()[1]}", file=sys.stderr)
+shares = {area: number / counts.total() for area, number in counts.most_common(4)}
+print(f"\\n{json.dumps(shares)}\\n{time.process_time()} {peak.split()[1]}", file=sys.stderr)
 """
 
 
-#: Measurement: runs by a Python and returns seconds and peak MiB.
-Row = Callable[[str], tuple[float, float]]
+class Run(NamedTuple):
+    """What a run of a row costs."""
+
+    seconds: float  # of the processor
+    memory: float  # peak [MiB]
+    shares: dict[str, float]  # part of the package -> share of the time of the whole process, the largest ones
 
 
-def spent(python: str, *words: str) -> tuple[float, float, str]:
-    """Run `_COMMAND` with words by a Python; return its seconds of processor, its peak memory [MiB] and its output."""
+#: Measurement: a run by a Python.
+Row = Callable[[str], Run]
+
+
+def spent(python: str, *words: str) -> tuple[Run, str]:
+    """Run `_COMMAND` with words by a Python; return what it costs, and its output."""
     process = subprocess.run([python, "-c", _COMMAND, *words], capture_output=True, text=True, check=False)
     if process.returncode:
         raise SystemExit(f"{' '.join(words[:2])[:80]} ended with {process.returncode}: {process.stderr[-500:]}")
-    seconds, peak = process.stderr.splitlines()[-1].split()
-    return float(seconds), float(peak) / 1024.0, process.stdout
+    *_, shares, last = process.stderr.splitlines()
+    seconds, peak = last.split()
+    return Run(float(seconds), float(peak) / 1024.0, json.loads(shares)), process.stdout
 
 
 def of_library(kind: str, files: Sequence[Path], channels: Sequence[str] = ()) -> Row:
     """Make a row that calls the library; its time is that of the call alone."""
     job = json.dumps([kind, [str(file) for file in files], list(channels)])
 
-    def run(python: str) -> tuple[float, float]:
-        """Return the seconds of the call and the peak memory of its process."""
-        _, memory, output = spent(python, "-", _ROW, job)
-        return float(output), memory
+    def run(python: str) -> Run:
+        """Run the call in a process; its time is that of the call, its memory that of the process."""
+        cost, output = spent(python, "-", _ROW, job)
+        return cost._replace(seconds=float(output))
 
     return run
 
 
 def of_command(*words: str) -> Row:
     """Make a row that runs a command of the program; its time is that of the whole process."""
-    return lambda python: spent(python, *words)[:2]
+    return lambda python: spent(python, *words)[0]
 
 
 def over_libraries(file: Path) -> Row:
     """Make a row of `sealscope diagnose` of a file, less the import of the libraries that it uses."""
     libraries = "import numpy, scipy.linalg, scipy.special, scipy.ndimage, numba, typer, rich, pydantic, h5netcdf, pywt"
 
-    def run(python: str) -> tuple[float, float]:
-        """Return the difference of the seconds, and the peak memory of the command."""
-        bare, (whole, memory) = spent(python, "-", libraries)[0], of_command("diagnose", str(file))(python)
-        return whole - bare, memory
+    def run(python: str) -> Run:
+        """Run the import and the command; the time is the difference, the memory that of the command."""
+        bare, whole = spent(python, "-", libraries)[0], of_command("diagnose", str(file))(python)
+        return whole._replace(seconds=whole.seconds - bare.seconds)
 
     return run
 
@@ -170,7 +199,8 @@ def main() -> None:
     share = 0.1 if chosen.quick else 1.0
     rounds = 1 if chosen.quick else chosen.rounds
     pythons = [sys.executable, *([chosen.beside] if chosen.beside else [])]
-    figures: dict[str, dict[str, float]] = {}
+    figures: dict[str, dict[str, Any]] = {}
+    others: dict[str, str] = {}
     with TemporaryDirectory() as name:
         folder = Path(name)
         length = 60.0 if chosen.quick else 180.0
@@ -194,26 +224,51 @@ def main() -> None:
             "`diagnose` of 60 s, over its libraries": over_libraries(minute[0]),
         }
         print(
-            "| work | seconds of processor | over the other version | peak MiB |\n| --- | --- | --- | --- |", flush=True
+            "| work | seconds of processor | over the other version | peak MiB | most of the process's time |\n"
+            "| --- | --- | --- | --- | --- |",
+            flush=True,
         )
         for title, row in rows.items():
             if chosen.only and not any(text in title for text in chosen.only):
                 continue
             runs = [[row(python) for python in pythons] for _ in range(rounds)]  # in turns
-            medians = np.median(np.array(runs), axis=0)
-            figures[title] = {"seconds": medians[0][0], "MiB": medians[0][1]}
+            medians = np.median(np.array([[run[:2] for run in pair] for pair in runs]), axis=0)
+            figures[title] = {"seconds": medians[0][0], "MiB": medians[0][1], "shares": runs[0][0].shares}
             if chosen.beside:
                 figures[title]["ratio"] = medians[0][0] / medians[1][0]
             ratio = f"{figures[title]['ratio']:.2f}" if chosen.beside else ""
-            print(f"| {title} | {medians[0][0]:.3g} | {ratio} | {medians[0][1]:.0f} |", flush=True)
+            shares = ", ".join(f"{area} {100.0 * share:.0f} %" for area, share in runs[0][0].shares.items())
+            print(f"| {title} | {medians[0][0]:.3g} | {ratio} | {medians[0][1]:.0f} | {shares} |", flush=True)
         exponents = growth(folder, share) if not chosen.only or "growth" in chosen.only else {}
+        if not chosen.only or "service" in chosen.only:
+            others |= measure_service(330.0 if chosen.quick else 600.0)
+        if not chosen.only or "cores" in chosen.only:
+            one, two = (of_many(4, length, cores) for cores in (1, 2))
+            others["four files on two cores"] = f"{one / two:.2f} times as fast as on one"
+        for title, text in others.items():
+            print(f"{title}: {text}", flush=True)
     if chosen.json:
         machine = f"{os.cpu_count()} cores, {platform.machine()}"
-        measured = {"measured": f"{date.today()}", "machine": machine, "rows": figures, "growth": exponents}
+        measured = {
+            "measured": f"{date.today()}",
+            "machine": machine,
+            "rows": figures,
+            "growth": exponents,
+            "others": others,
+        }
         if chosen.only and chosen.json.exists():  # the rows that were not chosen stay
             earlier = json.loads(chosen.json.read_text(encoding="utf-8"))
             measured |= {"rows": earlier["rows"] | figures, "growth": earlier["growth"] | exponents}
+            measured["others"] = earlier.get("others", {}) | others
         chosen.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
+
+
+def measure_service(seconds: float) -> dict[str, str]:
+    """Run `bench_monitor.py` on so many seconds of each actuator, and return its lines about the service."""
+    call = [sys.executable, str(Path(__file__).with_name("bench_monitor.py")), "--seconds", f"{seconds:g}"]
+    output = subprocess.run(call, capture_output=True, text=True, check=True).stdout
+    lines = (line.partition(": ") for line in output.splitlines() if line.startswith("service"))
+    return {title: text for title, _, text in lines}
 
 
 def growth(folder: Path, share: float) -> dict[str, float]:
@@ -228,9 +283,12 @@ def growth(folder: Path, share: float) -> dict[str, float]:
     }
     exponents = {}
     for title, (sizes, calls) in rows.items():
-        seconds = [call(sys.executable)[0] for call in calls]
-        exponents[title] = float(np.polyfit(np.log(sizes), np.log(np.maximum(seconds, 1e-9)), 1)[0])
-        print(f"the time grows with the {title} as their power {exponents[title]:.2f}", flush=True)
+        runs = [call(sys.executable) for call in calls]
+        costs = {title: [run.seconds for run in runs], f"{title} (memory)": [run.memory for run in runs]}
+        for name, values in costs.items():
+            exponents[name] = float(np.polyfit(np.log(sizes), np.log(np.maximum(values, 1e-9)), 1)[0])
+        time, memory = exponents[title], exponents[f"{title} (memory)"]
+        print(f"with the {title} the time grows as their power {time:.2f}, the memory as {memory:.2f}", flush=True)
     return exponents
 
 

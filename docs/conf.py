@@ -171,11 +171,17 @@ def speed() -> str:
             seconds = figures["solvers"]["ours, step chosen by error"]["seconds"][0]
             lines.append(f"| one run, {case} | {1e3 * seconds:.0f} | {100 * ratio:.0f} % of {peer} |")
     lines += ["", f"Measured {solvers['measured']} on {solvers['machine']}.", ""]
-    lines += ["| verdicts | seconds of processor | peak MiB |", "| --- | --- | --- |"]
-    lines += [f"| {work} | {row['seconds']:.2g} | {row['MiB']:.0f} |" for work, row in verdicts["rows"].items()]
+    lines += [
+        "| verdicts | seconds of processor | peak MiB | most of the process's time |",
+        "| --- | --- | --- | --- |",
+    ]
+    for work, row in verdicts["rows"].items():
+        shares = ", ".join(f"{area} {100 * share:.0f} %" for area, share in row.get("shares", {}).items())
+        lines.append(f"| {work} | {row['seconds']:.2g} | {row['MiB']:.0f} | {shares} |")
     if verdicts["growth"]:
         growth = ", ".join(f"{power:.1f} of the {name}" for name, power in verdicts["growth"].items())
-        lines += ["", f"The time grows as the power {growth}."]
+        lines += ["", f"The time, or where stated the memory, grows as the power {growth}."]
+    lines += ["", *(f"- {work}: {text}" for work, text in verdicts.get("others", {}).items())]
     lines += ["", f"Measured {verdicts['measured']} on {verdicts['machine']}, busy with other work."]
     return "\n".join(lines) + "\n"
 
