@@ -203,3 +203,18 @@ def test_machines_without_such_a_balance_are_refused():
         StreamSettings.from_rig(RIG, 5.0)
     with pytest.raises(InputError, match="balance"):
         StreamSettings.from_rig(RIG, 100.0, "x")
+
+
+def test_a_long_loss_of_readings_is_no_standstill():
+    """Whatever is lost, and in whatever way, for seconds: rows with it are left out, and no block is of zeros."""
+    unit = unit_at(16.0)
+    samples, parts = samples_of(machine(3, duration=100.0, rate=16.0)), parts_a_sample(unit.settings)
+    stream, expected = c_stream(unit), None
+    for channels, value in ((slice(None), np.nan), (2, np.nan), (2, 1e14), (3, 1e5), (slice(0, 2), np.inf)):
+        lost = samples.copy()
+        lost[1200:1350, channels] = value
+        stream._call("init")
+        results = np.array(list(stream.feed(lost, parts)))
+        expected = results if expected is None else expected
+        assert np.array_equal(results, expected)
+    assert RESULTS.index("reason") == len(RESULTS) - 1 and 3.0 in expected[-8:, -1]

@@ -134,7 +134,7 @@ class CText:
         if isinstance(statement, Assign):
             yield f"{indent}{self._place(statement.target)} = {self._expression(statement.value)};"
         elif isinstance(statement, If):
-            yield f"{indent}if ({self._expression(statement.condition)}) {{"
+            yield f"{indent}if ({self._condition(statement.condition)}) {{"
             yield from self._render_block(statement.body, inner)
             if statement.otherwise:
                 yield f"{indent}}} else {{"
@@ -147,7 +147,7 @@ class CText:
             yield from self._render_block(statement.body, inner)
             yield f"{indent}}}"
         elif isinstance(statement, While):
-            yield f"{indent}while ({self._expression(statement.condition)}) {{"
+            yield f"{indent}while ({self._condition(statement.condition)}) {{"
             yield from self._render_block(statement.body, inner)
             yield f"{indent}}}"
         elif isinstance(statement, Break):
@@ -214,6 +214,12 @@ class CText:
         if isinstance(value, TableElement):
             return f"{self._table(value.name)}[{self._expression(value.index)}]"
         return self._operation(value)
+
+    def _condition(self, value: Expression) -> str:
+        """Render an expression that stands in brackets already."""
+        text = self._expression(value)
+        is_bracketed = isinstance(value, Operation) and value.operator in (*_BINARY, *_COMPARISONS)
+        return text[1:-1] if is_bracketed else text
 
     def _operation(self, value: Operation) -> str:
         """Render an operation."""

@@ -333,9 +333,14 @@ def _describe_missing(values: Array, rate: float) -> tuple[str, int, NDArray[Any
     return "missing", n_missing, runs[:, 0], f"{text}, the longest {runs[:, 1].max() / rate:g} s"
 
 
+def sensor_limit(unit: str) -> float:
+    """Return the largest magnitude in `unit` that a sensor can read (`possible` of `priors.toml`)."""
+    return float(_SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"]))
+
+
 def flag_impossible(values: Array, unit: str) -> NDArray[np.bool_]:
     """Flag the finite samples (n,) in `unit` whose magnitude no sensor can read (`possible` of `priors.toml`)."""
-    limit: float = _SENSOR_LIMITS.get(unit, _SENSOR_LIMITS["any"])
+    limit = sensor_limit(unit)
     return np.asarray(np.isfinite(values) & ((values > limit) | (values < -limit)))
 
 

@@ -60,6 +60,7 @@ from sealscope.diagnosis.inference.rows.weak_form import (
 )
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
+    NOISE,
     STANDSTILL,
     Coefficients,
     add_block,
@@ -81,6 +82,8 @@ from sealscope.diagnosis.live.live_balance import (
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
 from sealscope.parameters import Rig
+from sealscope.recordings.channels import CHANNEL_UNITS
+from sealscope.recordings.quality import sensor_limit
 
 #: Number of blocks of a mean.
 WINDOW = 20
@@ -90,6 +93,8 @@ PAUSE = float(LIVE.watch.pause)
 WEIGHED_A_CALL, ADDED_A_CALL, HALVINGS = 2, 12, 20
 #: Blocks from which on the times of the detector of steps begin anew, and by how many.
 _MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
+#: Readings of a missing sample over `MAX_READING`.
+BEYOND = 1e20
 #: Parts of the work at the end of a block: `phase` of the record.
 (
     IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, TAKE, WEIGH, DECIDE,
@@ -333,7 +338,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     """Build the kernels of a stream: `start`, `add_sample`, `advance`, `write_results` and `acknowledge`.
 
     - ``start(m)`` sets the state m to its beginning.
-    - ``add_sample(m, p_A, p_B, flow, x)`` adds a sample in SI units, NaN or a number beyond `MAX_READING` if missing.
+    - ``add_sample(m, p_A, p_B, flow, x)`` adds a sample in SI units, NaN or more than a sensor reads if missing.
     - ``advance(m)`` does a part of the work at the end of a block, if there is any (`m.phase`).
     - ``write_results(m, out)`` writes the results, in the order of `RESULTS`.
     - ``acknowledge(m)`` withdraws an alarm, and begins the tests anew.
@@ -347,6 +352,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     block_seconds, pause = n_block / rate, PAUSE * rate / n_block
     channels, n_columns = settings.channels, len(settings.expressions)
     row_p_A, row_p_B, row_flow, row_x = range(len(channels))
+    limit_p, _, limit_flow, limit_x = (sensor_limit(CHANNEL_UNITS[name]) for name in channels)
     response, leak, bias = n_columns - 1, n_columns - 2, settings.bias
     column_order, n_fast, all_columns = settings.column_order, settings.n_fast, tuple(range(n_columns))
     capacity = (SUPPORT + 1) * block_strides
@@ -426,8 +432,13 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         """Add a sample to the state; after the last row of a block, begin the work at its end."""
         n_samples = int(m.sample_count)
         newest = n_samples % width
-        m.ring[row_p_A, newest], m.ring[row_p_B, newest] = p_A, p_B
-        m.ring[row_flow, newest], m.ring[row_x, newest] = flow, x
+        has_pressures = abs(p_A) <= limit_p and abs(p_B) <= limit_p  # False for NaN
+        if has_pressures and abs(flow) <= limit_flow and abs(x) <= limit_x:
+            m.ring[row_p_A, newest], m.ring[row_p_B, newest] = p_A, p_B
+            m.ring[row_flow, newest], m.ring[row_x, newest] = flow, x
+        else:  # the leak's increment is beyond `MAX_READING` in each interval with such a sample
+            m.ring[row_p_A, newest], m.ring[row_p_B, newest] = BEYOND * MAX_READING, -BEYOND * MAX_READING
+            m.ring[row_flow, newest], m.ring[row_x, newest] = BEYOND * MAX_READING, BEYOND * MAX_READING
         m.sample_count = n_samples + 1 if n_samples + 1 < 2 * period else n_samples + 1 - period
         k = n_samples - half - 1  # the newest interval that has `half` samples after it
         if k < 0:
@@ -506,8 +517,10 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
                 begin_next_block(m)
         elif m.phase == NORMAL:
             if is_last:
-                # a later block changes the sums less
-                move_sums(m.workspace.normal, m.slow_sums, n_closed, min(1.0, SUPPORT / m.n_weighted))
+                if m.n_weighted > 0:  # a later block changes the sums less
+                    move_sums(m.workspace.normal, m.slow_sums, n_closed, min(1.0, SUPPORT / m.n_weighted))
+                else:
+                    m.slow_sums[:, :] = 0.0
                 m.place = 0
                 m.phase = WEIGH if m.steps.n_onsets > 0 else FINISH
             else:
@@ -573,6 +586,10 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         motion = relative_motion(model.volume[0], n_rows, model.numbers)
         # G and the shift are multiplied by the precision, the systematic variance of G by the square of the precision
         precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
+        if not math.isfinite(precision + weighted_G + weighted_systematic + model.numbers[NOISE]):
+            forget_coefficients(m)  # numbers have overflowed: all is learned anew
+            m.n_weighted = 0
+            return
         if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
             m.reason = _STANDSTILL
             return
@@ -613,8 +630,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             m.history[k, _HISTORY_NUMBER] -= _SHIFTED_BLOCKS
 
     @law
-    def forget_standstill(m: Any) -> None:
-        """Discard the coefficients and estimates of a standstill: they do not hold in motion.
+    def forget_coefficients(m: Any) -> None:
+        """Discard coefficients and estimates, such as those of a standstill, which do not hold in motion.
 
         The weighting of the rows (`slow_sums`) remains, as after `LiveBalance.relearn`.
         """
@@ -648,7 +665,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             motion = relative_motion(motion_square, n_rows, m.model.numbers)
             m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
             if m.n_moving >= N_WAKING:
-                forget_standstill(m)
+                forget_coefficients(m)
                 return
             load_block(m.model, m.gram, all_columns)
             m.model.volume[0] = motion_square
