@@ -33,7 +33,7 @@ async function judge(again) {
     const held = new Linked();
     Object.assign(held, { first: t[0], last: t[t.length - 1], begin: t[0], end: t[t.length - 1] });
     const lines = [["read", "--total"], ["fit", "--leak"], ["lower bound", "--quiet"], ["upper bound", "--quiet"]].map(([name, tone], column) => ({ name, colour: tone, column, dash: column > 1 ? [3, 3] : undefined }));
-    link.charts.push(new Trace(place, held, { title: `${channel} of the held load, and its fit`, unit, lines, fetch: async () => ({ t, lines: [values, fit, low, high], first: held.first, last: held.last, complete: true }) }));
+    link.charts.push(new Trace(place, held, { title: `${channel === "x" ? "Travel of the held load, positive as it sinks" : `${channel} of the held load`}, and its fit`, unit, lines, fetch: async () => ({ t, lines: [values, fit, low, high], first: held.first, last: held.last, complete: true }) }));
   }
   byId("hold-state").textContent = again ? "Judged again while the log grows." : `${results.length} ${results.length === 1 ? "hold" : "holds"} judged.`;
 }
