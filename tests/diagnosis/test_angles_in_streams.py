@@ -75,3 +75,10 @@ def test_a_watch_of_a_wrapped_angle_gives_the_same_estimates() -> None:
             assert estimate.leak_lpm == pytest.approx(other.leak_lpm, rel=1e-3, abs=1e-5)
     assert wrapped_watch.counters["wraps of the motor angle, undone"] > 10
     assert "wraps of the motor angle, undone" not in plain_watch.counters
+
+
+@pytest.mark.parametrize("size", [1e9, 1e50, 1e300])
+def test_impossible_angles_are_no_wraps(size: float) -> None:
+    angles = np.array([0.1, size, 0.2, -size, np.inf, 0.3, size, 0.4])
+    result, n_wraps = AngleUnwrapper().unwrap(angles)
+    assert n_wraps == 0 and np.array_equal(result, angles)
