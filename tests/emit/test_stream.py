@@ -218,3 +218,16 @@ def test_a_long_loss_of_readings_is_no_standstill():
         expected = results if expected is None else expected
         assert np.array_equal(results, expected)
     assert RESULTS.index("reason") == len(RESULTS) - 1 and 3.0 in expected[-8:, -1]
+
+
+def test_each_result_stands_on_a_line_of_its_own():
+    """In the header, where it names an index; in both READMEs; and as an output in PLCopen's XML."""
+    unit = unit_at(16.0)
+    c, st = render_c(unit, **WORDS), render_st(unit, **WORDS)
+    interface = (
+        st["leak.xml"].partition('name="LEAK_MONITOR"')[2].partition("<outputVars>")[2].partition("</outputVars")[0]
+    )
+    for k, name in enumerate(RESULTS):
+        assert f"\n#define LEAK_{name.upper()} {k} /*" in c["leak.h"]
+        assert f"\n| `LEAK_{name.upper()}` |" in c["README.md"]
+        assert f'<variable name="{name}">' in interface
