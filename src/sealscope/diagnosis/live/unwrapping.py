@@ -20,8 +20,8 @@ from sealscope.storage.plain_state import SavedAttributes
 _TURN = 2.0 * math.pi  # [rad]
 #: Largest part of a wrap's step that remains without whole turns.
 _MAX_REMAINDER = 0.25
-#: Largest step or range [rad] whose number of turns doubles can tell.
-_MAX_ANGLE = _TURN * 1e-3 / float(np.finfo(float).eps)
+#: Largest step or range [rad] of a wrapped angle: 2^32 counts of 4096 a turn.
+_MAX_ANGLE = _TURN * 2.0**20
 #: Largest excess of the angle's range over its period, by rounding, relative.
 _TOLERANCE = 1e-3
 
