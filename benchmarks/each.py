@@ -56,7 +56,7 @@ SIZES: dict[str, list[str]] = {
     "pressures": ["--machines", "1", "--leaks", "0"],
     "readers": ["--rounds", "1"],
     "real_cranes": [str(REAL / "cranes")],
-    "real_eha": [str(REAL)],
+    "real_eha": [str(REAL / "eha" / "run1.csv"), str(REAL / "eha" / "run2.csv")],
     "run": ["--quick", "--into", "{into}"],
     "sensor_errors": ["--count", "1", "--rigs", "thesis"],
     "single_rods": ["--machines", "1"],
