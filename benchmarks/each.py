@@ -1,6 +1,6 @@
 """Run every benchmark at a size of seconds, so that none is broken unseen.
 
-    python benchmarks/each.py [--only NAME ...] [--limit 300] [--cut 30]
+    python benchmarks/each.py [--only NAME ...] [--limit 900] [--cut 30]
 
 A benchmark is a file of this folder that runs as a program; one without a row of `SIZES` is an error. Each runs in a
 process of its own, on one thread, in a copy of the repository, so that the figures of `results` stay as they are. Those
@@ -123,7 +123,7 @@ def main() -> None:
     """Run the benchmarks in turn; end with an error if any failed or has no size."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
-    parser.add_argument("--limit", type=float, default=300.0, help="longest time of a benchmark [s]")
+    parser.add_argument("--limit", type=float, default=900.0, help="longest time of a benchmark [s]")
     parser.add_argument("--cut", type=float, default=30.0, help="time of a benchmark that only ends after minutes [s]")
     chosen = parser.parse_args()
     names = list_benchmarks()
