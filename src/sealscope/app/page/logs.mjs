@@ -1,7 +1,7 @@
 // The screen of the logs: folders and dropped files, what each holds, and logs that are read differently.
 import { app, ask, attempt, go, make, miniature, refresh, say, tell } from "./main.mjs";
 const PIECE = 4_000_000;
-let mended = "";
+let mended = "", previewed = null, typing = 0;
 
 export function show() { update(); }
 
@@ -107,7 +107,8 @@ const layout = () => Object.fromEntries(new FormData(byId("mend-form")));
 
 async function preview() {
   try {
-    const seen = await ask("preview", { file: mended, ...layout() });
+    const asked = (previewed = Symbol()), seen = await ask("preview", { file: mended, ...layout() });
+    if (asked !== previewed) return; // the fields were changed meanwhile
     const { first_row: first, heading_row: heading } = seen.layout;
     byId("mend-lines").replaceChildren(...seen.lines.map((line, k) => make("li", { class: k + 1 === first ? "first" : k + 1 === heading ? "heading" : "", text: line || " ", "data-line": k + 1 })));
     byId("mend-rows").replaceChildren(
@@ -120,7 +121,6 @@ async function preview() {
   } catch (error) { byId("mend-problem").textContent = error.message; byId("mend-problem").className = "bad"; }
 }
 
-let typing = 0;
 byId("mend-form").addEventListener("input", () => { clearTimeout(typing); typing = setTimeout(preview, 250); });
 byId("mend-lines").addEventListener("click", (event) => {
   if (!event.target.dataset.line) return;
