@@ -241,7 +241,7 @@ def main() -> None:
             print(f"| {title} | {medians[0][0]:.3g} | {ratio} | {medians[0][1]:.0f} | {shares} |", flush=True)
         exponents = growth(folder, share) if not chosen.only or "growth" in chosen.only else {}
         if not chosen.only or "service" in chosen.only:
-            others |= measure_service(330.0 if chosen.quick else 600.0)
+            others |= measure_service(*((330.0, 2) if chosen.quick else (600.0, 20)))
         if not chosen.only or "cores" in chosen.only:
             one, two = (of_many(4, length, cores) for cores in (1, 2))
             others["four files on two cores"] = f"{one / two:.2f} times as fast as on one"
@@ -263,9 +263,10 @@ def main() -> None:
         chosen.json.write_text(json.dumps(measured, indent=1) + "\n", encoding="utf-8")
 
 
-def measure_service(seconds: float) -> dict[str, str]:
-    """Run `bench_monitor.py` on so many seconds of each actuator, and return its lines about the service."""
+def measure_service(seconds: float, actuators: int) -> dict[str, str]:
+    """Run `bench_monitor.py` on so many seconds of so many actuators, and return its lines about the service."""
     call = [sys.executable, str(Path(__file__).with_name("bench_monitor.py")), "--seconds", f"{seconds:g}"]
+    call += ["--actuators", f"{actuators}"]
     output = subprocess.run(call, capture_output=True, text=True, check=True).stdout
     lines = (line.partition(": ") for line in output.splitlines() if line.startswith("service"))
     return {title: text for title, _, text in lines}
