@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sealscope.diagnosis.live.balance import LiveBalance, NotJudged
+from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
 
 from sealscope.diagnosis.inference.equations import balances
 from sealscope.diagnosis.inference.equations.terms import expressed_term
