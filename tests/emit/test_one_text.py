@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
 
 from sealscope.diagnosis.inference.equations import balances
 from sealscope.diagnosis.inference.equations.terms import expressed_term
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, WINDOW
+from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
 from sealscope.emit.c_export import parts_a_sample
 from sealscope.fmu.sensor import sensor_sources
 
