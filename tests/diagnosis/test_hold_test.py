@@ -186,6 +186,7 @@ def test_tests_in_order_of_time_are_a_trend():
     assert trend.basis == "hold test"
     assert trend.wear.growth.low <= 0.3e-3 * 0.15 * 3.117 <= trend.wear.growth.high
     assert trend.wear.reach is not None
+    assert ("cap the port" in trend.next_check) == (trend.verdict == "leak")
 
 
 def test_a_commissioned_machine_and_its_monitor_take_hold_tests(tmp_path):

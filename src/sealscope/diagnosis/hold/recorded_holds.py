@@ -8,6 +8,12 @@ from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
 from sealscope.units import BAR
 
+#: Next check where hold tests show a growing leak.
+SEPARATE_LEAKS = (
+    "Look for oil outside: rod seal, fittings, hoses. If there is none, cap the port of the loaded side at the "
+    "cylinder and hold again: if it sinks as before, the piston leaks, else the valve or its line."
+)
+
 
 def describe_holds(holds: Sequence[HoldResult]) -> str:
     """Describe a recording of a held load by the results of its holds."""

@@ -13,6 +13,7 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.hold.recorded_holds import SEPARATE_LEAKS
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -158,6 +159,8 @@ class Trend:
         """Next check to make on the machine, in one or two sentences."""
         if self.verdict == NO_LEAK and self.decision.cause is None:
             return "Nothing needs a check; go on recording under the same duty."
+        if self.verdict == LEAK and self.basis == "hold test":
+            return SEPARATE_LEAKS
         return state_of(self.verdict, self.decision.cause).action
 
     @property
