@@ -30,6 +30,7 @@ import numba
 import numpy as np
 from llvmlite import ir as llvm
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 from platformdirs import user_cache_path
 
@@ -234,6 +235,23 @@ def address_of(context: Any, pointer: Any) -> Any:
     return numba.int64(pointer), lambda target, builder, signature, values: builder.ptrtoint(
         values[0], target.get_value_type(numba.int64)
     )
+
+
+@intrinsic  # type: ignore[misc]
+def copy_to_stack(context: Any, record: Any) -> Any:
+    """Copy a record to the stack of a kernel, in compiled code only; numba passes `context`.
+
+    No write to an array can then change the record, so that LLVM reads its fields and inverts divisors once, before a
+    loop, instead of in each round.
+    """
+
+    def emit_copy(target: Any, builder: Any, signature: Any, values: Any) -> Any:
+        """Emit LLVM instructions that load the record at the address `values[0]` and store it on the stack."""
+        copy = cgutils.alloca_once(builder, values[0].type.pointee)
+        cgutils.raw_memcpy(builder, copy, values[0], target.get_constant(types.intp, record.size), 1)
+        return copy
+
+    return record(record), emit_copy
 
 
 def record_dtype(*numbers: str, **parts: Any) -> np.dtype[Any]:

@@ -82,7 +82,7 @@ def piston_acceleration(
     `p_A`, `p_B` [Pa]: chamber pressures; `A_A`, `A_B` [m^2]: piston areas; `friction`, `load` [N]: forces against +x;
     `stop` [N]: force of the end stops along +x; `M_eq` [kg]: moving mass.
     """
-    return (p_A * A_A - p_B * A_B - friction - load + stop) / M_eq
+    return (p_A * A_A - p_B * A_B - load + stop - friction) / M_eq  # friction, known last, is subtracted last
 
 
 @contracted

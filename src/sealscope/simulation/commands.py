@@ -41,7 +41,9 @@ class Sine:
 
     def volts(self, t: Array) -> Array:
         """Compute the sine's voltage u [V] at times t [s]."""
-        return self.offset + self.amplitude * np.sin(self.omega * t + self.phase)
+        from sealscope.physics.sine import sine_wave
+
+        return sine_wave(t, self.amplitude, self.omega, self.phase, self.offset)
 
     def __str__(self) -> str:
         phase, offset = _format_addend(self.phase), _format_addend(self.offset)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -90,9 +90,11 @@ class RunInputs:
         `start` (steps,): beginnings of the steps [s]; `offsets` (nodes,): times [s] after each at which the solver
         needs its inputs. Raises InputError for a command beyond the converter's limit within the run.
         """
-        t = start[:, None] + offsets
+        t = np.empty((start.size, offsets.size))
+        for node, offset in enumerate(offsets):  # by columns, as NumPy is slow along a row of three numbers
+            t[:, node] = start + offset
         u = self._command.volts(t)
-        if not np.abs(u).max(initial=0.0) <= self._limit:  # also for NaN
+        if not (u.max(initial=0.0) <= self._limit and u.min(initial=0.0) >= -self._limit):  # also for NaN
             check_command(self._command, t[t <= self._duration], self._limit)
             # beyond the limit only after the recording's end, where the solver runs on for the anti-alias filter
             u = np.clip(u, -self._limit, self._limit)
@@ -302,6 +304,7 @@ class _Integration:
         self.inputs = RunInputs(experiment, leaks)
         self.method = choose_method(rig, experiment.method)
         self.schedule = Schedule(experiment.effects(), loaded_rig_numbers(rig, experiment.load), n_out, rate)
+        self._records: dict[int, Any] = {}  # parameters of `schedule` by their id, packed
         self.feedback: Feedback | None = None
         if target is not None and controller is not None:
             self.feedback = Feedback(rig, target, controller, duration=n_out / rate, rate=rate, seed=experiment.seed)
@@ -334,8 +337,10 @@ class _Integration:
                     refuse_long(h, longest_step(p, max_G, max_C), "the leak")
                 steps = slice((k - first) * n_steps, (end - first) * n_steps)
                 out = rows[k - origin : end - origin]
+                if id(p) not in self._records:
+                    self._records[id(p)] = pack_numbers(p)
                 # the arguments that `advance` and `advance_closed` share, in their order
-                arguments = G[steps], C[steps], F[steps], pack_numbers(p), euler, n_steps
+                arguments = G[steps], C[steps], F[steps], self._records[id(p)], euler, n_steps
                 if self.feedback is None:
                     advance(implicit, y, h, u[steps], *arguments, out)
                     self._check_rows(p, h, out, k)

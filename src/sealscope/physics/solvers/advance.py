@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.compiled import kernel
+from sealscope.compiled import copy_to_stack, kernel
 from sealscope.physics.rig import RigNumbers, observe
 from sealscope.physics.solvers.imex import IMEX_NODES, implicit_step
 from sealscope.physics.solvers.loop import SPACING, Loop, sample_controller
@@ -50,6 +50,7 @@ def advance(
     - `numbers`: parameters of the model. `rows` (n // every, 21): receives the outputs; n is a multiple of `every`.
     """
     z = state_of(y)
+    numbers = copy_to_stack(numbers)
     for step in range(u.shape[0]):
         if step % every == 0:
             observe(z, u[step, 0], G[step, 0], C[step, 0], numbers, rows[step // every])
