@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.campaigns.execution.workers import iter_results
+from sealscope.campaigns.execution.workers import iter_results, iter_results_in_order
 
 from ..waiting import until
 
@@ -27,6 +27,12 @@ def die_on(monkeypatch):
 def test_a_process_that_dies_loses_its_own_item_alone(die_on):
     results = dict(iter_results(partial(die_on, 3), range(8), 2))
     assert results == {item: None if item == 3 else item for item in range(8)}
+
+
+def test_results_come_in_order_where_a_fork_dies(die_on):
+    results = iter_results_in_order(2, partial(die_on, 3), list(range(6)))
+    assert list(results) == [(item, None if item == 3 else item) for item in range(6)]
+    until(lambda: not multiprocessing.active_children())
 
 
 @pytest.mark.long

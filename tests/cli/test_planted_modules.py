@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.campaigns.execution.workers import iter_results_in_order
+from sealscope.campaigns.execution.workers import iter_results
 from sealscope.recordings.subprocesses import run_in_subprocess
 
 from .conftest import SOURCES
@@ -110,11 +110,11 @@ def test_no_library_runs_where_python_itself_begins_in_the_folder(planted: Path,
 
 @pytest.mark.slow
 def test_none_runs_in_worker_processes(run: Ran) -> None:
-    ((_, loaded),) = iter_results_in_order(2, eval, [LOADED])
+    ((_, loaded),) = iter_results(eval, [LOADED], 2)
     assert loaded is not None
     assert "multiprocessing.spawn" in loaded
-    text = "from sealscope.campaigns.execution.workers import iter_results_in_order\n"
-    text += "if __name__ == '__main__':\n    print(list(iter_results_in_order(2, abs, [-1, 2])))\n"
+    text = "from sealscope.campaigns.execution.workers import iter_results\n"
+    text += "if __name__ == '__main__':\n    print(sorted(iter_results(abs, [-1, 2], 2)))\n"
     done = run(loaded, text)
     assert done.stdout == "[(-1, 1), (2, 2)]\n", done.stderr
 

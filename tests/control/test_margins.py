@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.control import FaultTolerant, PositionPI, margins
-from sealscope.control.margins import _frequency_response, compute_margins, open_loop
+from sealscope.control.loop_margins import _frequency_response, compute_margins, open_loop
 from sealscope.parameters import load_rig
 from sealscope.simulation.experiment import Experiment
 from sealscope.simulation.integrate import integrate_run

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
+import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager, suppress
 from functools import partial
 from itertools import islice
-from multiprocessing import get_context
+from multiprocessing import Pipe, get_context
 from multiprocessing.connection import Connection
 from typing import Any, NamedTuple, TypeVar
 
@@ -94,15 +96,39 @@ def iter_results_in_order(
 ) -> Iterator[tuple[Item, Result | None]]:
     """Run `task` on each item in `jobs` processes, and yield pairs of item and result in the order of the items.
 
-    The result is None if the worker process died at both attempts.
+    The result is None if the worker process died at both attempts. On Linux, a program of a single thread runs the
+    first attempts in copies of itself (forks), which have all that it has imported.
     """
-    results: dict[int, Result | None] = {}  # results not yet yielded, by number of the item
     next_number = 0
-    for (number, _), result in iter_results(partial(_run_numbered, task), enumerate(items), jobs):
-        results[number] = result
+    if sys.platform == "linux" and threading.active_count() == 1:
+        for item, result in zip(items, _iter_forked(jobs, task, items), strict=False):  # fewer if a process dies
+            yield item, result
+            next_number += 1
+    results: dict[int, Result | None] = {}  # results not yet yielded, by number of the item
+    waiting = list(enumerate(items))[next_number:]
+    for (number, _), spawned in iter_results(partial(_run_numbered, task), waiting, jobs) if waiting else ():
+        results[number] = spawned
         while next_number in results:
             yield items[next_number], results.pop(next_number)
             next_number += 1
+
+
+def _iter_forked(jobs: int, task: Callable[[Item], Result], items: Sequence[Item]) -> Iterator[Result]:
+    """Run `task` on each item in `jobs` forks of this process; yield the results in order until a process dies."""
+    lifeline, parent_end = Pipe(duplex=False)
+    start = partial(_initialise_fork, task, lifeline, parent_end)
+    with warnings.catch_warnings():  # Python warns of threads, as those of a library that are stopped before a fork
+        warnings.simplefilter("ignore", DeprecationWarning)
+        pool = ProcessPoolExecutor(jobs, get_context("fork"), initializer=start)
+        futures = [pool.submit(_run_task, item) for item in items]  # the first one forks all processes
+    try:
+        with suppress(BrokenProcessPool):
+            for future in futures:
+                yield future.result()
+    finally:
+        parent_end.close()
+        lifeline.close()
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 class _Pools(NamedTuple):
@@ -196,6 +222,12 @@ def _initialise_worker(task: Callable[[Any], Any], lifeline: Connection[Any, Any
     _task[:] = [task]
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     threading.Thread(target=_exit_with_parent, args=(lifeline,), daemon=True).start()
+
+
+def _initialise_fork(task: Callable[[Any], Any], lifeline: Connection[Any, Any], end: Connection[Any, Any]) -> None:
+    """Initialise a fork as a worker, and close its copy of the parent's `end` of the pipe `lifeline`."""
+    end.close()
+    _initialise_worker(task, lifeline)
 
 
 def _run_task(item: Any) -> Any:
