@@ -327,3 +327,29 @@ def test_a_flow_that_is_never_negative_keeps_its_95_percent(value: float) -> Non
     # with half the tail beyond the end at 0 cut off, the usual interval holds up to 97.5 %
     assert 0.95 - 1e-6 <= mass <= 0.976
     assert interval.low > 0.0 or mass == pytest.approx(0.95, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_level_or_slope_that_other_columns_took_already_is_not_taken_twice(seed: int) -> None:
+    """A step is tested beside any level and slope: eliminating them from the likelihood beforehand changes nothing."""
+    random = np.random.default_rng(seed)
+    count = int(random.integers(8, 40))
+    made = drawn(random, precision_of(random, count), 1.0, 3.0 * step(count, 0.6 * SPACING * count))
+    columns = np.column_stack([np.ones(count), np.arange(count)])[:, [[0], [1], [0, 1]][seed % 3]]
+    inner = columns.T @ made.precision @ columns * (1.0 + 1e-10 * np.eye(columns.shape[1]))  # with a ridge, as others
+    gain = np.linalg.solve(inner, columns.T @ made.precision)
+    left = made.precision - made.precision @ columns @ gain
+    taken = judged(made._replace(precision=left, vector=made.vector - gain.T @ (columns.T @ made.vector)))
+    test = judged(made)
+    assert (taken.score, taken.chance) == pytest.approx((test.score, test.chance), rel=1e-5)
+    assert np.array(taken.fitted) == pytest.approx(np.array(test.fitted), rel=1e-5)
+
+
+def test_a_prior_on_the_level_does_not_make_the_blocks_uninformed() -> None:
+    """However well the level before the recording is known, all blocks count in the test of a step after it."""
+    random, precision = np.random.default_rng(9), precision_of(np.random.default_rng(9), 20)
+    values = 9.0 * step(20, 35.0) + random.standard_normal(20) / np.sqrt(np.diag(precision))
+    made = Information(SPACING * (np.arange(20) + 0.5), precision, precision @ values)
+    tests = [judged(made._replace(level=level)) for level in (1e2, 1e-4, 1e-8)]
+    assert len({test.law.dimensions for test in tests}) == 1
+    assert max(test.chance for test in tests) < 1e-3

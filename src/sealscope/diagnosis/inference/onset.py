@@ -44,6 +44,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import kernel
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
@@ -62,6 +63,10 @@ WALKS = np.concatenate([[0.0], 10.0 ** np.linspace(-4.0, 3.0, 29)])
 ALLOWED = 4.5
 #: Eigenvalues below this fraction of the largest count as zero.
 RANK_TOLERANCE = 1e-9
+#: Smallest fraction of the squares that remains beside a step, whose logarithm is used.
+MIN_RESIDUAL = 1e-12
+#: Largest error of a fraction by rounding, the smallest positive number, and the smallest one that has a square.
+ROUNDING, TINY, SMALLEST = 1e-12, float(np.finfo(float).tiny), 1e-150
 
 
 class Information(NamedTuple):
@@ -328,9 +333,11 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
     if whitened is None:
         return []
     whitening, z, onsets = whitened
-    steps = whitening.unit_steps if shape is None else whitening.transform_steps(whitening.positions, shape)
-    fits = whitening.fit_steps(z, steps)
-    return [_test_step(whitening, onsets, steps, fits, sign) for sign in signs]
+    steps = whitening.unit_steps if shape is None else _Steps(whitening, shape)
+    weighted = whitening.weight * z
+    total = np.maximum(weighted @ z, np.finfo(float).tiny)
+    moments = weighted @ steps.whole
+    return [_test_step(whitening, onsets, steps, moments, total, sign) for sign in signs]
 
 
 def step_sizes(
@@ -346,43 +353,21 @@ def step_sizes(
     whitened = _whiten_blocks(information)
     assert whitened is not None  # else there is no step test with onsets
     whitening, z, _ = whitened
-    fits = whitening.fit_steps(z, whitening.transform_steps(whitening.positions[onsets], shape, growth))
-    squares = fits.residual_squares()
-    log_ratios = fits.log_likelihood(squares) - fits.log_likelihood(fits.total).max()  # (walk, onset)
-    likeliest_walk = log_ratios.argmax(axis=0), np.arange(len(onsets))
-    sizes, variances = fits.moments / fits.energies, squares / len(z) / fits.energies
-    return log_ratios[likeliest_walk], sizes[likeliest_walk], np.sqrt(variances)[likeliest_walk]
-
-
-class _StepFits(NamedTuple):
-    """Least-squares fits of a step to n whitened values z, for each of w walks (`WALKS`) and of o onsets.
-
-    `weight` (w, n): variance of the noise over that of each z; `log_factor` (w,): half the log determinant of the
-    weights, plus the log prior of the walk. Sums with these weights: `total` (w,): squares of z; `moments`, `energies`
-    (w, o): products of the steps with z and with themselves.
-    """
-
-    weight: Array
-    log_factor: Array
-    total: Array
-    moments: Array
-    energies: Array
-
-    def residual_squares(self) -> Array:
-        """Compute the sums of squares (w, o) that remain after the fit of a step up; a step down is not fitted."""
-        total = self.total[:, None]
-        # positive, since the logarithm is used
-        return np.asarray(np.maximum(total - np.maximum(self.moments, 0.0) ** 2 / self.energies, 1e-12 * total))
-
-    def log_likelihood(self, squares: Array) -> Array:
-        """Compute the log likelihood, with the prior on the walk, from the remaining `squares` (w,) or (w, o) of z.
-
-        The variance of the noise is the likeliest one.
-        """
-        n = self.weight.shape[1]
-        return np.asarray(
-            (self.log_factor - 0.5 * n * np.log(squares.T / n)).T
-        )  # transposed: the walk is the last axis
+    # the block that a prior on the level adds needs no factor of the shape: it precedes every onset
+    padding = (whitening.transform.shape[1] - len(shape), 0)
+    courses = step_shapes(whitening.transform.shape[1], whitening.positions[onsets], growth)
+    steps = whitening.transform @ (np.pad(shape, padding)[:, None] * courses)
+    weight, n = whitening.weight, len(z)
+    total = np.maximum((weight * z) @ z, np.finfo(float).tiny)
+    moments, energies = (weight * z) @ steps, np.maximum(weight @ steps**2, np.finfo(float).tiny)
+    # residual squares after the fit of a step up; a step down is not fitted
+    squares = np.maximum(total[:, None] - np.maximum(moments, 0.0) ** 2 / energies, MIN_RESIDUAL * total[:, None])
+    likelihood_without = float((whitening.log_factor - 0.5 * n * np.log(total / n)).max())
+    log_likelihoods = whitening.log_factor[:, None] - 0.5 * n * np.log(squares / n)  # (walk, onset)
+    likeliest = log_likelihoods.argmax(axis=0), np.arange(len(onsets))
+    variances = squares / n / energies
+    sizes = moments[likeliest] / energies[likeliest]
+    return log_likelihoods[likeliest] - likelihood_without, sizes, np.sqrt(variances[likeliest])
 
 
 def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
@@ -400,50 +385,31 @@ def step_shapes(count: int, positions: Array, growth: float = 0.0) -> Array:
     return np.asarray(steps * growing)
 
 
-class _WhitenedSteps:
-    """Unit steps at each of o onsets, transformed to n whitened values, with what does not depend on these values.
-
-    `steps` (n, o): changes of the values; `weight` (w, n): as in `_StepFits`.
-    """
-
-    def __init__(self, steps: Array, weight: Array) -> None:
-        self.steps, self.weight = steps, weight
-
-    @cached_property
-    def energies(self) -> Array:
-        """Weighted sums of squares of each step, for each walk, (w, o)."""
-        return np.maximum(self.weight @ self.steps**2, np.finfo(float).tiny)
-
-    @cached_property
-    def lengths(self) -> Array:
-        """Length of the curve of all steps on the unit sphere, for each walk, (w,).
-
-        It is the sum of the angles between the steps at neighbouring onsets.
-        """
-        norm = np.sqrt(self.energies)
-        cosines = (self.weight @ (self.steps[:, 1:] * self.steps[:, :-1])) / (norm[:, 1:] * norm[:, :-1])
-        return np.asarray(np.arccos(np.clip(cosines, -1.0, 1.0)).sum(axis=1))
-
-
 @dataclass(frozen=True, eq=False)
 class _Whitening:
     """Matrices that whiten the estimates of a coefficient in K blocks, from their precision and priors only.
 
     The whitened values z (n,) have independent noise of variance 1. Level, slope and a further change of known shape
-    are projected out.
+    are projected out. A step at the beginning of block k is an increment of the coefficient there, like one of the
+    walk. With the increments' precision R = L' Lambda L, where L sums them up, and its eigenvalues and eigenvectors
+    R = V diag(eigen) V', z = eigen^(-1/2) V' L' eta, and a unit increment in block k changes z by eigen^(1/2) V'[:, k].
 
-    - `transform` (n, K): matrix from the coefficient to z; `from_vector` (n, K): from the `vector` of `Information`;
+    - `increments` (n, K): change of z by a unit increment in each block;
+    - `to_z` (n, K): matrix from the `vector` of `Information` to z;
     - `eigen` (n,): variances of z by a random walk, whose steps have the variance `unit`;
     - `unit`: variance of the walk's steps at which it adds on average as much to z as the noise;
-    - `positions` (o,): possible onsets, counted in blocks;
+    - `positions` (o,): possible onsets, counted in blocks; `block`, `after` (o,): index of the block in which each
+      lies, and fraction of the block before it;
     - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
     """
 
-    transform: Array
-    from_vector: Array
+    increments: Array
+    to_z: Array
     eigen: Array
     unit: float
     positions: Array
+    block: NDArray[np.int64]
+    after: Array
     walk_log_priors: Array
 
     @cached_property
@@ -457,26 +423,63 @@ class _Whitening:
         return np.asarray(0.5 * np.log(self.weight).sum(axis=1) + self.walk_log_priors)
 
     @cached_property
-    def unit_steps(self) -> _WhitenedSteps:
+    def transform(self) -> Array:
+        """Matrix (n, K) from the coefficient in the blocks to z, without level, slope and further change."""
+        return -np.diff(self.increments, axis=1, append=0.0)
+
+    @cached_property
+    def unit_steps(self) -> _Steps:
         """Unit steps of the coefficient itself at all possible onsets."""
-        return self.transform_steps(self.positions)
+        return _Steps(self, None)
 
-    def transform_steps(self, positions: Array, shape: Array | None = None, growth: float = 0.0) -> _WhitenedSteps:
-        """Compute the change of the n whitened values by a unit step at each of o onsets.
 
-        `positions`, `growth`: as in `step_shapes`; `shape`: factor on the step in each block of the recording, by
-        default 1. The block that a prior on the level adds needs no factor: it precedes every onset.
-        """
-        count = self.transform.shape[1]
-        steps = step_shapes(count, positions, growth)
+class _Steps:
+    """Unit steps at each of o onsets, changed by a factor on each block, as changes of n whitened values.
+
+    A step within a block is the mean of one at the block's beginning and one at its end, weighted by the block's parts
+    before and after the onset. Sums of products are therefore formed for steps at the K + 1 beginnings and ends only.
+
+    - `whole` (n, K + 1): changes of z by a step at each beginning of a block, and at the last end, where it is zero;
+    - `inverse_energies` (w, o): 1 over the weighted sum of squares of each step, for each walk;
+    - `lengths` (w,): length of the curve of all steps on the unit sphere, the sum of the angles between neighbours.
+    """
+
+    def __init__(self, whitening: _Whitening, shape: Array | None) -> None:
+        whole = whitening.increments
         if shape is not None:
-            steps[count - len(shape) :] *= shape[:, None]  # the blocks of the recording
-        return _WhitenedSteps(np.asarray(self.transform @ steps), self.weight)
+            factor = np.pad(shape, (whole.shape[1] - len(shape), 0), constant_values=1.0)
+            whole = np.cumsum((whitening.transform * factor)[:, ::-1], axis=1)[:, ::-1]
+        self.whole = np.append(whole, np.zeros((len(whole), 1)), axis=1)
+        products = np.column_stack([self.whole**2, self.whole[:, 1:] * self.whole[:, :-1]])
+        n_walks, n_onsets = len(whitening.weight), len(whitening.positions)
+        self.inverse_energies, self.lengths = np.empty((n_walks, n_onsets)), np.zeros(n_walks)
+        sums = whitening.weight @ products
+        _sum_steps(sums, whitening.block, whitening.after, self.inverse_energies, self.lengths)
 
-    def fit_steps(self, z: Array, steps: _WhitenedSteps) -> _StepFits:
-        """Fit a step to whitened values `z` (n,) by weighted least squares, at each onset of the unit `steps`."""
-        total = np.maximum((self.weight * z**2).sum(axis=1), np.finfo(float).tiny)
-        return _StepFits(self.weight, self.log_factor, total, (self.weight * z) @ steps.steps, steps.energies)
+
+@kernel
+def _sum_steps(sums: Array, block: NDArray[np.int64], after: Array, inverse_energies: Array, lengths: Array) -> None:
+    """Write `inverse_energies` (w, o) and `lengths` (w,) of `_Steps`; the lengths are 0 before.
+
+    `sums` (w, 2 K + 1): weighted squares of the K + 1 whole steps, and products of each with the next one; `block`,
+    `after` (o,): as in `_Whitening`.
+    """
+    n_walks, n_onsets, n_whole = sums.shape[0], block.size, (sums.shape[1] + 1) // 2
+    for walk in range(n_walks):
+        for onset in range(n_onsets):
+            place, end = block[onset], after[onset]
+            begin = 1.0 - end
+            first, last, product = sums[walk, place], sums[walk, place + 1], sums[walk, n_whole + place]
+            energy = max(begin * begin * first + 2.0 * begin * end * product + end * end * last, TINY)
+            inverse_energies[walk, onset] = 1.0 / energy
+            if onset + 1 < n_onsets:  # the angle to the next onset, which lies in this block or at its end
+                next_end = after[onset + 1] + (block[onset + 1] - place)
+                next_begin = 1.0 - next_end
+                next_energy = next_begin * next_begin * first + 2.0 * next_begin * next_end * product
+                next_energy = max(next_energy + next_end * next_end * last, TINY)
+                inner = begin * next_begin * first + (begin * next_end + end * next_begin) * product
+                cosine = (inner + end * next_end * last) / math.sqrt(energy * next_energy)
+                lengths[walk] += math.acos(min(max(cosine, -1.0), 1.0))
 
 
 def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] | None:
@@ -487,16 +490,18 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
     coefficient, or if the precision is not finite.
     """
     time, precision, vector, level, slope, walk, disturbance, shape = information
-    if np.isfinite(level) and len(time) >= MIN_BLOCKS:  # the added block must not count towards this number
+    n_prior = int(
+        math.isfinite(level) and len(time) >= MIN_BLOCKS
+    )  # the added block must not count towards this number
+    if n_prior:
         time, vector = np.append(2.0 * time[0] - time[1], time), np.append(0.0, vector)
-        precision = np.pad(precision, (1, 0))
-        precision[0, 0] = 1.0 / level**2
-    if not np.isfinite(precision).all():
+        with_prior = np.zeros((len(time), len(time)))
+        with_prior[0, 0], with_prior[1:, 1:] = 1.0 / level**2, precision
+        precision, shape = with_prior, None if shape is None else np.append(0.0, shape)
+    if len(time) < MIN_BLOCKS:
         return None
-    if shape is not None:
-        shape = np.pad(shape, (len(time) - len(shape), 0))
     whitening = _find_whitening(
-        precision.tobytes(), len(time), slope, walk, None if shape is None else shape.tobytes(), disturbance
+        precision.tobytes(), len(time), n_prior, slope, walk, None if shape is None else shape.tobytes(), disturbance
     )
     if whitening is None:
         return None
@@ -504,110 +509,253 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
     first_edge, last_edge = 1.5 * time[0] - 0.5 * time[1], 1.5 * time[-1] - 0.5 * time[-2]
     edges = np.concatenate([[first_edge], 0.5 * (time[1:] + time[:-1]), [last_edge]])
     onsets = np.interp(whitening.positions, np.arange(len(edges)), edges)
-    return whitening, whitening.from_vector @ vector, onsets
+    return whitening, whitening.to_z @ vector, onsets
 
 
-@lru_cache(maxsize=16)
+@lru_cache(maxsize=64)
 def _find_whitening(
-    precision: bytes, count: int, slope: float, walk: float, shape: bytes | None, disturbance: float
+    precision: bytes, count: int, n_prior: int, slope: float, walk: float, shape: bytes | None, disturbance: float
 ) -> _Whitening | None:
     """Build the matrices of `_build_whitening`, once for the tests of all laws, growths and shapes of a coefficient.
 
     `precision`, `shape`: bytes of the arrays of doubles, `precision` with `count` rows.
     """
     shape_values = None if shape is None else np.frombuffer(shape)
-    return _build_whitening(np.frombuffer(precision).reshape(count, count), slope, walk, shape_values, disturbance)
+    matrix = np.frombuffer(precision).reshape(count, count)
+    return _build_whitening(matrix, n_prior, slope, walk, shape_values, disturbance)
 
 
 def _build_whitening(
-    precision: Array, slope: float, walk: float, shape: Array | None = None, disturbance: float = float("inf")
+    precision: Array, n_prior: int, slope: float, walk: float, shape: Array | None, disturbance: float
 ) -> _Whitening | None:
     """Build the matrices that turn the estimates of a coefficient in K blocks into independent values.
 
     The values do not depend on level and slope of the coefficient, nor on a multiple of `shape` (K,), if it is given.
-    `precision` (K, K): inverse covariance of the estimates; `slope`, `walk`, `disturbance`: scales of the priors on the
-    slope, on the random walk over all blocks, and on the multiple (`Information`). Return None if too few blocks have
-    information.
+    `precision` (K, K): inverse covariance of the estimates, of which the first `n_prior` are a prior's; `slope`,
+    `walk`, `disturbance`: scales of the priors on the slope, on the random walk over all blocks, and on the multiple
+    (`Information`). A block counts by its information beside that of other blocks, not beside a prior's. Return None if
+    too few blocks have information.
     """
     count = len(precision)
-    # z = Lambda^(-1/2) eta of the module, restricted to the eigenvectors of the precision Lambda with information
-    values, vectors = np.linalg.eigh(precision)
-    is_informative = values > RANK_TOLERANCE * max(float(values[-1]), 0.0)
-    n_informative = np.count_nonzero(is_informative)
-    if count < MIN_BLOCKS or n_informative < MIN_BLOCKS:
+    if not np.isfinite(precision).all():
         return None
-    root, vectors = np.sqrt(values[is_informative]), vectors[:, is_informative]
-    index = np.arange(count)
-    changes = [np.ones(count), (index - index.mean()) / count]  # level and slope
-    scales = [np.inf, slope]
+    strengths = np.linalg.eigvalsh(precision[n_prior:, n_prior:])
+    floor = RANK_TOLERANCE * max(float(strengths[-1]), 0.0)
+    n_informative = n_prior + int(np.count_nonzero(strengths > floor))
+    if n_informative < MIN_BLOCKS:
+        return None
+    changes = np.ones((2 if shape is None else 3, count))
+    priors = np.array([0.0, max(slope, SMALLEST) ** -2, max(disturbance, SMALLEST) ** -2])
+    changes[1] = (np.arange(count) - 0.5 * (count - 1)) / count
     if shape is not None:
-        changes.append(shape)
-        scales.append(disturbance)
-    design = (vectors * root).T  # matrix from the coefficient in all blocks to z
-    priors = np.diag(1.0 / np.array(scales))[np.isfinite(scales)]  # each is one more estimate, of 0
-    fixed = np.vstack([design @ np.column_stack(changes), priors])
-    # the remaining columns of the full Q span the complement of level, slope and shape; the priors' rows multiply 0
-    complement = np.linalg.qr(fixed, mode="complete")[0][:n_informative, len(scales) :].T
-    transform = complement @ design
-    # covariance of a walk with steps of variance 1, which is min(k, l) for blocks k and l counted from 1
-    covariance = transform @ (np.minimum.outer(index, index) + 1.0) @ transform.T
-    unit = len(complement) / max(float(np.trace(covariance)), np.finfo(float).tiny)
-    eigen, basis = np.linalg.eigh(unit * covariance)
-    transform = basis.T @ transform
-    positions = np.arange(EDGE, count - EDGE + 1e-9, 1.0 / PARTS)  # 1e-9 includes the upper end
+        changes[2] = shape
+    sums, gains = np.zeros_like(precision), np.zeros_like(changes)
+    n_removed = _project_out(precision, changes, priors, floor, sums, gains)
+    eigen, vectors = np.linalg.eigh(sums)
+    n = min(n_informative - n_removed, int(np.count_nonzero(eigen > ROUNDING * max(float(eigen[-1]), 0.0))))
+    if n < 1:
+        return None
+    eigen, increments, to_z = eigen[count - n :], np.empty((n, count)), np.empty((n, count))
+    _transform_blocks(eigen, vectors, changes, gains, increments, to_z)
+    unit = n / float(eigen.sum())
+    positions = np.arange(EDGE, count - EDGE + ROUNDING, 1.0 / PARTS)
     # before or after all blocks with information a step cannot be told from level and slope: its energy is zero
-    energies = ((transform @ step_shapes(count, positions)) ** 2).sum(axis=0)
+    block = (positions + ROUNDING).astype(np.int64)
+    energies = (increments**2).sum(axis=0)
+    energies = energies[block] + (positions - block) * energies[block + 1]
+    positions, block = (values[energies > RANK_TOLERANCE * energies.max()] for values in (positions, block))
     return _Whitening(
-        transform=transform,
-        from_vector=(basis.T @ complement) @ (vectors / root).T,
-        eigen=np.maximum(eigen, 0.0),
+        increments=increments,
+        to_z=to_z,
+        eigen=unit * eigen,
         unit=unit,
-        positions=positions[energies > RANK_TOLERANCE * energies.max()],
+        positions=positions,
+        block=block,
+        after=positions - block,
         # half-Cauchy prior on the standard deviation of the walk over all blocks, whose scale is `walk`
         walk_log_priors=-np.log1p(WALKS * unit * count / walk**2),
     )
 
 
-def _test_step(whitening: _Whitening, onsets: Array, steps: _WhitenedSteps, fits: _StepFits, sign: float) -> StepTest:
+@kernel
+def _project_out(precision: Array, changes: Array, priors: Array, floor: float, sums: Array, gains: Array) -> int:
+    """Project m `changes` (m, K) with prior precisions `priors` (m,) out of a coefficient's `precision` (K, K).
+
+    They are eliminated one after the other. A change x that the data cannot show, with x' Lambda x at most `floor` x' x
+    beside the earlier ones, stays. Writes L' Lambda L of the remaining precision to `sums` (K, K), where L sums up the
+    increments of the coefficient, and to `gains` (m, K) that of each change, with which its elimination subtracts
+    gain x' vector from the vector of the likelihood. Returns the number of values that are lost.
+    """
+    n_changes, count = changes.shape
+    products, n_removed = np.empty(count), 0
+    for i in range(count):
+        for j in range(count):
+            sums[i, j] = precision[i, j]
+    for m in range(n_changes):
+        energy, square = 0.0, 0.0
+        for i in range(count):
+            product = 0.0
+            for j in range(count):
+                product += sums[i, j] * changes[m, j]
+            products[i] = product
+            energy += changes[m, i] * product
+            square += changes[m, i] * changes[m, i]
+        if energy > floor * square:
+            n_removed += priors[m] == 0.0
+            for i in range(count):
+                gains[m, i] = products[i] / (energy + priors[m])
+                for j in range(count):
+                    sums[i, j] -= gains[m, i] * products[j]
+    for i in range(count - 1, -1, -1):
+        along_row = 0.0
+        for j in range(count - 1, -1, -1):
+            along_row += sums[i, j]
+            sums[i, j] = along_row + (sums[i + 1, j] if i + 1 < count else 0.0)
+    return n_removed
+
+
+@kernel
+def _transform_blocks(
+    eigen: Array, vectors: Array, changes: Array, gains: Array, increments: Array, to_z: Array
+) -> None:
+    """Write `increments` and `to_z` (n, K) of `_Whitening`.
+
+    `eigen` (n,): largest eigenvalues of the increments' precision; `vectors` (K, K): its eigenvectors as columns, those
+    of `eigen` last; `changes`, `gains` (m, K): as in `_project_out`.
+    """
+    n, count = increments.shape
+    for i in range(n):
+        root, total = math.sqrt(eigen[i]), 0.0
+        for k in range(count):
+            element = vectors[k, count - n + i]
+            increments[i, k] = root * element
+            total += element / root
+            to_z[i, k] = total
+        for m in range(changes.shape[0] - 1, -1, -1):
+            product = 0.0
+            for k in range(count):
+                product += to_z[i, k] * gains[m, k]
+            for k in range(count):
+                to_z[i, k] -= product * changes[m, k]
+
+
+def _test_step(
+    whitening: _Whitening, onsets: Array, steps: _Steps, moments: Array, total: Array, sign: float
+) -> StepTest:
     """Test whitened values of a coefficient for a step at any of o `onsets` [s], by the likelihood ratio to no step.
 
-    `steps`: whitened unit steps; `fits`: their fits to the values; `sign`: 1 for a step up, -1 for a step down,
-    which is a step up of the values with the opposite sign. Both likelihoods are maximised over the variances of walk
-    and noise, with the prior on the walk.
+    `moments` (w, K + 1): weighted sums of products of the `steps.whole` with the values, for each walk; `total` (w,):
+    those of the values' squares; `sign`: 1 for a step up, -1 for a step down.
     """
-    fits = fits._replace(moments=sign * fits.moments)
-    weight, log_factor, total, moments, energies = fits
-    n, unit = weight.shape[1], whitening.unit
-    residual_squares = fits.residual_squares()
-    log_likelihood = fits.log_likelihood(total)
-    walk_without_step = int(log_likelihood.argmax())
-    # at each onset the likeliest walk is that with the least squares times exp(-2 log_factor / n): one logarithm each
-    largest_factor = log_factor.max()
-    scaled_squares = residual_squares * np.exp(2.0 / n * (largest_factor - log_factor))[:, None]
-    walk, best = np.unravel_index(int(scaled_squares.argmin()), scaled_squares.shape)
-    likelihood = largest_factor - 0.5 * n * np.log(scaled_squares.min(axis=0) / n)  # of a step at each onset
-    score = 2.0 * float(likelihood[best] - log_likelihood[walk_without_step])
-    # variances of the walk that the data alone, without the prior, allow: with or without a step
-    with_step = fits.log_likelihood(residual_squares.min(axis=1))  # at the best onset for each walk
-    data_likelihoods = np.array([log_likelihood, with_step]) - whitening.walk_log_priors
-    allowed = (data_likelihoods > data_likelihoods.max(axis=1, keepdims=True) - ALLOWED).any(axis=0)
-    length = steps.lengths[allowed].max()
-    noise = float(residual_squares[walk, best]) / n
-    size_at_best, error_at_best = moments[walk, best] / energies[walk, best], np.sqrt(noise / energies[walk, best])
-    size = moments[walk_without_step] / energies[walk_without_step]
-    # residual squares of a step up or down at each onset
-    squares = total[walk_without_step] - moments[walk_without_step] ** 2 / energies[walk_without_step]
+    n, unit = whitening.weight.shape[1], whitening.unit
+    courses, numbers = np.empty((3, len(onsets))), np.empty(9)
+    _score_step(
+        whitening.log_factor,
+        whitening.walk_log_priors,
+        whitening.block,
+        whitening.after,
+        steps.inverse_energies,
+        steps.lengths,
+        moments,
+        total,
+        sign,
+        n,
+        courses,
+        numbers,
+    )
+    score, best, *fitted, noise_without, noise_with, walk_without, walk_with, length = numbers.tolist()
     return StepTest(
         score=score,
         best=int(best),
         positions=whitening.positions,
         onsets=onsets,
-        likelihood=likelihood,
-        size=size,
-        deviation=np.sqrt(np.maximum(squares, 0.0) / n) / np.sqrt(energies[walk_without_step]),
-        fitted=Estimate(float(size_at_best), float(error_at_best)),
-        walk=(unit * float(WALKS[walk_without_step]), unit * float(WALKS[walk])),
-        noise=(float(total[walk_without_step]) / n, noise),
-        law=NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=float(length)),  # degrees of freedom: see the module
+        likelihood=courses[0],
+        size=courses[1],
+        deviation=courses[2],
+        fitted=Estimate(*fitted),
+        walk=(unit * walk_without, unit * walk_with),
+        noise=(noise_without, noise_with),
+        law=NullLaw(dimensions=min(n, 0.5 * n + 2.0), length=length),  # degrees of freedom: see the module
         sign=sign,
     )
+
+
+@kernel
+def _score_step(
+    log_factor: Array,
+    walk_log_priors: Array,
+    block: NDArray[np.int64],
+    after: Array,
+    inverse_energies: Array,
+    lengths: Array,
+    moments: Array,
+    total: Array,
+    sign: float,
+    n: int,
+    courses: Array,
+    numbers: Array,
+) -> None:
+    """Maximise the likelihoods of a step and of no step over the variances of walk and noise, for `_test_step`.
+
+    A step down is a step up of the values with the opposite sign. Writes to `courses` (3, o) the log likelihood of a
+    step at each onset, and its size, up or down, with its error for the likeliest walk without a step; to `numbers`
+    (9,) score, index of the best onset, size and error of the step there, variances of the noise and of the walk
+    (`WALKS`), each without a step and with the best one, and the largest length of the curve of the steps over the
+    walks that the data allow.
+    """
+    n_walks, n_onsets = inverse_energies.shape
+    half = 0.5 * n
+    likelihood, size, deviation = courses
+    without, largest_factor = 0, log_factor[0]
+    without_likelihoods, with_likelihoods = np.empty(n_walks), np.empty(n_walks)
+    for walk in range(n_walks):
+        without_likelihoods[walk] = log_factor[walk] - half * math.log(total[walk] / n)
+        if without_likelihoods[walk] > without_likelihoods[without]:
+            without = walk
+        largest_factor = max(largest_factor, log_factor[walk])
+    # at each onset the likeliest walk is that with the least squares times exp(-2 log_factor / n): one logarithm each
+    for onset in range(n_onsets):
+        likelihood[onset] = np.inf
+        moment = sign * ((1.0 - after[onset]) * moments[without, block[onset]])
+        moment += sign * after[onset] * moments[without, block[onset] + 1]
+        inverse = inverse_energies[without, onset]
+        size[onset] = moment * inverse
+        deviation[onset] = math.sqrt(max(total[without] - moment * moment * inverse, 0.0) / n * inverse)
+    smallest, best_walk, best, gains = np.inf, 0, 0, np.empty(n_onsets)
+    for walk in range(n_walks):
+        scale, largest_gain = math.exp(2.0 / n * (largest_factor - log_factor[walk])), 0.0
+        for onset in range(n_onsets):
+            moment = (1.0 - after[onset]) * moments[walk, block[onset]] + after[onset] * moments[walk, block[onset] + 1]
+            moment = max(sign * moment, 0.0)  # a step down is not fitted
+            gains[onset] = moment * moment * inverse_energies[walk, onset]
+        least = MIN_RESIDUAL * total[walk]  # positive, since the logarithm is used
+        for onset in range(n_onsets):
+            largest_gain = max(largest_gain, gains[onset])
+            likelihood[onset] = min(likelihood[onset], scale * max(total[walk] - gains[onset], least))
+        least = max(total[walk] - largest_gain, least)
+        with_likelihoods[walk] = log_factor[walk] - half * math.log(least / n)
+        if scale * least < smallest:
+            smallest, best_walk = scale * least, walk
+            for onset in range(n_onsets):
+                if gains[onset] == largest_gain:
+                    best = onset
+                    break
+    for onset in range(n_onsets):
+        likelihood[onset] = largest_factor - half * math.log(likelihood[onset] / n)
+    # variances of the walk that the data alone, without the prior, allow: with or without a step
+    highest_without, highest_with, length = -np.inf, -np.inf, 0.0
+    for walk in range(n_walks):
+        highest_without = max(highest_without, without_likelihoods[walk] - walk_log_priors[walk])
+        highest_with = max(highest_with, with_likelihoods[walk] - walk_log_priors[walk])
+    for walk in range(n_walks):
+        below_without = highest_without - without_likelihoods[walk] + walk_log_priors[walk]
+        below_with = highest_with - with_likelihoods[walk] + walk_log_priors[walk]
+        if below_without < ALLOWED or below_with < ALLOWED:
+            length = max(length, lengths[walk])
+    noise = smallest / math.exp(2.0 / n * (largest_factor - log_factor[best_walk])) / n
+    moment = (1.0 - after[best]) * moments[best_walk, block[best]] + after[best] * moments[best_walk, block[best] + 1]
+    inverse = inverse_energies[best_walk, best]
+    numbers[0], numbers[1] = 2.0 * (likelihood[best] - without_likelihoods[without]), best
+    numbers[2], numbers[3] = sign * moment * inverse, math.sqrt(noise * inverse)
+    numbers[4], numbers[5] = total[without] / n, noise
+    numbers[6], numbers[7], numbers[8] = WALKS[without], WALKS[best_walk], length
