@@ -99,6 +99,8 @@ SPEED_QUANTILE = 0.999
 LOWERING_MARGIN = MIN_REST + 2.0 * AVERAGING_TIME
 #: Number of samples whose increments are computed together, so that they stay in the processor's cache.
 BATCH_SAMPLES = 8192
+#: Samples by channel, and the index of the first one, counted from the beginning of a stream.
+Piece = tuple[dict[str, Array], int]
 
 
 class BlockStream(SavedAttributes):
@@ -250,10 +252,11 @@ class BlockStream(SavedAttributes):
             limits = find_rest_limits(samples, self._rate, self._balances[0])
             self._rest_limits = _raise_limits(limits, self._rest_limits)
 
-    def _learn_flow(self, samples: Mapping[str, Array], first: int, end: int) -> None:
+    def _learn_flow(self, samples: Mapping[str, Array], first: int, end: int) -> Piece | None:
         """Add the blocks `first` to `end` - 1 to what is known of the pump's flow: its sign, and an open circuit.
 
-        A flow without a sign counts with one from the first blocks on that show the piston moving both ways.
+        A flow without a sign counts with one from the first blocks on that show the piston moving both ways. Returns
+        the samples of `_with_margins`, None if the sign of their flow no longer holds.
         """
         (balance,) = self._balances
         was_unsigned, feed_before = self.is_unsigned, self._feed_sums.find_feed(balance.area_ratio)
@@ -275,6 +278,7 @@ class BlockStream(SavedAttributes):
             self._used_balances = (feed_one_chamber(balance, feed),)
         feeds_as_before = not self._feeds_one_chamber or feed == feed_before
         self.n_meanings += self.is_unsigned != was_unsigned or not feeds_as_before
+        return None if was_unsigned or self.is_unsigned else (piece, begin)
 
     @property
     def is_unsigned(self) -> bool:
@@ -311,18 +315,20 @@ class BlockStream(SavedAttributes):
             self._learn_limits(group)
         elif not self.left_signs:
             self._learn_limits(group)
+        piece = None
         if self._flow_channel:
             signals = Signals(group, self._rate)
             limits = find_lowering_limits(self._balances[0].left(signals), signals)
             if np.isfinite(limits).all():  # not so for impossible readings
                 self._lowering_limits = self._lowering_limits.average_with(limits) if self._lowering_limits else limits
-            self._learn_flow(samples, first, end)
+            piece = self._learn_flow(samples, first, end)
         if self._on_samples is not None:
             for k in range(first * length, end * length, length):
                 block = slice(k - self._first, k - self._first + length)
                 self._on_samples(self._begin + k / self._rate, {name: samples[name][block] for name in samples})
         size = max(1, BATCH_SAMPLES // length)  # blocks in a batch, whose rows are computed together
-        batches = [self._compute_rows(samples, k, min(k + size, end)) for k in range(first, end, size)]
+        piece = piece if end - first <= size else None  # the samples of one batch are selected once
+        batches = [self._compute_rows(samples, k, min(k + size, end), piece) for k in range(first, end, size)]
         row_parts, *block_parts = zip(*batches, strict=True)
         weights, is_counted, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         root_weights = np.sqrt(weights[is_counted])[:, None]  # roots, since sums are over products of two entries
@@ -352,7 +358,7 @@ class BlockStream(SavedAttributes):
             zero=np.full(end - first, self._offset),
         )
 
-    def _with_margins(self, samples: Mapping[str, Array], first: int, end: int) -> tuple[dict[str, Array], int]:
+    def _with_margins(self, samples: Mapping[str, Array], first: int, end: int) -> Piece:
         """Select the samples on which the blocks `first` to `end` - 1 depend; also return the index of the first one.
 
         The test functions of the last rows extend beyond the last block, and speeds and rests beyond these.
@@ -366,11 +372,11 @@ class BlockStream(SavedAttributes):
         return piece, begin
 
     def _compute_rows(
-        self, samples: Mapping[str, Array], first: int, end: int
+        self, samples: Mapping[str, Array], first: int, end: int, piece: Piece | None
     ) -> tuple[list[Array], Array, NDArray[np.bool_], Array, Array]:
         """Compute the rows of each volume balance in the K blocks with the indices `first` to `end` - 1.
 
-        `samples`: arrays by channel name. Returns five items:
+        `samples`: arrays by channel name; `piece`: the result of `_with_margins`, if it is known. Returns five items:
 
         - for each balance an array (r, m) of its terms and left side, with one row for each test function;
         - weights (r,) of the rows: 1, a fraction next to a hole (a long gap), and 0 with a missing sample;
@@ -381,12 +387,12 @@ class BlockStream(SavedAttributes):
         """
         length = self._length
         start, stop = first * length, end * length + (SPAN - 1) * self._stride + 1
-        piece, begin = self._with_margins(samples, first, end)
-        signals = self._signals(piece)
+        channels, begin = piece or self._with_margins(samples, first, end)
+        signals = self._signals(channels)
         if self._feeds_one_chamber:
             circulates = flag_circulation(self._balances[0], signals, self._feed_sums.mean_flow)
             if circulates.any():
-                signals = self._signals(_without_flow(piece, circulates))
+                signals = self._signals(_without_flow(channels, circulates))
         without_margins = slice(start - begin, stop - 1 - begin)  # selects increments, one fewer than samples
         is_whole = np.ones((end - first) * self._strides_per_block, dtype=bool)
         lefts = [balance.left(signals) for balance in self._used_balances]
@@ -398,14 +404,16 @@ class BlockStream(SavedAttributes):
             rows.append(weak_rows.values)
         in_blocks = slice(start - begin, end * length - begin)
         # clipped pressures are used as recorded: they are closer to the true ones than the mean of the other samples
-        difference = piece[CLIPPED_DIFFERENCE] if CLIPPED_DIFFERENCE in piece else piece["p_A"] - piece["p_B"]
+        difference = (
+            channels[CLIPPED_DIFFERENCE] if CLIPPED_DIFFERENCE in channels else channels["p_A"] - channels["p_B"]
+        )
         pressure = difference[in_blocks].reshape(-1, length)
         flow = np.abs(lefts[0][in_blocks].reshape(-1, length)) * self._rate  # volume per interval times rate [m^3/s]
         is_known = np.isfinite(flow)
         mean_flow = np.where(is_known, flow, 0.0).sum(axis=1) / np.maximum(is_known.sum(axis=1), 1)
         pressures = np.array([sorted_part_means(block, self._rate) for block in pressure])
         hole_weights = (
-            weights_near_holes(piece[HOLE][start - begin : stop - begin], self._rate) if HOLE in piece else 1.0
+            weights_near_holes(channels[HOLE][start - begin : stop - begin], self._rate) if HOLE in channels else 1.0
         )
         row_weights = np.where(is_whole, hole_weights, 0.0)
         is_counted = row_weights > 0.0

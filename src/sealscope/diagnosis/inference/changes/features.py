@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -221,11 +221,16 @@ def _log_hum(blocks: Array, frequency: float) -> Array:
     length = blocks.shape[1] // 2
     halves = blocks[:, : 2 * length].reshape(-1, 2, length)
     halves = halves - halves.mean(axis=2, keepdims=True)
-    distances = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])  # [bins], from the line
-    cycles = np.outer(np.arange(length), frequency + distances / length)  # (samples, bins); bin 0 is the line
-    fourier = np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles)
-    log_power = np.log((np.abs(halves @ fourier) ** 2).mean(axis=1))
+    log_power = np.log((np.abs(halves @ _line_and_neighbours(length, frequency)) ** 2).mean(axis=1))
     return np.asarray(log_power[:, 0] - log_power[:, 1:].mean(axis=1))
+
+
+@lru_cache(maxsize=16)  # a stream asks for the same frequencies of the mains in each block
+def _line_and_neighbours(length: int, frequency: float) -> NDArray[np.complex128]:
+    """Compute the windowed Fourier factors (samples, bins) of a spectral line, bin 0, and of the bins beside it."""
+    distances = np.array([0.0, *_NEIGHBOURS, *np.negative(_NEIGHBOURS)])  # [bins], from the line
+    cycles = np.outer(np.arange(length), frequency + distances / length)
+    return np.asarray(np.hanning(length)[:, None] * np.exp(-2j * np.pi * cycles))
 
 
 def _row_statistic(statistic: Callable[..., Array], without_missing: Callable[..., Array], values: Array) -> Array:

@@ -231,7 +231,7 @@ def central_difference(values: Array, half_width: int) -> Array:
 
     It is not divided by the time. Beyond the ends the first and last values are repeated.
     """
-    padded = np.pad(values, half_width, mode="edge")
+    padded = np.concatenate([np.repeat(values[:1], half_width), values, np.repeat(values[-1:], half_width)])
     return np.asarray(padded[2 * half_width :] - padded[: -2 * half_width])
 
 
