@@ -10,7 +10,7 @@ import pytest
 
 from sealscope.diagnosis.live.explanation import UNKNOWN
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, BlockConductance, LiveBalance
+from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, BlockConductance, BlockResult, LiveBalance, NotJudged
 from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.live.step_null import WINDOW, StepNull
 from sealscope.diagnosis.live.watch import Watch
@@ -262,6 +262,31 @@ def test_a_live_balance_is_restored_at_any_instant():
         again = LiveBalance(RIG, names)
         again.load_state(json.loads(json.dumps(live.state(), allow_nan=False)))
         assert before + conductances(again, stop, len(WORN)) == whole
+
+
+@pytest.mark.slow
+def test_a_stream_recovers_by_itself_from_readings_of_faulty_sensors():
+    """Within half an hour of right ones, and whatever the messages: motion and noise of the fault had been learned."""
+    random, rate, names = np.random.default_rng(1), 16.0, ("p_A", "p_B", "theta", "x")
+    right = machine(2, duration=120.0, rate=rate)
+    readings = np.stack([right[name] for name in names])
+    wild = random.standard_normal((4, 1600)) * 10.0 ** random.uniform(-3.0, 8.0, (4, 1600))
+    samples = np.concatenate([wild, np.tile(readings, (1, 17))], axis=1)
+
+    def results(size: int) -> list[BlockResult]:
+        live, shown = LiveBalance(RIG, names), list[BlockResult]()
+        for first in range(0, samples.shape[1], size):
+            channels = dict(zip(names, samples[:, first : first + size], strict=True))
+            t = np.arange(first, first + len(channels["x"])) / rate
+            shown.extend(live.take(SampleRun(t, channels, rate, follows=first > 0)))
+        return shown
+
+    with np.errstate(all="ignore"):
+        whole = results(samples.shape[1])
+        assert results(80) == whole
+    assert sum(block.is_outdated for block in whole if isinstance(block, NotJudged)) == 1
+    conductances = [block.g for blocks in whole if isinstance(blocks, list) for block in blocks]
+    assert np.mean(conductances[-40:]) == pytest.approx(2.4e-13, rel=0.2)  # what the pump passes
 
 
 def test_first_blocks_that_cannot_be_estimated_are_counted():

@@ -1,5 +1,6 @@
 /* Feed hostile samples to the estimator: lost, infinite, huge, stuck, zero, with jumps of the clock and power cuts. Then
-   restore what healthy recordings showed, feed samples from standard input, and print the results of each block. */
+   restore what healthy recordings showed, or acknowledge the alarm only, feed samples from standard input, and print the
+   results of each block. Arguments: number of hostile samples, and 1 to restore. */
 #include "leak.h"
 
 #include <math.h>
@@ -91,8 +92,12 @@ int main(int argc, char **argv)
             leak_results(&state);
         }
     }
-    if (!leak_restore(&state, commissioned)) {
-        return 4;
+    if ((argc > 2) && (atol(argv[2]) == 1L)) {
+        if (!leak_restore(&state, commissioned)) {
+            return 4;
+        }
+    } else {
+        leak_acknowledge(&state);
     }
     blocks = state.n_ended;
     while (fgets(line, (int)sizeof(line), stdin) != NULL) {

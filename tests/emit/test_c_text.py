@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import shutil
 import subprocess
@@ -14,7 +15,9 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.live.coefficients import OUTDATED_BLOCKS
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
+from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LEARNED
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.single_precision import learn_basis
@@ -86,8 +89,8 @@ def test_rules_of_misra_hold_but_for_a_few(precision, tmp_path):
     assert not [line for line in done.stderr.splitlines() if re.search(r": (error|warning):", line)]
 
 
-def hostile_results(folder, precision, n, samples):
-    """Results after n hostile samples and a restore, under the sanitizer of undefined behaviour."""
+def hostile_results(folder, precision, n, samples, restores=True):
+    """Results after n hostile samples, with or without a restore, under the sanitizer of undefined behaviour."""
     unit = write(folder, precision)
     source = Path(__file__).with_name("hostile_samples.c")
     parts, rate = parts_a_sample(unit.settings), unit.settings.rate
@@ -96,7 +99,7 @@ def hostile_results(folder, precision, n, samples):
     words = ["gcc", "-std=c99", "-O1", "-ffp-contract=off", *sanitizers, *defines, str(source), "leak.c", "-lm"]
     subprocess.run([*words, "-o", "hostile"], cwd=folder, check=True)
     text = "".join(",".join(map(repr, reading)) + "\n" for reading in samples.tolist())
-    words = [str(folder / "hostile"), str(n)]
+    words = [str(folder / "hostile"), str(n), str(int(restores))]
     done = subprocess.run(words, input=text, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[-2000:]
     return np.array([[float(value) for value in line.split(",")] for line in done.stdout.splitlines()])
@@ -112,3 +115,18 @@ def test_hostile_samples_lead_nowhere_and_what_was_learned_is_restored(precision
     assert np.array_equal(results, hostile_results(tmp_path, precision, 0, samples))
     q, low, high = (RESULTS.index(name) for name in ("q", "q_low", "q_high"))
     assert 0.0 < results[-1, low] < results[-1, q] < results[-1, high] and not results[:, RESULTS.index("alarm")].any()
+
+
+@pytest.mark.skipif(not shutil.which("gcc"), reason="gcc has the sanitizers")
+@pytest.mark.parametrize("precision", ["double", "single"])
+@pytest.mark.parametrize("n", [30_000, 1_000_000])
+def test_the_state_recovers_by_itself_from_hostile_samples(precision, n, tmp_path):
+    """Within `OUTDATED_BLOCKS`, and the first fit after them, its interval holds what it stated before."""
+    samples = programs()[1]
+    expected = hostile_results(tmp_path, precision, 0, samples)[-1]
+    n_blocks = OUTDATED_BLOCKS + 3 * LEARNED
+    repeated = np.tile(samples, (math.ceil(n_blocks * BLOCK_SECONDS * 100.0 / len(samples)), 1))
+    results = hostile_results(tmp_path, precision, n, repeated, restores=False)[-1]
+    q, low, high = (RESULTS.index(name) for name in ("q", "q_low", "q_high"))
+    assert results[RESULTS.index("reason")] == 0.0
+    assert results[low] < expected[q] < results[high] < 5.0 * expected[q]

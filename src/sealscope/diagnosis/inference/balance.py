@@ -149,7 +149,6 @@ class BlockStream(SavedAttributes):
         self._on_samples, self._flow_channel, self._feeds_one_chamber = on_samples, flow_channel, feeds_one_chamber
         self.columns = tuple(ColumnRoles(balance) for balance in balances)
         self._balances, self._rate, self._offset = balances, rate, offset
-        self._used_balances = tuple(balances)  # adapted to an open circuit, if it is one
         self._stride = stride_samples(rate)
         self._strides_per_block = strides_in(block_s, rate)
         self._length = self._strides_per_block * self._stride  # samples in a block
@@ -164,16 +163,22 @@ class BlockStream(SavedAttributes):
             self._margin += math.ceil(LOWERING_MARGIN * rate)
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
+        self._n_first, self.n_meanings = n_first, 0
+        self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
+        self.forget()
+        self.left_signs = left_signs  # sign of each balance's left side, known after the first motion
+        self.restart(start)
+
+    def forget(self) -> None:
+        """Forget what the blocks so far have told of the machine; their weights, too, do not affect later blocks."""
+        self._used_balances = tuple(self._balances)  # adapted to an open circuit, if it is one
         self._rest_limits: RestLimits | None = None  # known after the first motion
         self._lowering_limits: LoweringLimits | None = None  # of all blocks so far
-        self._sign_evidence = SignEvidence(balances, self.columns)
-        self._feed_sums, self.n_meanings = FeedSums(), 0
+        self._sign_evidence = SignEvidence(self._balances, self.columns)
+        self._feed_sums, self.left_signs = FeedSums(), ()
         self._flow_range = (0.0, 0.0)  # lowest and highest value of the flow's channel
-        self._weighting, self._n_first = Weighting(self.columns), n_first
+        self._weighting = Weighting(self.columns)
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
-        self.left_signs = left_signs  # sign of each balance's left side, known after the first motion
-        self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
-        self.restart(start)
 
     def restart(self, begin: float) -> None:
         """Restart the stream after a gap, at the time `begin` [s] of the next sample, and drop an incomplete block.
@@ -202,13 +207,14 @@ class BlockStream(SavedAttributes):
         n_complete = max(0, (self._end - tail) // self._length)
         is_waiting = not (last or self._weighting.has_blocks)  # until the first `n_first` blocks are complete
         min_blocks = (self._n_first or 1) if is_waiting else 1
-        if n_complete <= self._n_closed or n_complete < min_blocks:
+        if n_complete < self._n_closed + min_blocks:
             return None
         joined = self._join_pieces()
         # groups of blocks whose rows are weighted together, by the index past their last block
         group_ends = [n_complete]
         if self._n_first is not None:  # the first blocks in one group, later ones one by one
-            first_end = self._n_closed + 1 if self._weighting.has_blocks else min(self._n_first, n_complete)
+            n_together = 1 if self._weighting.has_blocks else self._n_first
+            first_end = min(self._n_closed + n_together, n_complete)
             group_ends = list(range(first_end, n_complete + 1))
         groups = zip([self._n_closed, *group_ends[:-1]], group_ends, strict=True)
         blocks = Blocks.join([self._build_blocks(joined, first, end) for first, end in groups])

@@ -27,6 +27,13 @@ from sealscope.diagnosis.priors.live import LIVE
 #: Standard deviations beyond which a residual is a glitch or a step; fraction of the usual motion at a standstill.
 JUMP: float = LIVE.coefficients.jump
 STANDSTILL: float = LIVE.block.standstill
+#: Successive blocks at a standstill, or far closer to the fit than usual, after which all is learned anew: what was
+#: learned has faded by `STANDSTILL` then, and motion would be as never before.
+OUTDATED_BLOCKS = round(LIVE.coefficients.memory * -math.log(STANDSTILL))
+#: A block at standstill counts if its precision is over this fraction of the usual precision. After `N_WAKING`
+#: successive blocks that move far more than usual, the machine is taken to have stood still before.
+MIN_REST_PRECISION: float = LIVE.block.tells
+N_WAKING: int = LIVE.block.wakes
 #: Factor per block by which the weight of earlier blocks decays, and the same for the shift of the series.
 _MEMORY: float = math.exp(-1.0 / LIVE.coefficients.memory)
 _SHIFT_DECAY: float = math.exp(-1.0 / LIVE.coefficients.returns)
@@ -240,3 +247,35 @@ def relative_motion(square: float, rows: float, numbers: Any) -> float:
     """
     usual_square = numbers[MOTION] * rows
     return square * numbers[ROWS] / usual_square if usual_square > 0.0 else (math.inf if square > 0.0 else 1.0)
+
+
+#: Results of `judge_estimate`: the estimate counts; it is too uncertain; what was learned is not that of the machine.
+COUNTS, UNCERTAIN, OUTDATED = range(3)
+
+
+@law
+def is_waking(m: Any, motion: float) -> bool:
+    """Count a block by its relative `motion`, and return True after `N_WAKING` successive ones that move far more.
+
+    If the usual blocks stood still and this one moves, its relative motion is above 1/`STANDSTILL`. `m` has the fields
+    `n_moving`, and for `judge_estimate` `n_still` and `usual_precision`.
+    """
+    m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
+    return bool(m.n_moving >= N_WAKING)
+
+
+@law
+def judge_estimate(m: Any, motion: float, misfit: float, results: float, precision: float, min_precision: float) -> int:
+    """Decide whether the estimate of a block counts: `COUNTS`, `UNCERTAIN` or `OUTDATED`.
+
+    At standstill, i.e. with a relative `motion` below `STANDSTILL`, the precision must be above `MIN_REST_PRECISION`
+    times the usual one, otherwise above `min_precision`; it must not be NaN. What was learned is outdated if `results`,
+    a sum of all numbers, is not finite, or after `OUTDATED_BLOCKS` successive blocks at standstill or with a `misfit`
+    below `STANDSTILL`: readings of a faulty sensor may have been learned, beside which any motion is none.
+    """
+    is_still = motion < STANDSTILL
+    m.n_still = m.n_still + 1 if is_still or misfit < STANDSTILL else 0
+    if not math.isfinite(results) or m.n_still >= OUTDATED_BLOCKS:
+        return OUTDATED
+    least = max(min_precision, MIN_REST_PRECISION * m.usual_precision) if is_still else min_precision
+    return COUNTS if precision > least else UNCERTAIN

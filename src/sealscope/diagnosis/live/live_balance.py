@@ -27,13 +27,20 @@ from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import NEGLIGIBLE
 from sealscope.diagnosis.inference.rows.weak_form import stride_samples
 from sealscope.diagnosis.live.coefficients import (
+    MIN_REST_PRECISION,
+    MISFIT,
+    NOISE,
+    OUTDATED,
     STANDSTILL,
     TINY,
+    UNCERTAIN,
     Coefficients,
     add_block,
     coefficient_shapes,
     estimate_leak,
     fit_coefficients,
+    is_waking,
+    judge_estimate,
     load_block,
     relative_motion,
 )
@@ -61,10 +68,8 @@ _PRIORS = LIVE.block
 #: Approximate duration of a block [s], and blocks before the first estimate.
 BLOCK_SECONDS: float = _PRIORS.seconds
 LEARNED: int = _PRIORS.learned
-#: A block at standstill counts if its precision is over this fraction of the usual precision. After `N_WAKING`
-#: successive blocks that move far more than usual, the machine is taken to have stood still before.
-MIN_REST_PRECISION: float = _PRIORS.tells
-N_WAKING: int = _PRIORS.wakes
+#: What `is_waking` and `judge_estimate` count; the precision of a usual block's conductance is 0 before the first fit.
+_JUDGED = np.dtype([("usual_precision", "f8"), ("n_moving", "i8"), ("n_still", "i8")])
 
 
 class BlockConductance(NamedTuple):
@@ -99,6 +104,7 @@ class NotJudged(NamedTuple):
     status: str  # the reason in words; "" for samples before the first block
     counter: str = ""  # name of the counter to increase by one, "" for none
     restarts: bool = False  # True if later blocks cannot be compared with earlier ones
+    is_outdated: bool = False  # True if nothing that was learned holds
 
     @classmethod
     def with_count(cls, end: float, status: str, restarts: bool = False) -> NotJudged:
@@ -132,6 +138,20 @@ def _estimate_leak(
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
 
 
+@kernel
+def _is_waking(judged: Any, motion: float) -> bool:
+    """Count a block by its relative `motion`, by `is_waking`; `judged` (1,) is a record."""
+    return is_waking(judged[0], motion)  # type: ignore[no-any-return]
+
+
+@kernel
+def _judge_estimate(
+    judged: Any, motion: float, misfit: float, results: float, precision: float, min_precision: float
+) -> int:
+    """Decide whether an estimate counts, by `judge_estimate`; `judged` (1,) is a record."""
+    return judge_estimate(judged[0], motion, misfit, results, precision, min_precision)  # type: ignore[no-any-return]
+
+
 class LiveBalance(SavedAttributes):
     """Estimate the leakage conductance of a running machine block by block, from the balance of volumes.
 
@@ -142,7 +162,7 @@ class LiveBalance(SavedAttributes):
 
     data = VOLUMES
     block_seconds = BLOCK_SECONDS
-    SAVED = ("_precision", "_moving", "_waiting", "_n_meanings", "_rate", "_signals")
+    SAVED = ("_judged", "_waiting", "_n_meanings", "_rate", "_signals")
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self._balances = live_equations(rig, names, with_tested_terms=True)
@@ -166,8 +186,7 @@ class LiveBalance(SavedAttributes):
             nuisance = [k for k in roles.nuisance if k not in (roles.leak, *pump_columns)]
             self._column_orders.append(np.array([*nuisance, roles.leak, roles.left]))
             self._models.append(Coefficients(*map(np.zeros, coefficient_shapes(len(nuisance)))))
-        self._precision = 0.0  # precision of a usual block's conductance; 0 before the coefficients are learned
-        self._moving = 0  # number of successive blocks that move far more than the usual ones
+        self._judged = np.zeros(1, _JUDGED)
         self._stored: Blocks | None = None  # the last blocks, packed
         self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
         self._circuit, self._n_meanings, self._is_unsigned = rig.circuit, 0, False
@@ -200,7 +219,11 @@ class LiveBalance(SavedAttributes):
                     new_stream.load_state(stream.state())
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
-        yield from self._take_blocks(stream.push({name: run.channels[name] for name in self.names}))
+        # the samples complete at most one block at a time, as one may change what the next is compared with
+        size = math.ceil(0.5 * BLOCK_SECONDS * self._rate)
+        for first in range(0, len(run.t), size):
+            piece = {name: run.channels[name][first : first + size] for name in self.names}
+            yield from self._take_blocks(stream.push(piece))
 
     def _make_stream(self) -> BlockStream:
         """Build the object that divides samples at the present rate into blocks, and stores the samples of each."""
@@ -231,10 +254,9 @@ class LiveBalance(SavedAttributes):
         """Estimate the leakage conductance in a block, or store the block until the coefficients can be fitted.
 
         Learning begins with the first block that moves: `LEARNED` - 1 blocks give a `NotJudged`, and the next one the
-        conductances of all `LEARNED`. After `N_WAKING` successive blocks that move far more than usual, learning begins
-        again; so it does when the terms or the sign of the flow change their meaning. The last `WINDOW` blocks with at
-        least one complete equation are stored. `n_meanings`: `BlockStream.n_meanings` of the block; `is_complete`: no
-        sample is missing.
+        conductances of all `LEARNED`. Learning begins again when a machine wakes that stood still before, or when the
+        terms or the sign of the flow change their meaning. The last `WINDOW` blocks with at least one complete equation
+        are stored. `n_meanings`: `BlockStream.n_meanings` of the block; `is_complete`: no sample is missing.
         """
         _, end = self._sample_times(block)
         if n_meanings != self._n_meanings:
@@ -247,10 +269,8 @@ class LiveBalance(SavedAttributes):
             return NotJudged.with_count(end, "at standstill" if is_complete else "missing values")
         packed = block.pack()
         self._stored = packed if self._stored is None else Blocks.join([self._stored, packed])[-WINDOW:]
-        if self._precision > 0.0:  # the coefficients are known
-            # if the usual blocks stood still and this one moves, its relative motion is above 1/STANDSTILL
-            self._moving = self._moving + 1 if self._relative_motion(block) > 1.0 / STANDSTILL else 0
-            if self._moving >= N_WAKING:
+        if self._judged["usual_precision"][0] > 0.0:  # the coefficients are known
+            if _is_waking(self._judged, self._relative_motion(block)):
                 self.relearn()
                 return NotJudged(end, "learning", counter="blocks: moves as never before", restarts=True)
             estimate = self._estimate_block(block)
@@ -274,7 +294,7 @@ class LiveBalance(SavedAttributes):
         precisions = np.array([self._solve_block(block, updates_model=False)[0] for block in _split(blocks)])
         if self._has_own_leakage:  # only rests under load tell of the leak
             precisions = precisions[precisions > NEGLIGIBLE * precisions.max(initial=0.0)]
-        self._precision = float(np.median(precisions)) if precisions.size else 0.0  # of a usual block
+        self._judged["usual_precision"] = np.median(precisions) if precisions.size else 0.0
         estimates = (self._estimate_block(block, updates_model=False) for block in _split(blocks))
         return [estimate for estimate in estimates if not isinstance(estimate, NotJudged)]
 
@@ -323,16 +343,27 @@ class LiveBalance(SavedAttributes):
         return tuple(sum(values) for values in zip(*results, strict=True))
 
     def _estimate_block(self, block: Blocks, updates_model: bool = True) -> BlockConductance | NotJudged:
-        """Estimate the leakage conductance in a block; a `NotJudged` if the estimate is too uncertain at standstill.
+        """Estimate the leakage conductance in a block; a `NotJudged` if the estimate does not count (`judge_estimate`).
 
-        In motion, too, the precision must be above 0 and not NaN. With `updates_model`, the block updates the other
-        coefficients.
+        With `updates_model`, the block updates the other coefficients. If what was learned is outdated, all is learned
+        anew, from the samples after the block on.
         """
         begin, end = self._sample_times(block)
-        at_standstill = self._relative_motion(block) < STANDSTILL
-        precision, weighted_total, weighted_shift, weighted_variance = self._solve_block(block, updates_model)
-        min_precision = MIN_REST_PRECISION * self._precision if at_standstill or self._has_own_leakage else 0.0
-        if not precision > min_precision:
+        motion = self._relative_motion(block)
+        results = self._solve_block(block, updates_model)
+        precision, weighted_total, weighted_shift, weighted_variance = results
+        noise = sum(float(model.numbers[NOISE]) for model in self._models)
+        misfit = float(self._models[0].numbers[MISFIT]) if updates_model else 1.0
+        needs_rest = self._has_own_leakage
+        usual_precision = float(self._judged["usual_precision"][0])
+        min_precision = MIN_REST_PRECISION * usual_precision if needs_rest else 0.0
+        judgement = _judge_estimate(self._judged, motion, misfit, sum(results) + noise, precision, min_precision)
+        if judgement == OUTDATED:
+            self._learn_anew()
+            counter = "blocks: what was learned was not the machine's"
+            return NotJudged(end, "learning", counter=counter, restarts=True, is_outdated=True)
+        if judgement == UNCERTAIN:
+            at_standstill = motion < STANDSTILL or not needs_rest
             return NotJudged.with_count(end, "at standstill" if at_standstill else "without a rest under load")
         total = weighted_total / precision
         return BlockConductance(
@@ -354,8 +385,15 @@ class LiveBalance(SavedAttributes):
         for model in self._models:
             for values in model:
                 values[:] = 0.0
-        self._precision, self._moving = 0.0, 0
+        self._judged[:] = np.zeros(1, _JUDGED)
         self._waiting = 0 if self._stored is None else int(np.count_nonzero(self._stored.start >= since))
+
+    def _learn_anew(self) -> None:
+        """Drop all that the samples so far have told of the machine."""
+        self._stored, self._signals = None, SignalWindow()
+        self.relearn()
+        if self._stream is not None:
+            self._stream.forget()
 
     def observables(self, since: float, end: float, onset: float) -> tuple[Observable, ...] | None:
         """Test terms of the volume balance and signals of the last blocks, from `since` to `end` [s], for changes.

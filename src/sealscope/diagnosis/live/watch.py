@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 #: Name of the watch as a detector (`Evidence.detector`).
 WATCH = "watch"
 #: Version of the format of the saved state.
-STATE_VERSION = 26
+STATE_VERSION = 27
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])
@@ -318,6 +318,8 @@ class Watch:
         self.blocks += 1
         self._unjudged = self._unjudged + 1 if isinstance(result, NotJudged) else 0
         if isinstance(result, NotJudged):
+            if result.is_outdated:
+                self._detector = StepDetector()
             if result.restarts:
                 self._forget()
             if result.counter:

@@ -61,12 +61,15 @@ from sealscope.diagnosis.inference.rows.weak_form import (
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
     NOISE,
-    STANDSTILL,
+    OUTDATED,
+    UNCERTAIN,
     Coefficients,
     add_block,
     coefficient_shapes,
     estimate_leak,
     fit_coefficients,
+    is_waking,
+    judge_estimate,
     load_block,
     relative_motion,
 )
@@ -74,8 +77,6 @@ from sealscope.diagnosis.live.kernel import step
 from sealscope.diagnosis.live.live_balance import (
     BLOCK_SECONDS,
     LEARNED,
-    MIN_REST_PRECISION,
-    N_WAKING,
     live_equations,
     size_error,
 )
@@ -128,16 +129,18 @@ REASONS = MappingProxyType(
         2: "at standstill",
         3: "missing values",
         4: "the cycle calls `step` too rarely: a block was dropped",
+        5: "learning anew: what was learned is not that of the machine",
     }
 )
-_LEARNING, _STANDSTILL, _MISSING, _OVERRUN = 1, 2, 3, 4
+_LEARNING, _STANDSTILL, _MISSING, _OVERRUN, _RELEARNING = 1, 2, 3, 4, 5
 _REAL_NUMBERS = (
     *("size_error", "leak_error", "displacement", "log_threshold", "angle_sign", "usual_precision", "leak_size"),
     *("leak_deviation", "leak_onset", "block_end"),
 )
 _WHOLE_NUMBERS = (
     # samples so far, less whole periods; blocks: ended, weighted, open, being worked on, that wait for the first fit,
-    # successive ones of larger motion, estimated, of these taken by the detector, dropped
+    # successive ones of larger motion and of none, estimated, of these taken by the detector, dropped; and how often
+    # all was learned anew
     *(
         "sample_count",
         "n_ended",
@@ -146,9 +149,11 @@ _WHOLE_NUMBERS = (
         "n_closed",
         "n_waiting",
         "n_moving",
+        "n_still",
         "n_estimated",
         "n_tested",
         "n_dropped",
+        "n_relearned",
     ),
     # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, iterations
     *("n_rows", "n_closed_rows", "phase", "place", "iteration", "has_converged", "is_fitting", "halvings"),
@@ -380,8 +385,9 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         m.size_error, m.displacement, m.log_threshold = own_size_error, own_displacement, own_threshold
         m.leak_error, m.angle_sign = leak_error, 1.0
         m.usual_precision = m.leak_size = m.leak_deviation = m.leak_onset = m.block_end = 0.0
-        m.sample_count = m.n_ended = m.n_weighted = m.n_open = m.n_closed = m.n_waiting = m.n_moving = 0
-        m.n_estimated = m.n_tested = m.n_dropped = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = 0
+        m.sample_count = m.n_ended = m.n_weighted = m.n_open = m.n_closed = m.n_waiting = m.n_moving = m.n_still = 0
+        m.n_estimated = m.n_tested = m.n_dropped = m.n_relearned = m.n_rows = m.n_closed_rows = m.phase = m.place = 0
+        m.iteration = 0
         m.has_converged = m.is_fitting = m.halvings = m.alarm = m.first_closed = m.first_number = 0
         m.reason = _LEARNING
         m.slow_sums[:, :] = 0.0
@@ -577,26 +583,27 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     def append_conductance(m: Any, n_rows: float, pressure: float, number: float, is_learned: bool) -> None:
         """Estimate the leakage conductance of the block loaded in `m.model`, and append it to the history.
 
-        An estimate is left out if its precision (1/variance) is not positive or, at standstill, at most
-        `MIN_REST_PRECISION` times the usual one. `n_rows`, `pressure` [Pa], `number`: rows of the volume balance in the
-        block, its mean abs(p_A - p_B), and its number; `is_learned`: True if the balance's other coefficients are
-        updated with the block.
+        An estimate is left out if it is too uncertain. `n_rows`, `pressure` [Pa], `number`: rows of the volume balance
+        in the block, its mean abs(p_A - p_B), and its number; `is_learned`: True if the balance's other coefficients
+        are updated with the block.
         """
         model = m.model
         motion = relative_motion(model.volume[0], n_rows, model.numbers)
         # G and the shift are multiplied by the precision, the systematic variance of G by the square of the precision
         precision, weighted_G, weighted_shift, weighted_systematic = estimate_leak(model, n_rows, is_learned=is_learned)
-        if not math.isfinite(precision + weighted_G + weighted_systematic + model.numbers[NOISE]):
-            forget_coefficients(m)  # numbers have overflowed: all is learned anew
-            m.n_weighted = 0
+        results = precision + weighted_G + weighted_shift + weighted_systematic + model.numbers[NOISE]
+        misfit = model.numbers[MISFIT] if is_learned else 1.0
+        judgement = judge_estimate(m, motion, misfit, results, precision, 0.0)
+        if judgement == OUTDATED:
+            learn_anew(m)
             return
-        if not precision > (MIN_REST_PRECISION * m.usual_precision if motion < STANDSTILL else 0.0):
+        if judgement == UNCERTAIN:
             m.reason = _STANDSTILL
             return
         G, history, k = weighted_G / precision, m.history, int(m.n_estimated) % WINDOW
         comparable_G = G - weighted_shift / precision  # without jumps where the other coefficients improve
         history[k, _G], history[k, _COMPARABLE_G], history[k, _VARIANCE] = G, comparable_G, 1.0 / precision
-        history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision**2 + (m.size_error * G) ** 2
+        history[k, _SYSTEMATIC_VARIANCE] = weighted_systematic / precision / precision + (m.size_error * G) ** 2
         history[k, _PRESSURE], history[k, _HISTORY_NUMBER] = pressure, number
         m.n_estimated += 1
         m.reason = 0
@@ -640,17 +647,25 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         model.leak_products[:] = 0.0
         model.numbers[:] = 0.0
         m.usual_precision = 0.0
-        m.n_moving = m.n_estimated = m.n_tested = 0
+        m.n_moving = m.n_still = m.n_estimated = m.n_tested = 0
         m.reason = _LEARNING
         step.forget_onsets(m.steps)
+
+    @law
+    def learn_anew(m: Any) -> None:
+        """Discard all that was learned, and count it."""
+        forget_coefficients(m)
+        step.start_detector(m.steps)
+        m.n_weighted = 0
+        m.n_relearned += 1
+        m.reason = _RELEARNING
 
     @law
     def use_block(m: Any) -> None:
         """Estimate the leakage of the block at `place`, or store it until `LEARNED` blocks are fitted together.
 
-        Before the first fit, blocks are only stored, beginning with the first that has motion. After `N_WAKING`
-        successive blocks whose mean square motion is more than 1/`STANDSTILL` times that of earlier blocks, the machine
-        is taken to have stood still before: all estimates are discarded, and the first fit is repeated.
+        Before the first fit, blocks are only stored, beginning with the first that has motion. If the machine is taken
+        to have stood still before (`is_waking`), all estimates are discarded, and the first fit is repeated.
         """
         b = int(m.place)
         n_rows = m.closed_ends[b] - (m.closed_ends[max(b - 1, 0)] if b > 0 else 0.0)
@@ -662,9 +677,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             return
         motion_square = m.gram[volume, volume]
         if m.usual_precision > 0.0:  # after the first fit
-            motion = relative_motion(motion_square, n_rows, m.model.numbers)
-            m.n_moving = m.n_moving + 1 if motion > 1.0 / STANDSTILL else 0
-            if m.n_moving >= N_WAKING:
+            if is_waking(m, relative_motion(motion_square, n_rows, m.model.numbers)):
                 forget_coefficients(m)
                 return
             load_block(m.model, m.gram, all_columns)
@@ -806,7 +819,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     @law
     def resume(m: Any) -> None:
         """Begin with samples anew, after a power cut, with what was learned before."""
-        m.sample_count = m.n_ended = m.n_open = m.n_closed = m.n_waiting = m.n_moving = m.n_estimated = 0
+        m.sample_count = m.n_ended = m.n_open = m.n_closed = m.n_waiting = m.n_moving = m.n_still = m.n_estimated = 0
         m.n_tested = m.n_rows = m.n_closed_rows = m.phase = m.place = m.iteration = m.has_converged = m.is_fitting = 0
         m.block_end = m.leak_onset = 0.0
         m.reason = 0 if m.usual_precision > 0.0 else _LEARNING
