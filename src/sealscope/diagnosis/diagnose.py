@@ -163,7 +163,8 @@ def diagnose(
     Four methods are asked in this order: the balance of volumes, the response of the pressures, plug-ins, and the
     change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict; the change of
     RMS gives it only if the channels allow neither of the first two. The results of plug-ins and of the change of RMS
-    are always stated in addition.
+    are always stated in addition. If a load is held nearly all the time, a hold test states the total leakage and the
+    reason; the verdict, on the piston alone, stays that of the methods.
 
     Parameters
     ----------

@@ -118,8 +118,9 @@ def judge_held_recording(
 ) -> tuple[HoldResult, ...]:
     """Judge a recording of a held load, or return no result if it is none.
 
-    It is one if its pump and command rest and its position is held for the fraction `part.share` (`priors.toml`) of its
-    duration or longer. `areas` [m^2]: of the sides A and B; `limit`: as of `hold_test`.
+    It is one if it has a position in units of length, its pump and command rest, and `hold_test` finds holds in it that
+    last for the fraction `part.share` (`priors.toml`) of its duration or longer. `areas` [m^2]: of the sides A and B;
+    `limit`: as of `hold_test`. A limit or areas that `hold_test` refuses also give no result.
     """
     if "x" not in recording or recording.units["x"] == COUNTS or not _is_pump_at_rest(recording):
         return ()

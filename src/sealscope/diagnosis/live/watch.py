@@ -450,8 +450,9 @@ class Watch:
     def _explain(self, rise: LiveRise, block: BlockConductance) -> RiseExplanation:
         """Find the cause of the increase `rise` of the conductance, from changes of other quantities up to `block`.
 
-        The result is `UNKNOWN` if too few blocks have followed the onset, or if the machine had started shortly before
-        it; a start restarts the tests. If the blocks around the onset are no longer stored, the rise counts as a leak.
+        The result is `UNKNOWN` if too few blocks have followed the onset, or if the onset lies shortly after the tests
+        last restarted (at a start of the machine, after a pause, at a change of duty); such a rise is counted as one of
+        a start, and the tests restart. If the blocks around the onset are no longer stored, the rise counts as a leak.
         If other events explain the rise and enough blocks have followed, the tests restart and the estimator learns
         anew.
         """

@@ -288,7 +288,11 @@ def _group_scales(scales: Sequence[float | None]) -> tuple[list[int], list[float
 
 
 def _sort_by_time(readings: Sequence[LeakReading], every: float | None) -> list[LeakReading]:
-    """Sort readings by time, with the start times that follow from `every`; raise InputError if a time is unknown."""
+    """Sort readings by time.
+
+    `every` [s] replaces all start times, known ones too, by 0, `every`, 2 `every` and so on in the order of the names.
+    Raises InputError if a time is unknown.
+    """
     ordered = sorted(readings, key=lambda reading: numeric_sort_key(reading.file))
     if every is not None:
         ordered = [replace(reading, start=k * every) for k, reading in enumerate(ordered)]

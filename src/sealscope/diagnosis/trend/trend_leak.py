@@ -128,9 +128,11 @@ def _total_leakage(total: Interval, size_deviation: float, pressure: float) -> T
 def _report_ringing(before: Sequence[TrendPoint], wear: Wear, chance: float) -> Observed:
     """Report the decrease of the pressures' ringing (RMS of their wavelet details) since the last repair.
 
-    `chance` is the probability of such a decrease in a healthy machine; `before` are the recordings before its onset.
+    `wear.leak` is -100 times the change of the log RMS; `chance` is the probability of such a decrease in a healthy
+    machine; `before` are the recordings before its onset. A decrease without an onset is reported as a change, but not
+    as one of the ringing: nothing tells which recordings are healthy.
     """
-    size = -wear.leak.value / 100.0  # change of the log RMS; the leak is in %
+    size = -wear.leak.value / 100.0  # change of the log RMS
     # a score is twice the logarithm of a likelihood ratio, here of 1 / chance
     fall = Observable(name="fall of the ringing", data=DETAILS, score=-2.0 * np.log(chance), chance=chance, size=size)
     ringing = Ringing(bound=np.inf, rate=0.0, healthy=len(before), is_dated=True)  # at rate 0 no bound is stated

@@ -76,8 +76,9 @@ def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
     """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
 
     `rate`: sampling rate [Hz]. The speed is the difference of x or theta over a fixed time, or else omega or u itself;
-    the acceleration is the difference of the speed over that time; the position is relative to its mean. Missing values
-    are NaN. Return None if none of these channels is recorded.
+    the acceleration is the difference of the speed over that time. Neither is divided by the time, as only the space
+    of the columns matters to a fit. The position is relative to its mean. Missing values are NaN. Return None if none
+    of these channels is recorded.
     """
     name = find_motion_channel(channels)
     if name is None:

@@ -166,9 +166,10 @@ def _sum_products(rows: Any, weight: Any, edges: Any, products: Any) -> None:
 
 
 def sum_products(equations: Equations, weight: Array, edges: NDArray[np.intp]) -> Array:
-    """Sum the products of the m columns of weighted equations with each other over p parts of the rows, (p, m, m).
+    """Sum w_i^2 x_i x_i' over p parts of the rows x_i (m,) of the equations; shape (p, m, m).
 
-    `weight` (n,): factors of the rows; `edges` (p + 1,): index of the first row of each part, and past the last row.
+    `weight` (n,): factors w_i of the rows; `edges` (p + 1,): index of the first row of each part, and past the last
+    row.
     """
     size = equations.n_columns
     products = np.empty((len(edges) - 1, size, size))

@@ -65,7 +65,11 @@ def recognise_circuit(rig: Rig, recordings: Sequence[Recording]) -> str | None:
 
 
 def _cylinder_signals(rig: Rig, recording: Recording) -> tuple[Equation, Signals] | None:
-    """Return the volume balance of a closed circuit and the signals of a recording; None if it cannot tell."""
+    """Return the volume balance of a cylinder in a closed circuit, and the signals of a recording for it.
+
+    The balance tells a closed circuit from an open one only where their flows differ: on a single rod whose two areas
+    are stated. It also needs a flow of the pump and two pressures in Pa. Return None otherwise.
+    """
     channels = frozenset(recording.channels)
     if not (rig.states("cylinder.A_A", "cylinder.A_B") and rig.cylinder.single_rod):
         return None

@@ -138,7 +138,9 @@ def subtract_reference(
 def marginal_difference(residual: Gaussian, tested: Sequence[int], nuisance: Sequence[int], prior: Array) -> Gaussian:
     """Compute the likelihood of the `tested` differences, with those of the columns `nuisance` (c,) integrated out.
 
-    `residual`, `nuisance`, `prior`: as `subtract_reference` returns them.
+    A difference is the coefficient of a column in the judged recording less that in the healthy ones. `residual`: their
+    likelihood in all columns; `prior` (c,): precisions of the nuisance differences about zero. All three arguments are
+    as `subtract_reference` returns them.
     """
     differences = residual.among(nuisance).with_prior(prior)
     return differences.integrate_out(residual.precision[np.ix_(tested, nuisance)], residual.among(tested))

@@ -33,9 +33,11 @@ def compare_laws(
 ) -> LawFit | None:
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
-    All balances are fitted together; a negative leak is fitted, too. Return None if a balance has no column of an
-    orifice, if the recording has no information on one of the two leaks, or if their columns, both with the sign of
-    p_A - p_B, are not positively correlated.
+    Both are fitted alone, with all other columns integrated out, in all balances together; the coefficient may be
+    negative. The result is the log of the likelihood ratio of the orifice to the laminar leak for one independent
+    residual, and the laminar coefficient that fits an orifice of coefficient 1. Return None if a balance has no column
+    of an orifice, if the recording has no information on one of the two leaks, or if their columns, both with the sign
+    of p_A - p_B, are not positively correlated.
     """
     if any(ORIFICE not in roles.names for roles in columns):
         return None

@@ -86,9 +86,11 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
     hardly changes the flow. The balance gets two terms at rest with unknown coefficients: a flow with the sign that
     `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B. `Signals.holding` flags all rests of the piston
-    here, since the flow of such a balance never counts as resting (`balance.find_rest_limits`).
+    here, since the flow of such a balance never counts as resting (`balance.find_rest_limits`). The terms of `equation`
+    must end with `LEAKS`.
     """
     left = equation.left
+    # as the openings change from rest to rest, both coefficients drift like the error of a sensor (`drift="bias"`)
     at_rest = (
         fitted_term(NULL_FLOW, "m^3/s", lambda s: s.holding(left) * null_sign(s) * s.dt, drift="bias"),
         conductance_term(

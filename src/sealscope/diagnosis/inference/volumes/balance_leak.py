@@ -231,9 +231,11 @@ class BalanceLeak(LeakMeasure):
         return np.hstack([self._fit_hold_laws(variant, probability) for probability, variant in variants])
 
     def _fit_hold_laws(self, chambers: HeldChambers, probability: float) -> Array:
-        """Compute the columns of `_hold_laws` for one piston area, with its `probability`.
+        """Compute for one piston area the leak by each law, (4, laws), as columns of `_hold_laws`.
 
-        The deviations include the uncertain starts of the holds (`HeldChambers.start_error`).
+        Rows: weights of the laws, which sum to the `probability` of the area; mean flow for a coefficient of 1; mean
+        flow [m^3/s] and its standard deviation, which includes the uncertain starts of the holds
+        (`HeldChambers.start_error`).
         """
         recording, rows = self.balance.recording, []
         best_log_weight = max(fit.log_weight for fit in chambers.law_fits)

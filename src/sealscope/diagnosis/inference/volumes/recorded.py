@@ -376,8 +376,9 @@ class RecordedBalance:
     def locked_log_odds(self, conductance: Interval) -> float | None:
         """Compute the log odds that valves are shut in holds, and not open; None without holds.
 
-        With open valves the leakage in holds would be the total leakage of pump and piston. This is measured just
-        before the holds, or else is `conductance` [m^3/(s Pa)], that of the whole recording with open valves.
+        With open valves the leakage in holds would be the total leakage of pump and piston. This is the sum of the
+        pump's leakage around the holds (`held_pump_leakage`) and the leak in them, or, if the former is unknown,
+        `conductance` [m^3/(s Pa)], that of the whole recording with open valves.
         """
         if self.chambers is None:
             return None

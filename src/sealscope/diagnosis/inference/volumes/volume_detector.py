@@ -289,8 +289,8 @@ class VolumeBalance:
                 return Observed(self.name, lack=f"finds the recording too short, {recording.duration:.3g} s")
             needed = f"; it needs {self.rig.circuit.needed_channels}" if has_position else ""
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration) + needed)
-        # without a flow (`balances.locked`), creep shows the leakage only if no loop controls the position: the command
-        # is recorded, or the load creeps in the healthy recordings as well
+        # a balance without a flow (`is_creep`) shows the leakage only if no loop controls the position: a meter,
+        # speed or command of the pump is recorded, or the load creeps in the healthy recordings as well
         is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
         if balance is None or (balance.is_creep and not is_held):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
@@ -329,7 +329,8 @@ class VolumeBalance:
             reason = "finds p_A and p_B too similar, or too few samples without gaps, to show a leak"
             return Observed(self.name, lack=reason)
         # a block with missing samples has fewer rows; but in a balance over cycles or holds (`without_position`) the
-        # number of rows also depends on the motion, and the whole recording counts as judged
+        # number of rows also depends on the motion, and the whole recording counts as judged; only a position gives the
+        # balance of the cylinder, or two balances, one a chamber
         has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks

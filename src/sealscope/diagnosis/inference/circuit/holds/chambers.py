@@ -580,10 +580,11 @@ class HeldChambers:
     def _weigh_hypotheses(self, leaks: Sequence[Sequence[UnitLeak]]) -> list[LeakHypothesis]:
         """Fit a leak past the piston and each of the other `leaks`, and compute their probabilities, in this order.
 
-        Each of `leaks` is one leak with the flows that it has under each possible choice of the sides' supplies. It may
-        grow from its onset on. The coefficient past the piston is that of the most probable law, converted to the
-        conductance of a laminar leak with the same mean flow in the holds; the others are means from the onset to the
-        end. The likelihood of a leak is a mean over its laws and growths, by their priors, each at its best onset.
+        Each of `leaks` is one leak, with its flow for a coefficient of 1 in each of the ways in which the two sides can
+        be supplied (shut, or held by a pump). It may grow from its onset on. The coefficient past the piston is that of
+        the most probable law, converted to the conductance of a laminar leak with the same mean flow in the holds; the
+        others are means from the onset to the end. The likelihood of a leak is a mean over its laws and growths, by
+        their priors, each at its best onset. Each hypothesis states the fraction of the recording after its onset.
         """
         best = max(self.law_fits, key=lambda fit: fit.log_weight)
         laminar = best.leak._replace(exponent=1.0, growth=0.0)
