@@ -39,7 +39,7 @@ numba.config._config_fname = ""
 numba.config.reload_config()
 _F = TypeVar("_F", bound=Callable[..., Any])
 #: Packages and modules with compiled code that is cached, or from which it takes constants (`units`) or the order of a
-#: record's fields (`parameters`). The code of `fmu` is compiled anew for each unit (`plain_code`).
+#: record's fields (`parameters`).
 _COMPILED_PACKAGES = (
     *("compiled.py", "numba_pipeline.py", "numba_private.py", "units.py", "units.toml", "parameters"),
     *("physics", "signals", "control", "simulation", "diagnosis", "monitor/sources/message_limits.py"),
@@ -288,22 +288,3 @@ def record_view(layout: Any) -> Callable[[Any], Any]:
         return numba.carray(cast_pointer(pointer), 1)[0]
 
     return record  # type: ignore[no-any-return]
-
-
-def plain_code(function: Callable[..., Any], *arguments: str) -> tuple[str, str]:
-    """Compile a function to LLVM code that needs no Python; return the code and the function's symbol.
-
-    `arguments`: type of each argument, "double*", "double" or "int64". The function must return an integer and allocate
-    nothing. C calls it as ``int symbol(int64_t *result, void **unused, arguments...)``.
-    """
-    numba_types = {"double*": numba.types.CPointer(numba.float64), "double": numba.float64, "int64": numba.int64}
-    signature = numba.int64(*(numba_types[argument] for argument in arguments))
-    dispatcher = numba.njit(signature, nogil=True, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)(
-        function
-    )
-    (compiled,) = dispatcher.overloads.values()
-    text = dispatcher.inspect_llvm(compiled.signature.args)
-    # remove numba's reference counting, which is not called and is specific to one processor
-    text = re.sub(r"^define linkonce_odr void @NRT_decref\(.*?^}\n", "", text, flags=re.MULTILINE | re.DOTALL)
-    text = re.sub(r"^declare .* @(NRT_MemInfo_call_dtor|llvm\.x86\.[\w.]+)\(.*\n", "", text, flags=re.MULTILINE)
-    return text, compiled.fndesc.llvm_func_name

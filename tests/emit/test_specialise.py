@@ -14,6 +14,7 @@ from sealscope.compiled import record_dtype
 from sealscope.emit.c99 import CText
 from sealscope.emit.specialise import specialise
 from sealscope.errors import InputError
+from sealscope.physics.lanes import select
 
 COMPILER = shutil.which("gcc") or shutil.which("cc")
 LAYOUT = np.dtype(
@@ -52,8 +53,30 @@ def halves(x, y):
     return x - y, -0.5 * y
 
 
+def turn(pair, angle):
+    """Return a pair, and a pair within a tuple."""
+    if angle > 0.0:
+        return (pair[1], -pair[0]), angle
+    return pair, 0.0
+
+
+def tuples(m, x, y):
+    """Use tuples that are assigned anew, nested and indexed by a loop."""
+    pair = x, y
+    if len(m.absent) > 0:
+        return m.missing
+    for k in range(3):
+        before = pair
+        pair, angle = turn(pair, y - k)
+        pair = select((angle > 1.0) | (x > y) & (y > 0.0), pair[0], before[1]), math.copysign(pair[1], before[0])
+    for k in range(2):
+        m.part.v[k] += pair[k]
+    return pair[0] + m.scale[1]
+
+
 def work(m, x, y):
     """Use each construct of the subset."""
+    m.a = tuples(m, x, y)
     rows, part = m.rows, m.part
     m.n += 1
     sort_row(rows[int(m.n) % 3])
@@ -71,6 +94,19 @@ def work(m, x, y):
         part.b /= 3.0
     is_odd = m.n % 2 == 1
     m.a = math.log1p(abs(m.a)) if is_odd and m.a > -math.inf else float(is_odd)
+
+
+class WithSettings:
+    """A record beside settings that kernels read as fields."""
+
+    def __init__(self, record, settings):
+        self.__dict__.update(settings, record=record)
+
+    def __getattr__(self, name):
+        return getattr(self.record, name)
+
+    def __setattr__(self, name, value):
+        setattr(self.record, name, value)
 
 
 def record_as_struct(program):
@@ -97,14 +133,15 @@ def compile_c(program, public, folder, *flags):
 
 @pytest.mark.skipif(COMPILER is None, reason="needs a C compiler")
 def test_a_program_in_c_equals_the_kernel_to_the_bit(tmp_path):
-    program = specialise(LAYOUT, {"work": (work, {"m": "state", "x": "real", "y": "real"})})
+    known = {"absent": (), "scale": (1.0, 0.25)}
+    program = specialise(LAYOUT, {"work": (work, {"m": "state", "x": "real", "y": "real"})}, known=known)
     library = compile_c(program, ["work"], tmp_path)
     state, memory = record_as_struct(program), np.zeros(1, LAYOUT).view(np.recarray)
-    random = np.random.default_rng(1)
+    random, kernel_state = np.random.default_rng(1), WithSettings(memory[0], known)
     for k in range(400):
         x, y = (float(v) for v in random.integers(-40, 41, 2) / 8.0)  # whose powers are exact in any order
         memory.rows[0, 0, 0] = state.rows[0] = random.standard_normal()
-        work(memory[0], x, y)
+        work(kernel_state, x, y)
         library.t_work(ctypes.byref(state), ctypes.c_double(x), ctypes.c_double(y))
         expected = [memory.n[0], memory.a[0], memory.part.b[0], *memory.rows.ravel(), *memory.part.v.ravel()]
         values = [state.n, state.a, state.part_b, *state.rows, *state.part_v]

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
+import zipfile
 from xml.etree import ElementTree
 
 import pytest
@@ -47,7 +49,7 @@ def test_every_parameter_that_a_law_takes_is_tunable_unless_it_is_absent(name):
 @pytest.mark.parametrize(("version", "tag"), [(2, "ScalarVariable"), (3, "Float64")])
 def test_references_and_names_are_unique_and_outputs_are_listed(version, tag):
     listed = tuple(variables(load_rig("thesis"), 1e-3))
-    root = ElementTree.fromstring(format_description(version, "eha", "token", "words", listed))
+    root = ElementTree.fromstring(format_description(version, "eha", "token", "words", listed, ["unit.c"]))
     held = list(root.iter(tag))
     assert len({v.get("name") for v in held}) == len(held)
     assert len({v.get("valueReference") for v in held}) == len(held)
@@ -83,6 +85,24 @@ def test_without_a_compiler_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with refusal("sealscope[fmu]"):
         find_compiler()
+
+
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_unit_of_sources_needs_no_compiler(tmp_path, monkeypatch, version):
+    def refuse():
+        raise AssertionError("no compiler is to be sought")
+
+    monkeypatch.setattr(build, "find_compiler", refuse)
+    monkeypatch.setattr(build, "fmi_headers", lambda: tmp_path)
+    build.write_fmu(tmp_path / "eha.fmu", fmi=version, step=1e-3, platforms=["source"])
+    with zipfile.ZipFile(tmp_path / "eha.fmu") as archive:
+        names = set(archive.namelist())
+        description = archive.read("modelDescription.xml" if version == 2 else "sources/buildDescription.xml").decode()
+        laws = archive.read("sources/rig.c").decode()
+    assert not any(name.startswith("binaries/") for name in names)
+    listed = re.findall(r'<(?:Source)?File name="(.*?)"/>', description)
+    assert {f"sources/{name}" for name in listed} == {name for name in names if name.endswith(".c")}
+    assert "void sealscope_advance(" in laws
 
 
 @pytest.mark.skipif(os.name != "posix", reason="the compilers are scripts of a shell")

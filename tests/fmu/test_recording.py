@@ -35,31 +35,28 @@ static void rates(const double *v, const double *in, const double *y, double *dy
     dy[4] = -dy[3];
     dy[5] = ((y[3] - y[4]) * area - 900.0 * y[5] - 120.0 * tanh(y[5] / 1e-3)) / mass;
 }
-int sealscope_start(int64_t *code, void **u, double *v, double *in, double x_0, double *y) {
-    (void)u, (void)v, (void)in;
+void sealscope_start(int64_t *code, const double *v, const double *in, double x_0, double *y) {
+    (void)v, (void)in;
     y[0] = y[1] = y[5] = 0.0;
     y[2] = x_0;
     y[3] = y[4] = 8e5;
     *code = 0;
-    return 0;
 }
-int sealscope_report(int64_t *code, void **u, double *v, double *in, double *y, double *out) {
-    (void)u, (void)v, (void)in;
+void sealscope_report(const double *v, const double *in, double *y, double *out) {
+    (void)v, (void)in;
     out[0] = y[3] / 1e5;
     out[1] = y[4] / 1e5;
     out[2] = y[2] * 1e3;
     out[3] = y[1] * 180.0 / 3.14159265358979323846;
     out[4] = 40.0;
     out[5] = 1.2e-6 * y[0] * 6e4;
-    *code = 0;
-    return 0;
 }
-int sealscope_advance(int64_t *code, void **u, double *v, double *in, double *slopes, double *y, double span,
-                      int64_t n) {
+void sealscope_advance(int64_t *code, const double *v, const double *in, const double *slopes, double *y,
+                       double span, int64_t n) {
     double h = span / (double)n, k[4][6], z[6];
     int64_t step;
     int m, s;
-    (void)u, (void)slopes;
+    (void)slopes;
     for (step = 0; step < n; step++) {
         rates(v, in, y, k[0]);
         for (s = 1; s < 4; s++) {
@@ -69,7 +66,6 @@ int sealscope_advance(int64_t *code, void **u, double *v, double *in, double *sl
         for (m = 0; m < 6; m++) y[m] += h / 6.0 * (k[0][m] + 2.0 * k[1][m] + 2.0 * k[2][m] + k[3][m]);
     }
     *code = in[0] > 9.5 ? 1 : 0;
-    return 0;
 }
 """
 CONFIG = """

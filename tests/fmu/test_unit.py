@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import math
 import shutil
 import subprocess
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -21,6 +23,7 @@ from sealscope.simulation.integrate import integrate_run
 pytestmark = pytest.mark.slow
 fmpy = pytest.importorskip("fmpy", reason="FMPy runs the units: pip install 'sealscope[fmu]'")
 
+COMPILER = shutil.which("gcc")
 STEPS = {"single-rod-eha": 1.25e-4}
 CHANNELS = ("p_A", "p_B", "x", "theta", "q_leak")
 
@@ -286,7 +289,7 @@ def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, f
         unit.step(k * span, span)
     place = fmpy.extract(str(path))
     (tmp_path / "master.c").write_text(MASTER)
-    headers = f"-I{place}/sources/headers"
+    headers = f"-I{place}/sources"
     subprocess.run(["gcc", headers, tmp_path / "master.c", "-ldl", "-o", tmp_path / "master"], check=True, timeout=60)
     references = [str(unit.references[name]) for name in (given, *outputs)]
     call = [tmp_path / "master", f"{place}/binaries/linux64/c.so", unit.description.guid, *references]
@@ -299,6 +302,43 @@ def test_a_master_in_c_runs_the_unit(kind, given, value, span, steps, outputs, f
     assert any(ours) == (kind == "machine")  # of a machine at standstill a sensor estimates no block
     assert refusal.startswith("c: a value must be finite")
     unit.free()
+
+
+@pytest.mark.skipif(COMPILER is None or this_platform() != "linux", reason="sources are compiled by gcc on Linux")
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("write", [partial(ss.write_fmu, step=5e-4), partial(ss.write_sensor_fmu, rate=100.0)])
+def test_the_sources_of_a_unit_compile_to_the_same_numbers(write, version, folder, tmp_path):
+    """A unit of sources alone, compiled as its description says, equals that with a library to the bit."""
+    library, sources = folder / f"library{version}.fmu", tmp_path / "sources.fmu"
+    write(library, fmi=version)
+    write(sources, fmi=version, platforms=["source"])
+    place = Path(fmpy.extract(str(sources)))
+    assert not (place / "binaries").exists()
+    description = fmpy.read_model_description(str(sources))
+    assert description.coSimulation.needsExecutionTool is False
+    (files,) = description.buildConfigurations[0].sourceFileSets
+    assert set(files.sourceFiles) == {path.name for path in (place / "sources").glob("*.c")}
+    target = place / "binaries" / PLATFORMS["linux"].folders[version]
+    target.mkdir(parents=True)
+    flags = ["-std=c99", "-O2", "-Wall", "-Werror", "-ffp-contract=off", "-fPIC", "-shared"]
+    output = target / f"{description.coSimulation.modelIdentifier}.so"
+    subprocess.run(
+        [COMPILER, *flags, "-o", output, *files.sourceFiles, "-lm"], cwd=place / "sources", check=True, timeout=120
+    )
+    shutil.make_archive(str(tmp_path / "compiled"), "zip", place)
+    compiled = (tmp_path / "compiled.zip").rename(tmp_path / "compiled.fmu")
+    random, rows = np.random.default_rng(5), []
+    readings = 1e6 * random.standard_normal((1000, 2)).cumsum(axis=0)
+    for path in (library, compiled):
+        unit = Unit(path, version).start()
+        names = [v.name for v in unit.description.modelVariables if v.causality == "input"]
+        outputs = [v.name for v in unit.description.modelVariables if v.causality == "output"]
+        for k, (first, second) in enumerate(readings):
+            unit.set(**{names[0]: math.sin(0.01 * k) if "u" in names else first, names[1]: abs(second) * 1e-18})
+            unit.step(k * 1e-2, 1e-2)
+        rows.append(unit.get(*outputs))
+        unit.free()
+    assert np.array_equal(rows[0], rows[1], equal_nan=True)
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from sealscope.errors import InputError
 
 _PLATFORM = (
     "System it shall run on: linux, windows, macos; FMI 3 also macos-arm, linux-arm; repeat. By default this one; "
-    "others need the extra `fmu`."
+    "others need the extra `fmu`. source: its C sources alone."
 )
 _ERROR = "Error that a pressure may have, by which the solver's step is chosen (1 Pa)."
 _SENSOR = (

@@ -35,6 +35,7 @@ Precision = Literal["double", "single"]
 _MATH = {
     **{"absolute": "fabs", "log": "log", "log1p": "log1p", "exp": "exp", "sqrt": "sqrt", "hypot": "hypot"},
     **{"power": "pow", "log_gamma": "lgamma", "floor": "floor", "ceil": "ceil"},
+    "copysign": "copysign",
 }
 #: Name of the pointer to the state.
 _STATE = "record"

@@ -7,8 +7,8 @@ scalars. Expressions have no side effects.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Container, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 #: Type of a number: floating point, whole, or truth value.
@@ -202,3 +202,63 @@ def iter_calls(statements: Iterable[Statement]) -> Iterator[Call]:
             yield from iter_calls((*statement.body, *statement.otherwise))
         elif isinstance(statement, (For, While)):
             yield from iter_calls(statement.body)
+
+
+def iter_read_names(statements: Iterable[Statement]) -> Iterator[str]:
+    """Yield the names of the variables and parameters that statements read."""
+    for statement in statements:
+        if isinstance(statement, Assign):
+            target = statement.target
+            values: tuple[Expression, ...] = (statement.value,)
+            values += () if isinstance(target, Local) or target.index is None else (target.index,)
+        elif isinstance(statement, (If, While)):
+            values = (statement.condition,)
+            yield from iter_read_names((*statement.body, *(statement.otherwise if isinstance(statement, If) else ())))
+        elif isinstance(statement, For):
+            values = (statement.start, statement.stop)
+            yield from iter_read_names(statement.body)
+        elif isinstance(statement, Return):
+            values = statement.values
+        else:
+            values = statement.arguments if isinstance(statement, Call) else ()
+        yield from (part.name for value in values for part in parts(value) if isinstance(part, Local))
+
+
+def iter_written_names(statements: Iterable[Statement]) -> Iterator[str]:
+    """Yield the names of the variables that statements write."""
+    for statement in statements:
+        if isinstance(statement, Assign):
+            yield from (statement.target.name,) if isinstance(statement.target, Local) else ()
+        elif isinstance(statement, Call):
+            yield from (variable.name for variable in statement.results if variable is not None)
+        elif isinstance(statement, If):
+            yield from iter_written_names((*statement.body, *statement.otherwise))
+        elif isinstance(statement, (For, While)):
+            yield from (statement.variable.name,) if isinstance(statement, For) else ()
+            yield from iter_written_names(statement.body)
+
+
+def drop_unread(statements: Iterable[Statement], read: Container[str], changing: Container[str]) -> Iterator[Statement]:
+    """Yield statements without those whose only effect is on variables other than those in `read`.
+
+    `changing`: names of the functions that change the state.
+    """
+    for statement in statements:
+        if isinstance(statement, Call) and statement.function not in changing:
+            is_read = any(variable is not None and variable.name in read for variable in statement.results)
+            if not is_read:
+                continue
+        if isinstance(statement, Assign) and isinstance(statement.target, Local) and statement.target.name not in read:
+            continue
+        if isinstance(statement, If):
+            body, otherwise = (
+                tuple(drop_unread(part, read, changing)) for part in (statement.body, statement.otherwise)
+            )
+            if not body and not otherwise:
+                continue
+            condition = statement.condition if body else Operation("not", (statement.condition,), "truth")
+            yield If(condition, body or otherwise, otherwise if body else ())
+        elif isinstance(statement, (For, While)):
+            yield replace(statement, body=tuple(drop_unread(statement.body, read, changing)))
+        else:
+            yield statement

@@ -47,21 +47,27 @@ from sealscope.emit.program import (
     Statement,
     TableElement,
     While,
+    drop_unread,
+    iter_calls,
     iter_expressions,
+    iter_read_names,
+    iter_written_names,
     parts,
 )
 from sealscope.errors import InputError
+from sealscope.physics.lanes import exponential, select
 
 #: Functions of one or two real numbers by which kernels compute, and the operator that each becomes.
 OPERATORS: Mapping[Any, str] = {
     **{math.log: "log", np.log: "log", math.log1p: "log1p", np.log1p: "log1p", math.exp: "exp", np.exp: "exp"},
     **{math.sqrt: "sqrt", np.sqrt: "sqrt", math.hypot: "hypot", np.hypot: "hypot", math.lgamma: "log_gamma"},
     **{math.isnan: "is_nan", np.isnan: "is_nan", math.isfinite: "is_finite", np.isfinite: "is_finite"},
-    **{math.floor: "floor", math.ceil: "ceil"},
+    **{math.floor: "floor", math.ceil: "ceil", math.pow: "power", math.copysign: "copysign", exponential: "exp"},
 }
 _TRUTHS = ("is_nan", "is_finite")
 _KINDS: tuple[Kind, ...] = ("truth", "whole", "real")  # from narrow to wide
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
+_TRUTH_OPERATORS: Mapping[type[ast.operator], str] = {ast.BitAnd: "and", ast.BitOr: "or"}
 _ARITHMETIC = {
     **{ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.FloorDiv: "floor_div", ast.Mod: "floor_mod"},
     ast.Pow: "power",
@@ -157,6 +163,7 @@ def specialise(
     layout: np.dtype[Any],
     entries: Mapping[str, tuple[Any, Mapping[str, Any]]],
     constants: Mapping[str, float] | None = None,
+    known: Mapping[str, Any] | None = None,
 ) -> Program:
     """Specialise kernels to a program whose state is a record of the dtype `layout`.
 
@@ -169,17 +176,26 @@ def specialise(
         the record, "real" or "whole" for a number, anything else for a setting.
     constants : mapping of str to float, optional
         Values of module constants, by name, that differ from the kernels' own, such as limits of rounding.
+    known : mapping of str to object, optional
+        Settings that kernels read as if they were fields of the state, by the field's name.
 
     Raises
     ------
     InputError
         A kernel is outside of the subset that can be written; the message has file, line and reason.
     """
-    writer = _Writer(layout, constants or {})
+    writer = _Writer(layout, constants or {}, known or {})
     for name, (kernel, arguments) in entries.items():
         values = {key: _value_of_argument(key, kind, layout) for key, kind in arguments.items()}
         writer.add_function(source_function(kernel), values, name)
-    return Program(writer.fields, writer.tables, tuple(writer.functions.values()))
+    functions = {function.name: function for function in writer.functions.values()}
+    called, found = set(entries), list(entries)
+    while found:
+        new = {call.function for call in iter_calls(functions[found.pop()].body)} - called
+        called |= new
+        found += new
+    kept = tuple(function for name, function in functions.items() if name in called)
+    return Program(writer.fields, writer.tables, kept)
 
 
 def source_function(kernel: Any) -> Callable[..., Any]:
@@ -204,11 +220,12 @@ def _kind_of(dtype: np.dtype[Any]) -> Kind:
 class _Writer:
     """The program under construction: its functions by what they are specialised for, and its tables."""
 
-    def __init__(self, layout: np.dtype[Any], constants: Mapping[str, float]) -> None:
-        self.layout, self.constants = layout, constants
+    def __init__(self, layout: np.dtype[Any], constants: Mapping[str, float], known: Mapping[str, Any]) -> None:
+        self.layout, self.constants, self.known = layout, constants, known
         self.fields, self.places = allocate_fields(layout)
         self.functions: dict[Any, Function] = {}
         self.writes_state: set[str] = set()
+        self.result_shapes: dict[str, Any] = {}
         self.tables: dict[str, tuple[float | int, ...]] = {}
         self._names: Counter[str] = Counter()
 
@@ -236,6 +253,7 @@ class _Writer:
             written = body.write(self.free_name(name or function.__name__.strip("_")), keeps_parameters=bool(name))
             if body.writes_state:
                 self.writes_state.add(written.name)
+            self.result_shapes[written.name] = body.result_shape
             self.functions[key] = written
         return self.functions[key]
 
@@ -284,6 +302,25 @@ def _pairs(inner: Value, outer: Value) -> Iterator[tuple[Local, Expression]]:
             yield from _pairs(mine, theirs)  # type: ignore[arg-type]
 
 
+def _shape_of(value: Value) -> Any:
+    """Return the shapes of the parts of a tuple, None for anything else."""
+    return tuple(map(_shape_of, value.values)) if isinstance(value, Several) else None
+
+
+def _leaves(value: Value) -> Iterator[Value]:
+    """Yield the parts of a tuple, and of the tuples in it."""
+    if isinstance(value, Several):
+        for part in value.values:
+            yield from _leaves(part)
+    else:
+        yield value
+
+
+def _shaped(shape: Any, leaves: Iterator[Value]) -> Value:
+    """Build the value of a shape (`_shape_of`) from its numbers."""
+    return next(leaves) if shape is None else Several(tuple(_shaped(part, leaves) for part in shape))
+
+
 def _constant(value: Any) -> Constant:
     """Make the constant of a number."""
     if isinstance(value, (bool, np.bool_)):
@@ -291,6 +328,11 @@ def _constant(value: Any) -> Constant:
     if isinstance(value, (int, np.integer)):
         return Constant(int(value), "whole")
     return Constant(float(value), "real")
+
+
+def _is_object(value: Value) -> bool:
+    """Return True for a known value that is no number."""
+    return isinstance(value, Known) and not _is_number(value.value)
 
 
 def _is_number(value: Any) -> bool:
@@ -330,10 +372,12 @@ class _Body:
                    if isinstance(node, (ast.AugAssign, ast.For)) and isinstance(node.target, ast.Name)}  # fmt: skip
         self._single = {name for name, count in stores.items() if count == 1} - changed - set(values)
         self._stored = set(stores)
+        self._part_variables: set[str] = set()  # those of tuples that are assigned anew
         self._kinds: dict[str, Kind] = {}
         self._result_kinds: list[Kind] | None = None
         self._is_settled = True
         self.writes_state = False
+        self.result_shape: Any = ()  # a tuple of the shapes of a tuple's parts, None for a number
         self._reset()
 
     def _reset(self) -> None:
@@ -368,6 +412,7 @@ class _Body:
             self._block(self._tree.body)
             if self._is_settled:
                 break
+        self._drop_unread()
         parameters = [inner for key, value in self._arguments.items() for inner in _parameters(value)]
         if not keeps_parameters:
             used = {part.name for value in iter_expressions(self._statements) for part in parts(value)
@@ -376,6 +421,16 @@ class _Body:
         document = (ast.get_docstring(self._tree) or "").partition("\n")[0]
         results = tuple(self._result_kinds or ())
         return Function(name, document, tuple(parameters), results, dict(self._variables), tuple(self._statements))
+
+    def _drop_unread(self) -> None:
+        """Drop assignments to variables that nothing reads."""
+        n_before = -1
+        while n_before != len(self._variables):
+            n_before = len(self._variables)
+            read = set(iter_read_names(self._statements))
+            self._statements = list(drop_unread(self._statements, read, self._writer.writes_state))
+            written = set(iter_written_names(self._statements))
+            self._variables = {name: kind for name, kind in self._variables.items() if name in written}
 
     def _copy_parameter(self, key: str) -> None:
         """Copy a parameter that the function assigns to into a variable."""
@@ -400,6 +455,8 @@ class _Body:
                 raise self._refusal(node, f"a statement must be of the subset, got {type(node).__name__}")
             self._root = None
             method(node)
+            if self._statements and isinstance(self._statements[-1], (Return, Break)):
+                break  # what follows is never reached
 
     def _nested(self, nodes: Sequence[ast.stmt]) -> tuple[Statement, ...]:
         """Write statements into a block of their own."""
@@ -426,8 +483,8 @@ class _Body:
         if node.value is not None:
             self._root = node.value
             value = self._value(node.value)
-            several = value.values if isinstance(value, Several) else (value,)
-            values = tuple(self._number(part, node) for part in several)
+            self.result_shape = _shape_of(value)
+            values = tuple(self._number(part, node) for part in _leaves(value))
         kinds = [value.kind for value in values]
         if self._result_kinds is None:
             self._result_kinds = kinds
@@ -474,6 +531,11 @@ class _Body:
             if len(bounds) > 2 or node.iter.keywords:
                 raise self._refusal(node, "a range must have the step 1")
             start, stop = (Constant(0, "whole"), bounds[0]) if len(bounds) == 1 else bounds
+            if self._indexes_tuple(node, name):
+                for k in range(*(self._known_number(bound, node) for bound in (start, stop))):
+                    self._values[name] = Known(k)
+                    self._block(node.body)
+                return
             start, stop = self._steady(start, node), self._steady(stop, node)
             self._declare(name, "whole", node)
             variable = Local(name, "whole")
@@ -487,6 +549,23 @@ class _Body:
         for value in values:
             self._values[name] = value
             self._block(node.body)
+
+    def _indexes_tuple(self, loop: ast.For, name: str) -> bool:
+        """Return True if a loop's variable `name` is an index of a tuple, whose parts have no index in the program."""
+        return any(
+            isinstance(part, ast.Subscript)
+            and isinstance(part.value, ast.Name)
+            and isinstance(self._values.get(part.value.id), Several)
+            and any(isinstance(used, ast.Name) and used.id == name for used in ast.walk(part.slice))
+            for statement in loop.body
+            for part in ast.walk(statement)
+        )
+
+    def _known_number(self, value: Expression, node: ast.AST) -> int:
+        """Return a whole number that is known."""
+        if not isinstance(value, Constant):
+            raise self._refusal(node, "the range of a tuple's index must be known")
+        return int(value.value)
 
     def _write_AnnAssign(self, node: ast.AnnAssign) -> None:
         """Write an assignment with a type."""
@@ -551,7 +630,10 @@ class _Body:
         """Assign to a local name: views and known values only name, numbers are stored in a variable."""
         if name == "_":
             return
-        if isinstance(value, (View, Record, Several)) or (isinstance(value, Known) and not _is_number(value.value)):
+        if isinstance(value, Several):
+            self._assign_parts(name, value, node)
+            return
+        if isinstance(value, (View, Record)) or (isinstance(value, Known) and not _is_number(value.value)):
             if name not in self._single:
                 raise self._refusal(node, f"{name} is assigned to more than once, and must be a number")
             self._values[name] = self._fixed_view(value, node) if isinstance(value, View) else value
@@ -565,6 +647,30 @@ class _Body:
         variable = Local(variable_name, self._kinds[variable_name])
         self._values[name] = variable
         self._statements.append(Assign(variable, convert(number, variable.kind)))
+
+    def _assign_parts(self, name: str, value: Several, node: ast.AST) -> None:
+        """Assign a tuple to a local name; of a name that is assigned to more than once, each part is a variable."""
+        is_number = [not isinstance(part, (View, Record, Several)) and not _is_object(part) for part in value.values]
+        if name in self._single:
+            values = [
+                self._steady(part, node) if number and not isinstance(part, Known) else part
+                for part, number in zip(value.values, is_number, strict=True)
+            ]
+            self._values[name] = Several(tuple(values))
+            return
+        if not all(is_number):
+            raise self._refusal(node, f"{name} is assigned to more than once, and must have numbers only")
+        names = [f"{self._free_variable(name)}_part{k}" for k in range(len(value.values))]
+        self._part_variables |= set(names)
+        numbers = [self._number(part, node) for part in value.values]
+        for k, number in enumerate(numbers):
+            if any(isinstance(part, Local) and part.name in names for part in parts(number)):
+                numbers[k] = self._temporary(number)
+        for variable_name, number in zip(names, numbers, strict=True):
+            self._declare(variable_name, number.kind, node)
+            variable = Local(variable_name, self._kinds[variable_name])
+            self._statements.append(Assign(variable, convert(number, variable.kind)))
+        self._values[name] = Several(tuple(Local(variable, self._kinds[variable]) for variable in names))
 
     def _free_variable(self, name: str) -> str:
         """Return the name of the variable for a local name, another one than a parameter's."""
@@ -630,7 +736,7 @@ class _Body:
 
     def _is_steady(self, name: str) -> bool:
         """Return True for a variable that is assigned to once, and for a parameter."""
-        return name in self._single or name not in self._stored
+        return name in self._single or name not in self._stored | self._part_variables
 
     def _number(self, value: Value, node: ast.AST) -> Expression:
         """Return the expression of a number; raise InputError for anything else."""
@@ -699,7 +805,9 @@ class _Body:
         raise self._refusal(node, f"{node.attr} must be a field of the state")
 
     def _field(self, record: Record, node: ast.Attribute) -> Value:
-        """Return a field of a record: a number, a view of an array, or a record."""
+        """Return a field of a record: a number, a view of an array, a record, or a setting."""
+        if record.prefix + node.attr in self._writer.known:
+            return self._lift(self._writer.known[record.prefix + node.attr])
         if node.attr not in (record.layout.fields or {}):
             raise self._refusal(node, f"the state has no field {node.attr}")
         dtype = record.layout[node.attr]
@@ -796,6 +904,9 @@ class _Body:
         """Return the result of an operator of two values."""
         name = _ARITHMETIC.get(type(node.op))
         left, right = self._value(node.left), self._value(node.right)
+        if type(node.op) in _TRUTH_OPERATORS:
+            truths = tuple(self._truth_value(value, node) for value in (left, right))
+            return Operation(_TRUTH_OPERATORS[type(node.op)], truths, "truth")
         if name is None:
             raise self._refusal(node, f"an operator must be of the subset, got {type(node.op).__name__}")
         if isinstance(left, Known) and isinstance(right, Known):
@@ -908,7 +1019,7 @@ class _Body:
         called = function.value
         methods: dict[Any, Callable[[ast.Call, Sequence[Value]], Value]] = {
             **{len: self._call_len, abs: self._call_abs, min: self._call_least, max: self._call_largest},
-            **{int: self._call_int, float: self._call_float, bool: self._call_bool},
+            **{int: self._call_int, float: self._call_float, bool: self._call_bool, select: self._call_select},
         }
         if called in methods:
             return methods[called](node, [self._value(part) for part in node.args])
@@ -950,7 +1061,7 @@ class _Body:
         self._statements.append(Call(written.name, tuple(arguments), results))
         if not results:
             return Known(None)
-        return results[0] if len(results) == 1 else Several(results)
+        return _shaped(self._writer.result_shapes[written.name], iter(results))
 
     def _reads_state_only_in(self, call: ast.Call) -> bool:
         """Return True if the present statement's expression reads no state outside of a call, which may change it."""
@@ -1002,6 +1113,13 @@ class _Body:
     def _call_largest(self, node: ast.Call, values: Sequence[Value]) -> Value:
         """Return the largest of some numbers."""
         return self._extreme(">", node, values)
+
+    def _call_select(self, node: ast.Call, values: Sequence[Value]) -> Value:
+        """Return one of two numbers by a condition."""
+        truth = self._truth_value(values[0], node)
+        numbers = [self._number(value, node) for value in values[1:]]
+        kind = _wider([number.kind for number in numbers])
+        return Operation("select", (truth, *(convert(number, kind) for number in numbers)), kind)
 
     def _call_int(self, node: ast.Call, values: Sequence[Value]) -> Value:
         """Return a number without its fraction."""

@@ -21,8 +21,8 @@ from sealscope.diagnosis.live.kernel.stream import StreamSettings
 from sealscope.emit.compiler import find_compiler
 from sealscope.emit.stream_program import stream_program
 from sealscope.errors import InputError
-from sealscope.fmu.description import format_description, templates
-from sealscope.fmu.machine import FAILURES, RigChoice, object_code, rig_code
+from sealscope.fmu.description import format_build_description, format_description, templates
+from sealscope.fmu.machine import FAILURES, RigChoice, rig_sources
 from sealscope.fmu.variables import INPUTS, REFERENCES, RESULTS, SENSOR_RESULTS, Variable, variables
 from sealscope.parameters import Rig, load_rig
 from sealscope.parameters.circuit import check_circuit_property
@@ -40,16 +40,17 @@ ERROR = 1.0
 STEP_COMMANDS = ("3 sin(4t)", "5 sin(2t)")
 #: Longest time [s] that the C compiler may take.
 _COMPILE_TIMEOUT = 300.0
-_README = """\
-The interface is C11, a soft sensor C99; a rig's laws are LLVM code (.ll). To build the library for another system:
-cc -O2 -ffp-contract=off -fPIC -shared -I. -Iheaders -o NAME.so *.c -lm (with .ll: clang or `zig cc`, and *.ll).
+_FLAGS = ("-std=c99", "-O2", "-ffp-contract=off", "-fPIC", "-shared")
+_README = f"""\
+C99. To build the library for another system: cc {" ".join(_FLAGS)} -I. -o NAME.so *.c -lm
 """
+#: Name of no system: of a unit that holds its sources, and no library.
+SOURCE = "source"
 
 
 class Platform(NamedTuple):
     """An operating system and processor on which an FMU can run."""
 
-    triple: str  # name for LLVM
     target: str  # name for the C compiler
     folders: Mapping[int, str]  # by FMI version: folder of the library in the FMU's archive
     suffix: str  # of the library's file name
@@ -100,7 +101,7 @@ class MockUp(NamedTuple):
     """The code and data of a functional mock-up unit (FMU), to be compiled and archived."""
 
     summary: str  # one line that describes the FMU
-    modules: Mapping[str, str]  # LLVM code by name of the function, or C sources by name of the file
+    modules: Mapping[str, str]  # C sources of what it computes, by name of the file
     variable_list: tuple[Variable, ...]
     values: tuple[float, ...]  # initial values of the parameters, in the order of the code
     n_inputs: int
@@ -121,17 +122,22 @@ class MockUp(NamedTuple):
         with tempfile.TemporaryDirectory(prefix="sealscope-fmu-") as folder, atomic_write(path) as temporary:
             source_folder = Path(folder)
             sources = self._write_sources(source_folder, version)
+            compiled = [source.name for source in sources if source.suffix == ".c"]
             with zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-                xml = format_description(version, identifier, self.token, self.summary, self.variable_list)
+                xml = format_description(version, identifier, self.token, self.summary, self.variable_list, compiled)
                 archive.writestr("modelDescription.xml", xml)
+                if version == 3:
+                    archive.writestr("sources/buildDescription.xml", format_build_description(identifier, compiled))
                 for system in platforms:
+                    if system == SOURCE:
+                        continue
                     target = f"binaries/{PLATFORMS[system].folders[version]}/{identifier}{PLATFORMS[system].suffix}"
-                    archive.writestr(target, self._compile_library(source_folder, system, version))
+                    archive.writestr(target, self._compile_library(source_folder, system, compiled))
                 for source in sources:
-                    archive.write(source, f"sources/{source.relative_to(source_folder).as_posix()}")
+                    archive.write(source, f"sources/{source.name}")
 
     def _write_sources(self, folder: Path, version: Version) -> list[Path]:
-        """Write the FMU's sources (C, LLVM code and headers of FMI `version`) to a folder; return the files' paths."""
+        """Write the FMU's sources (C, with the headers of FMI `version`) to a folder; return the files' paths."""
         interface = files("sealscope.fmu") / "c"
         # indices in `values`; those of inputs and outputs fall outside its range
         value_indices = {variable.reference - REFERENCES["value"] for variable in self.variable_list}
@@ -139,43 +145,20 @@ class MockUp(NamedTuple):
         present = [int(k in value_indices) for k in range(len(self.values))]
         config = templates().get_template("config.h.j2").render(unit=self, references=REFERENCES, present=present)
         texts = {name: (interface / name).read_text("utf-8") for name in ("unit.c", "unit.h", f"fmi{version}.c")}
-        texts |= {f"headers/{path.name}": path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
-        texts |= {"config.h": config} | {
-            name if Path(name).suffix in (".c", ".h") else f"{name}.ll": text for name, text in self.modules.items()
-        }
-        texts["README.txt"] = _README
-        (folder / "headers").mkdir()
+        texts |= {path.name: path.read_text("utf-8") for path in fmi_headers().glob(f"fmi{version}*.h")}
+        texts |= {"config.h": config, **self.modules, "README.txt": _README}
         for name, text in texts.items():
             (folder / name).write_text(text, encoding="utf-8")
         return [folder / name for name in texts]
 
-    def _compile_library(self, folder: Path, system: str, version: Version) -> bytes:
-        """Compile the sources in `folder` to a library for `system`; return its bytes, or raise InputError."""
+    def _compile_library(self, folder: Path, system: str, sources: Sequence[str]) -> bytes:
+        """Compile C files in `folder` to a library for `system`; return its bytes, or raise InputError."""
         platform = PLATFORMS[system]
         compiler = find_compiler()
-        inputs = [folder / "unit.c", folder / f"fmi{version}.c"]
-        for function, module in self.modules.items():
-            if Path(function).suffix == ".c":
-                inputs.append(folder / function)
-            if Path(function).suffix in (".c", ".h"):
-                continue
-            object_file = folder / f"{function}-{system}.o"
-            object_file.write_bytes(object_code(module, platform.triple))
-            inputs.append(object_file)
         output = folder / f"{system}{platform.suffix}"
         target = ["-target", platform.target] if compiler.cross_compiles else []
-        flags = [
-            "-std=c11",
-            "-O2",
-            "-ffp-contract=off",
-            "-fPIC",
-            "-shared",
-            f"-I{folder}",
-            f"-I{folder / 'headers'}",
-            "-o",
-            str(output),
-        ]
-        command = [*compiler.command, *target, *flags, *map(str, inputs), "-lm"]
+        inputs = [str(folder / name) for name in sources]
+        command = [*compiler.command, *target, *_FLAGS, f"-I{folder}", "-o", str(output), *inputs, "-lm"]
         rule = f"the C compiler ({' '.join(compiler.command)}) must build the unit for {system}"
         try:
             process = subprocess.run(
@@ -216,7 +199,8 @@ def write_fmu(
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
         Systems on which the FMU can run: "linux", "windows", "macos", and for FMI 3 also "macos-arm" and "linux-arm";
-        by default the present one. Others need the compiler that ``pip install 'sealscope[fmu]'`` installs.
+        by default the present one. Others need the compiler that ``pip install 'sealscope[fmu]'`` installs. "source"
+        alone: no library, only the C sources that each unit holds, for importers that compile.
     error : float, optional
         Largest rms error of a pressure [Pa]; the solver's step is chosen to keep it.
     step : float, optional
@@ -251,7 +235,7 @@ def write_fmu(
         raise InputError(f"step must be > 0 s, got {step}")
     unit = MockUp(
         summary=f"{machine.title}; {accuracy}",
-        modules=rig_code(RigChoice.from_rig(machine)),
+        modules=rig_sources(RigChoice.from_rig(machine), machine.title),
         variable_list=tuple(variables(machine, step)),
         values=parameter_values(machine),
         n_inputs=len(INPUTS),
@@ -359,9 +343,11 @@ def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequenc
         raise InputError(f"fmi must be 2 or 3, got {fmi!r}")
     chosen_platforms = tuple(dict.fromkeys(platforms or (this_platform(),)))
     for name in chosen_platforms:
+        if name == SOURCE:
+            continue
         if name not in PLATFORMS or fmi not in PLATFORMS[name].folders:
             platform_names = ", ".join(key for key, platform in PLATFORMS.items() if fmi in platform.folders)
-            raise InputError(f"a platform of FMI {fmi} must be one of {platform_names}, got {name!r}")
+            raise InputError(f"a platform of FMI {fmi} must be one of {platform_names}, {SOURCE}, got {name!r}")
         if name != this_platform() and not find_compiler().cross_compiles:
             raise InputError(f"a unit for {name} needs a compiler for it: pip install 'sealscope[fmu]'")
     return chosen_platforms

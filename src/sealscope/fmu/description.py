@@ -42,11 +42,18 @@ def base_units(unit: str) -> dict[str, str] | None:
     return base if factor == 1.0 else base | {"factor": repr(factor)}
 
 
-def format_description(fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable]) -> str:
+def format_build_description(identifier: str, sources: Sequence[str]) -> str:
+    """Format sources/buildDescription.xml of FMI 3, which lists the C files to compile."""
+    return templates().get_template("build.xml.j2").render(identifier=identifier, sources=sources)
+
+
+def format_description(
+    fmi: int, identifier: str, token: str, summary: str, variables: Sequence[Variable], sources: Sequence[str]
+) -> str:
     """Format modelDescription.xml, the description of an FMU for version 2 or 3 of FMI.
 
     `identifier`: prefix of the C functions; `token`: hash by which the compiled library recognises this description;
-    `summary`: one line that describes the FMU.
+    `summary`: one line that describes the FMU; `sources`: names of the C files to compile.
     """
     by_name = {variable.name: variable for variable in variables}
     outputs = [variable for variable in variables if variable.causality == "output"]
@@ -59,6 +66,7 @@ def format_description(fmi: int, identifier: str, token: str, summary: str, vari
         sealscope=version("sealscope"),
         units=[(unit, base_units(unit)) for unit in units],
         variables=variables,
+        sources=sources,
         outputs=outputs,
         index={variable.name: k for k, variable in enumerate(variables, 1)},  # by which FMI 2 names variables
         dependencies={

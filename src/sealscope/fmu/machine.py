@@ -1,41 +1,36 @@
-"""The code of a functional mock-up unit (FMU) of a rig: the equations of `simulate`, compiled to functions for C.
+"""The code of a functional mock-up unit (FMU) of a rig: the equations of `simulate` as C99, and the unit's functions.
 
-The functions' arguments are pointers to arrays of doubles. The arrays, and the tables that give their order, are:
-parameters `values`, `variables.VALUES`; `inputs`, `variables.INPUTS`; state `y`, `physics.state.STATES`; outputs
-`results`, `variables.RESULTS`. The functions return 0, or a code of `FAILURES`.
+The equations are kernels on one record, which `emit` specialises to C: the state `y`, inputs and their slopes, outputs
+and the rig's numbers `p`. The unit's functions copy the numbers of an instance to the record and back.
 """
 
 from __future__ import annotations
 
-import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
-import llvmlite.binding as llvm
-from numba import carray
-from numba.cpython.unsafe.tuple import tuple_setitem
-from numba.np.unsafe.ndarray import to_fixed_tuple
-
-from sealscope.compiled import law, plain_code
-from sealscope.fmu.variables import INPUTS, RESULTS, VALUES
+from sealscope.compiled import law, record_dtype
+from sealscope.emit.c99 import CText
+from sealscope.emit.program import Program
+from sealscope.emit.specialise import specialise
+from sealscope.fmu.description import templates
+from sealscope.fmu.variables import INPUTS, RESULTS
 from sealscope.parameters import Rig
 from sealscope.physics.cylinder import mechanical_power
 from sealscope.physics.motor import electric_power
 from sealscope.physics.pump import hydraulic_power
 from sealscope.physics.rig import (
     CHOICES,
+    DERIVED,
     NUMBERS,
-    PARAMETERS,
-    RigNumbers,
-    RigValues,
     derived_numbers,
     observe,
     pressures_of,
     rig_numbers,
     throttle_readings,
 )
+from sealscope.physics.rig import VALUES as SYMBOLS
 from sealscope.physics.solvers.imex import IMEX_NODES, imex_step
 from sealscope.physics.solvers.rk4 import RK4_NODES, rk4_step
 from sealscope.physics.standstill import BELOW_VACUUM, BEYOND_DRIVE, stand_still, standstill_force
@@ -50,18 +45,14 @@ FAILURES: Mapping[int, str] = {
     BELOW_VACUUM: "a pressure is below vacuum, where the model does not hold",
     BEYOND_DRIVE: "the drive cannot hold the load at standstill",
 }
-_N_VALUES, _N_INPUTS, _N_STATES, _N_RESULTS = len(VALUES), len(INPUTS), len(STATES), len(RESULTS)
-_N_PARAMETERS, _N_OUTPUTS = len(PARAMETERS), len(OUTPUTS)
-_G_EXT_A, _G_EXT_B = VALUES.index("cylinder.G_ext_A"), VALUES.index("cylinder.G_ext_B")
+_N_STATES, _N_OUTPUTS = len(STATES), len(OUTPUTS)
 _U, _G, _C, _F, _ADDED_G_EXT_A, _ADDED_G_EXT_B = range(len(INPUTS))
 _VOLTAGE, _Q_1 = OUTPUTS.index("V"), OUTPUTS.index("Q_1")
-_electric, _hydraulic, _mechanical = law(electric_power), law(hydraulic_power), law(mechanical_power)
-#: The C types of the arguments of each function of an FMU.
-ARGUMENTS: Mapping[str, tuple[str, ...]] = {
-    "start": ("double*", "double*", "double", "double*"),
-    "advance": ("double*", "double*", "double*", "double*", "double", "int64"),
-    "report": ("double*", "double*", "double*", "double*"),
-}
+#: The record of an FMU's kernels; `p` has the rig's parameters by symbol, and derived numbers.
+_LAYOUT = record_dtype(
+    y=(_N_STATES,), inputs=(len(INPUTS),), slopes=(len(INPUTS),), results=(len(RESULTS),),
+    p=record_dtype(*SYMBOLS, *DERIVED),
+)  # fmt: skip
 
 
 @law
@@ -101,47 +92,52 @@ class RigChoice(NamedTuple):
         return cls(laws, exponent, literal_metering, implicit=implicit, euler=rig.motor.integrator == "euler")
 
 
-def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
-    """Build the functions of an FMU for a rig, which `rig_code` compiles; return them by name.
+@lru_cache(maxsize=8)
+def rig_program(choice: RigChoice) -> Program:
+    """Specialise the functions of an FMU for a rig.
 
-    - ``start(values, inputs, x_0, y)`` sets `y` to standstill at x_0 [m] under the load among the inputs.
-    - ``advance(values, inputs, slopes, y, span, steps)`` integrates `y` over `span` [s] in `steps` equal steps, while
-      the inputs change linearly by their `slopes` (per second); `y` is replaced also after a failure.
-    - ``report(values, inputs, y, results)`` writes the outputs, then the electric, hydraulic and mechanical power [W].
+    - ``start(m, x_0)`` sets `y` to standstill at x_0 [m] under the load among the inputs.
+    - ``advance(m, span, steps)`` integrates `y` over `span` [s] in `steps` equal steps, while the inputs change
+      linearly by their `slopes` (per second); `y` is replaced also after a failure.
+    - ``report(m)`` writes the outputs, then the electric, hydraulic and mechanical power [W].
 
-    All arguments but x_0, span and steps are pointers to arrays of doubles, in the order of the module's docstring.
+    The first two return 0, or a code of `FAILURES`.
     """
     laws, exponent, literal_metering, implicit, euler = choice
     throttled = bool(laws[CHOICES.index("throttled")])
 
     @law
-    def model_parameters(v: Any, inputs: Any) -> Any:
-        """Compute `RigNumbers` from the values v, with the external leakage among `inputs` added to the rig's."""
-        derived = derived_numbers(RigValues(*to_fixed_tuple(v, _N_VALUES)), exponent, literal_metering)
-        parameters = to_fixed_tuple(v, _N_PARAMETERS)
-        parameters = tuple_setitem(parameters, _G_EXT_A, parameters[_G_EXT_A] + inputs[_ADDED_G_EXT_A])
-        parameters = tuple_setitem(parameters, _G_EXT_B, parameters[_G_EXT_B] + inputs[_ADDED_G_EXT_B])
-        return RigNumbers(*(parameters + derived + laws))
+    def derive(m: Any) -> None:
+        """Compute the derived numbers of the rig, and add the inputs of external leakage to its own."""
+        p = m.p
+        p.c_A_in, p.c_A_out, p.c_B_in, p.c_B_out, p.V_A, p.V_B, p.c_slip, p.k_h = derived_numbers(
+            p, exponent, literal_metering
+        )
+        p.G_ext_A = p.G_ext_A + m.inputs[_ADDED_G_EXT_A]
+        p.G_ext_B = p.G_ext_B + m.inputs[_ADDED_G_EXT_B]
 
-    def start(values: Any, inputs: Any, x_0: float, y: Any) -> int:
-        v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
-        p = model_parameters(v, input_values)
-        state[:] = 0.0
-        return stand_still(state, x_0, standstill_force(x_0, p) + input_values[_F], p)  # type: ignore[no-any-return]
+    @law
+    def start(m: Any, x_0: float) -> int:
+        """Set the state to standstill."""
+        derive(m)
+        m.y[:] = 0.0
+        force = standstill_force(x_0, m.p) + m.inputs[_F]
+        return stand_still(m.y, x_0, force, m.p)  # type: ignore[no-any-return]
 
-    def report(values: Any, inputs: Any, y: Any, results: Any) -> int:
-        v, input_values, state = carray(values, _N_VALUES), carray(inputs, _N_INPUTS), carray(y, _N_STATES)
-        out = carray(results, _N_RESULTS)
-        p, z = model_parameters(v, input_values), state_of(state)
-        observe(z, input_values[_U], input_values[_G], input_values[_C], p, out)
-        out[_N_OUTPUTS] = _electric(out[_VOLTAGE], z[CURRENT])
+    @law
+    def report(m: Any) -> None:
+        """Compute the outputs."""
+        derive(m)
+        p, out, z = m.p, m.results, state_of(m.y)
+        observe(z, m.inputs[_U], m.inputs[_G], m.inputs[_C], p, out)
+        out[_N_OUTPUTS] = electric_power(out[_VOLTAGE], z[CURRENT])
         # without throttles the ports of the pump have the chambers' pressures
-        out[_N_OUTPUTS + 1] = _hydraulic(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
-        out[_N_OUTPUTS + 2] = _mechanical(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
-        return 0
+        out[_N_OUTPUTS + 1] = hydraulic_power(out[_Q_1], (out[P_1] - out[P_2]) if throttled else (out[P_A] - out[P_B]))
+        out[_N_OUTPUTS + 2] = mechanical_power(out[P_A], out[P_B], z[VELOCITY], p.A_A, p.A_B)
 
     @law
     def explicit_step(z: Any, h: float, u: Any, G: Any, C: Any, F: Any, p: Any) -> Any:
+        """Advance the state by the Runge-Kutta method."""
         return rk4_step(z, h, u, G, C, F, p, euler)
 
     at_nodes: Any = _at_imex_nodes if implicit else _at_rk4_nodes
@@ -154,50 +150,38 @@ def build_functions(choice: RigChoice) -> dict[str, Callable[..., Any]]:
         C, F = at_nodes(a[_C], b[_C], t, h), at_nodes(a[_F], b[_F], t, h)
         return solver_step(z, h, u, G, C, F, p)
 
-    def advance(values: Any, inputs: Any, slopes: Any, y: Any, span: float, steps: int) -> int:
-        v, state = carray(values, _N_VALUES), carray(y, _N_STATES)
-        a, b = carray(inputs, _N_INPUTS), carray(slopes, _N_INPUTS)  # the inputs at the time t are a + b t
-        p, z, h = model_parameters(v, a), state_of(state), span / steps
+    @law
+    def advance(m: Any, span: float, steps: int) -> int:
+        """Integrate the state over a span."""
+        derive(m)
+        p, z, h = m.p, state_of(m.y), span / steps
         for k in range(steps):
-            z = step(z, h, k * h, a, b, p)
+            z = step(z, h, k * h, m.inputs, m.slopes, p)
         finite_check = 0.0
-        for m in range(_N_STATES):
-            state[m] = z[m]
-            finite_check += 0.0 * z[m]  # NaN from any value that is not finite
+        for i in range(_N_STATES):
+            m.y[i] = z[i]
+            finite_check += 0.0 * z[i]  # NaN from any value that is not finite
         if finite_check != 0.0:
             return _NOT_FINITE
         p_A, p_B, p_1, p_2 = pressures_of(z, p)
         return BELOW_VACUUM if min(p_A, p_B, p_1, p_2) < -P_ATM else 0
 
-    return {"start": start, "advance": advance, "report": report}
+    entries = {
+        "start": (start, {"m": "state", "x_0": "real"}),
+        "advance": (advance, {"m": "state", "span": "real", "steps": "whole"}),
+        "report": (report, {"m": "state"}),
+    }
+    known = {f"p_{name}": value for name, value in zip(CHOICES, laws, strict=True)}
+    return specialise(_LAYOUT, entries, known=known)
 
 
-@lru_cache(maxsize=8)
-def rig_code(choice: RigChoice) -> Mapping[str, str]:
-    """Compile the functions of an FMU for a rig to LLVM code; return the text of each function by its name."""
-    return unit_code(build_functions(choice))
-
-
-def unit_code(functions: Mapping[str, Callable[..., Any]]) -> Mapping[str, str]:
-    """Compile an FMU's functions to LLVM code, with symbols ``sealscope_NAME`` and arguments of types `ARGUMENTS`."""
-    modules = {}
-    for name, function in functions.items():
-        text, symbol = plain_code(function, *ARGUMENTS[name])
-        # rename the symbol, quoted or not, wherever arguments in brackets follow
-        modules[name] = re.sub(r'"?' + re.escape(symbol) + r'"?(?=\()', f"sealscope_{name}", text)
-    return MappingProxyType(modules)
-
-
-def object_code(module: str, triple: str) -> bytes:
-    """Compile LLVM code to the bytes of an object file with position-independent machine code for a platform.
-
-    `module`: text of the code; `triple`: LLVM's target, such as "x86_64-pc-windows-gnu".
-    """
-    llvm.initialize_all_targets()
-    llvm.initialize_all_asmprinters()
-    target = llvm.Target.from_triple(triple)
-    machine = target.create_target_machine(opt=3, reloc="pic", codemodel="default")
-    parsed = llvm.parse_assembly(module)
-    parsed.triple, parsed.data_layout = machine.triple, str(machine.target_data)
-    parsed.verify()
-    return bytes(machine.emit_object(parsed))
+def rig_sources(choice: RigChoice, title: str) -> dict[str, str]:
+    """Render the C sources of a rig's unit by file name."""
+    text = CText(rig_program(choice), "rig")
+    values = [f"p_{symbol}" for symbol in SYMBOLS]
+    source = (
+        templates()
+        .get_template("rig.c.j2")
+        .render(title=title, state=text.declare_state(), source=text.render_source(()), values=values)
+    )
+    return {"rig.c": source}

@@ -19,34 +19,24 @@ DISPLACEMENT = "pump.q_b"
 _GLUE = """\
 /* The functions of the unit (unit.c), which feed samples to the estimator of leak.c. */
 #include "leak.h"
+#include "unit.h"
 
-#include <math.h>
-#include <stddef.h>
-
-int sealscope_start(int64_t *code, void **unused, double *values, double *inputs, double x_0, double *y);
-int sealscope_advance(int64_t *code, void **unused, double *values, double *inputs, double *slopes, double *y,
-                      double span, int64_t steps);
-int sealscope_report(int64_t *code, void **unused, double *values, double *inputs, double *y, double *results);
-
-int sealscope_start(int64_t *code, void **unused, double *values, double *inputs, double x_0, double *y)
+void sealscope_start(int64_t *code, const double *values, const double *inputs, double x_0, double *y)
 {{
     leak_state *state = (leak_state *)(void *)(y + 1);
-    (void)unused;
     (void)inputs;
     (void)x_0;
     y[0] = 0.0;
     leak_init(state);
     state->displacement = values[{index}] / {full_turn!r};
     *code = (values[{index}] > 0.0) ? 0 : 1;
-    return 0;
 }}
 
-int sealscope_advance(int64_t *code, void **unused, double *values, double *inputs, double *slopes, double *y,
-                      double span, int64_t steps)
+void sealscope_advance(int64_t *code, const double *values, const double *inputs, const double *slopes, double *y,
+                       double span, int64_t steps)
 {{
     leak_state *state = (leak_state *)(void *)(y + 1);
     double t = y[0];
-    (void)unused;
     (void)values;
     (void)steps;
     while (t < span - {tolerance!r}) {{ /* a sample at the end is the next step's first */
@@ -58,22 +48,18 @@ int sealscope_advance(int64_t *code, void **unused, double *values, double *inpu
     }}
     y[0] = t - span;
     *code = 0;
-    return 0;
 }}
 
-int sealscope_report(int64_t *code, void **unused, double *values, double *inputs, double *y, double *results)
+void sealscope_report(const double *values, const double *inputs, double *y, double *results)
 {{
     leak_state *state = (leak_state *)(void *)(y + 1);
     int32_t k;
-    (void)unused;
     (void)values;
     (void)inputs;
     leak_results(state);
     for (k = 0; k < {n_results}; ++k) {{
         results[k] = state->results[k];
     }}
-    *code = 0;
-    return 0;
 }}
 """
 

@@ -7,13 +7,6 @@
 #include <stdlib.h>
 #include <string.h>
 
-/* The compiled laws (machine code made from the functions that Sealscope simulates with). They return 0 and write a
-   code of failure to `code`. */
-int sealscope_start(int64_t *code, void **unused, double *values, double *inputs, double x_0, double *y);
-int sealscope_advance(int64_t *code, void **unused, double *values, double *inputs, double *slopes, double *y,
-                      double span, int64_t steps);
-int sealscope_report(int64_t *code, void **unused, double *values, double *inputs, double *y, double *results);
-
 static const double START_VALUES[N_VALUES] = VALUES_AT_START;
 static const char PRESENT[N_VALUES] = VALUES_PRESENT;
 
@@ -64,7 +57,7 @@ void unit_reset(Instance *unit) {
 static int at_standstill(Instance *unit) {
     Block *b = &unit->block;
     int64_t code = 0;
-    sealscope_start(&code, NULL, b->values, b->inputs, b->start_position, b->y);
+    sealscope_start(&code, b->values, b->inputs, b->start_position, b->y);
     return code ? failure(unit, code) : OK;
 }
 
@@ -87,7 +80,6 @@ int unit_started(Instance *unit) {
 
 int unit_get(Instance *unit, uint32_t reference, double *value) {
     Block *b = &unit->block;
-    int64_t code = 0;
     /* the differences are unsigned: large for references below the base */
     if (reference == 0) { /* the time, in FMI 3 */
         *value = b->time;
@@ -98,7 +90,7 @@ int unit_get(Instance *unit, uint32_t reference, double *value) {
     } else if (reference - RESULT_BASE < N_RESULTS) {
         if (!b->fresh) {
             if (b->phase < STEPPING) at_standstill(unit); /* a failure is returned by unit_started */
-            sealscope_report(&code, NULL, b->values, b->inputs, b->y, b->results);
+            sealscope_report(b->values, b->inputs, b->y, b->results);
             b->fresh = 1;
         }
         *value = b->results[reference - RESULT_BASE];
@@ -148,7 +140,7 @@ int unit_advance(Instance *unit, double time, double span) {
         return unit_refuse(unit, WRONG_CALL, "a step must begin at t = %.15g s, got %.15g s", b->time, time);
     steps = ceil(span / b->step * (1.0 - 1e-9));
     if (!(span > 0.0 && steps <= 1e9)) return unit_refuse(unit, WRONG_CALL, "a step must be > 0 s and at most %g s, got %g s", 1e9 * b->step, span);
-    sealscope_advance(&code, NULL, b->values, b->inputs, b->slopes, b->y, span, steps < 1.0 ? 1 : (int64_t)steps);
+    sealscope_advance(&code, b->values, b->inputs, b->slopes, b->y, span, steps < 1.0 ? 1 : (int64_t)steps);
     b->time = time + span;
     for (k = 0; k < N_INPUTS; k++) b->inputs[k] += b->slopes[k] * span;
     b->fresh = 0;

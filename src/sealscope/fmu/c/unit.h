@@ -39,4 +39,10 @@ int unit_keep(Instance *unit, void **state, const void *block, size_t size);
 /* reports a message to the importer, and returns `code` */
 int unit_refuse(Instance *unit, int code, const char *format, ...);
 
+/* What the unit computes. The first two write a code of failure, or 0, to `code`. */
+void sealscope_start(int64_t *code, const double *values, const double *inputs, double x_0, double *y);
+void sealscope_advance(int64_t *code, const double *values, const double *inputs, const double *slopes, double *y,
+                       double span, int64_t steps);
+void sealscope_report(const double *values, const double *inputs, double *y, double *results);
+
 #endif
