@@ -11,6 +11,8 @@ from sealscope.cli.options import say
 from sealscope.errors import InputError
 
 _LANGUAGE = "c: C99; st: Structured Text (IEC 61131-3) as .st, PLCopen XML and .scl."
+_RATE = "Samples a second of the controller, '100 Hz'; by default those of the recordings to learn from."
+_FLOW = "Channel of the pump's flow: theta, omega or q_pump; by default that of the recordings to learn from."
 _LEARN = "Healthy recording from which the program begins to know the machine; repeat."
 
 
@@ -19,8 +21,8 @@ def export(
     output: Annotated[Path, Option("--output", "-o", help="Folder to write into.")],
     machine: Annotated[Path | None, Option(help="File of a commissioned machine (.toml).")] = None,
     rig: Annotated[str | None, Option(help="Without --machine: name or file of a rig (thesis).")] = None,
-    rate: Annotated[str, Option(help="Samples a second of the controller.")] = "100 Hz",
-    flow: Annotated[str, Option(help="Channel of the pump's flow: theta, omega or q_pump.")] = "theta",
+    rate: Annotated[str | None, Option(help=_RATE)] = None,
+    flow: Annotated[str | None, Option(help=_FLOW)] = None,
     alarms: Annotated[float, Option("--false-alarms", help="False alarms in 1000 h of a healthy machine.")] = 1.0,
     learn: Annotated[list[Path] | None, Option(metavar="FILE", help=_LEARN)] = None,
     precision: Annotated[str, Option(help="Of C's real numbers: double or single (with --learn).")] = "double",
@@ -48,7 +50,7 @@ def export(
         output,
         language=language,  # type: ignore[arg-type]
         rig=sizes,
-        rate=parse_quantity(rate, "Hz", name="rate"),
+        rate=None if rate is None else parse_quantity(rate, "Hz", name="rate"),
         flow=flow,
         false_alarms_per_1000_h=alarms,
         learn=recordings,
@@ -57,9 +59,12 @@ def export(
         origin="" if machine is None else machine.name,
     )
     names = ", ".join(path.name for path in written.files)
-    lines = [f"{output}: {names}", f"state {written.state_bytes} bytes, {written.parts_a_sample} parts a sample"]
+    lines = [
+        f"{output}: {names}",
+        f"{written.rate:g} Hz, state {written.state_bytes} bytes, {written.parts_a_sample} parts a sample",
+    ]
     if paths:
-        lines.append(f"learned from {written.learned_blocks} blocks of {len(paths)} recordings")
+        lines.append(f"learned from {written.learned_blocks} blocks, recordings: {len(paths)}")
     if written.single_error is not None:
         lines.append(f"single precision errs by at most {written.single_error:.2g} standard deviations of a block")
     say("\n".join(lines))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from sealscope.diagnosis.inference.rows.row_weights import MAX_ITERATIONS, SUPPORT
 from sealscope.diagnosis.live.kernel.step import MAX_ONSETS
-from sealscope.diagnosis.live.kernel.stream import ADDED_A_CALL, HALVINGS, WEIGHED_A_CALL, StreamSettings
+from sealscope.diagnosis.live.kernel.stream import ADDED_A_CALL, HALVINGS, REASONS, WEIGHED_A_CALL, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LEARNED
 from sealscope.emit.c99 import CText
 from sealscope.emit.run_program import CompiledStream
@@ -56,6 +56,16 @@ def parts_a_sample(settings: StreamSettings) -> int:
     return math.ceil(most_parts() / (_MARGIN * n_stride * block_strides))
 
 
+def sample_headings(settings: StreamSettings) -> list[str]:
+    """Return the headings of the columns of samples, as recordings are written."""
+    return [f"{name} [{CHANNEL_UNITS[name]}]" for name in settings.channels]
+
+
+def result_headings() -> list[str]:
+    """Return the headings of the columns of results."""
+    return [f"{name} [{unit}]" for name, unit, _ in result_rows()]
+
+
 def render_c(
     unit: StreamProgram,
     *,
@@ -90,6 +100,9 @@ def render_c(
         "flow_meaning": f"{LONG_NAMES[flow]} {flow} [{CHANNEL_UNITS[flow]}]",
         "block_seconds": f"{BLOCK_SECONDS:g}",
         "first_seconds": f"{LEARNED * BLOCK_SECONDS:g}",
+        "columns": sample_headings(unit.settings),
+        "headings": result_headings(),
+        "reasons": list(REASONS.values()),
         "most_parts": most_parts(),
         "parts_a_sample": parts_a_sample(unit.settings),
         "alarm_rate": alarm_rate,
@@ -100,8 +113,12 @@ def render_c(
 
 
 def render_vectors(stream: CompiledStream, samples: Array) -> Mapping[str, str]:
-    """Render samples (n, 4) and the results of each block, as files by name."""
+    """Render samples (n, 4) and the results of each block, as files by name, with headings."""
     lines = (",".join("" if math.isnan(v) else repr(float(v)) for v in reading) for reading in samples)
     results = stream.feed(samples, parts_a_sample(stream.unit.settings))
     expected = (",".join(f"{value:.17g}" for value in row) for row in results)
-    return {"vectors.csv": "\n".join([*lines, ""]), "expected.csv": "\n".join([*expected, ""])}
+    headings = ",".join(sample_headings(stream.unit.settings)), ",".join(result_headings())
+    return {
+        "vectors.csv": "\n".join([headings[0], *lines, ""]),
+        "expected.csv": "\n".join([headings[1], *expected, ""]),
+    }

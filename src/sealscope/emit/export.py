@@ -39,6 +39,7 @@ class Export(NamedTuple):
     """
 
     files: tuple[Path, ...]
+    rate: float
     state_bytes: int
     parts_a_sample: int
     learned_blocks: int
@@ -51,8 +52,8 @@ def export_controller(
     *,
     language: Language = "c",
     rig: Rig | str | os.PathLike[str] = "thesis",
-    rate: float = 100.0,
-    flow: str = "theta",
+    rate: float | None = None,
+    flow: str | None = None,
     false_alarms_per_1000_h: float = 1.0,
     learn: Sequence[Recording] = (),
     precision: Precision = "double",
@@ -69,10 +70,11 @@ def export_controller(
         C99, or Structured Text of IEC 61131-3.
     rig : Rig, str or path, default "thesis"
         Sizes of the machine: of its circuit, piston area and pump displacement are used.
-    rate : float, default 100
-        Samples a second [Hz].
-    flow : {"theta", "omega", "q_pump"}, default "theta"
-        Channel that gives the pump's flow: its angle, its speed, or a flow meter.
+    rate : float, optional
+        Samples a second [Hz]; by default that of the recordings to learn from, or 100 Hz.
+    flow : {"theta", "omega", "q_pump"}, optional
+        Channel that gives the pump's flow: its angle, its speed, or a flow meter; by default the one that the
+        recordings to learn from have, or the angle.
     false_alarms_per_1000_h : float, default 1
         Largest number of false alarms of a healthy machine per 1000 operating hours.
     learn : sequence of Recording, optional
@@ -113,6 +115,10 @@ def export_controller(
     if not _PREFIX.fullmatch(prefix) or len(prefix) > 16:
         raise InputError(f"prefix must be a name of at most 16 letters and digits, got {prefix!r}")
     machine = load_rig(rig)
+    if rate is None:
+        rate = float(round(learn[0].rate, 3)) if learn else 100.0
+    if flow is None:
+        flow = (flow_source(learn[0].channels) if learn else None) or "theta"
     unit = stream_program(StreamSettings.from_rig(machine, float(rate), flow, false_alarms_per_1000_h))
     words: dict[str, Any] = {
         "prefix": prefix,
@@ -143,7 +149,8 @@ def export_controller(
     for name, text in texts.items():
         with atomic_write(place / name) as temporary:
             Path(temporary).write_text(text, encoding="utf-8")
-    return Export(tuple(place / name for name in texts), unit.state_bytes, parts_a_sample(unit.settings), blocks, error)
+    files = tuple(place / name for name in texts)
+    return Export(files, unit.settings.rate, unit.state_bytes, parts_a_sample(unit.settings), blocks, error)
 
 
 def _samples_of(recording: Recording, unit: StreamProgram) -> Array:

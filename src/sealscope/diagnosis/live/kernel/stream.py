@@ -216,9 +216,10 @@ class StreamSettings(NamedTuple):
         (balance,) = balances
         unknown = [term.name for term in balance.terms if not term.expression]
         has_flow = rig.circuit.pump_moves_piston or flow == "q_pump"
-        if unknown or not balance.left_expression or not has_flow or rig.circuit.feeds_one_chamber:
-            what = ", ".join(unknown) or f"the flow of {rig.circuit.name}"
-            raise InputError(f"a stream on a controller must have terms that are expressions, got {what}")
+        if not has_flow or rig.circuit.feeds_one_chamber or not balance.left_expression:
+            raise InputError(f"a stream on a controller must have a pump between the chambers, got {rig.circuit}")
+        if unknown:
+            raise InputError(f"a stream on a controller must have terms that are expressions, got {', '.join(unknown)}")
         columns = ColumnRoles(balance)
         fast = columns.fast
         expressions = (*(term.expression for term in balance.terms), balance.left_expression)
