@@ -80,6 +80,20 @@ def min_samples(wavelet: str = "db8", levels: int = 4) -> int:
     return int(deepest_reach.sum()) + 1
 
 
+def find_inside(n_samples: int, wavelet: str = "db8", levels: int = 4) -> slice:
+    """Return the slice of a signal's samples whose details do not depend on padding; InputError for a shorter signal.
+
+    The shortest signal has `min_samples`.
+    """
+    needed = min_samples(wavelet, levels)
+    if n_samples < needed:
+        raise InputError(
+            f"signal must have at least {needed} samples for {levels} levels of {wavelet}, got {n_samples}"
+        )
+    before, after = reach(wavelet, levels)[-1]
+    return slice(int(before), n_samples - int(after))
+
+
 def details(signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4) -> Details:
     """Compute the stationary wavelet details d_1 .. d_levels of a `signal` (n,), all at its length and sampling times.
 
@@ -98,9 +112,7 @@ def details(signal: ArrayLike, *, wavelet: str = "db8", levels: int = 4) -> Deta
     """
     levels = require_levels(levels)
     x = require_finite(signal, ndim=1)
-    needed = min_samples(wavelet, levels)
-    if x.size < needed:
-        raise InputError(f"signal must have at least {needed} samples for {levels} levels of {wavelet}, got {x.size}")
+    find_inside(x.size, wavelet, levels)
     return Details(_atrous_details(x, discrete_wavelet(wavelet), levels), reach(wavelet, levels))
 
 

@@ -605,8 +605,10 @@ def _speed_and_noise(increments: Array, rate: float) -> tuple[float, float]:
     """Compute the mean speed in motion, and the standard deviation of the noise of a speed (`max_rest_rate`)."""
     velocity = increments[np.isfinite(increments)] * rate
     speed = np.abs(velocity)
-    speed = np.minimum(speed, np.quantile(speed, SPEED_QUANTILE)) if speed.size else speed
+    if speed.size:
+        np.minimum(speed, np.quantile(speed, SPEED_QUANTILE), out=speed)
     mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
+    del speed
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
@@ -644,14 +646,27 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
     by default those of the same samples.
     """
     limits = limits or find_lowering_limits(pump_volume, signals)
-    rate, x_step, load = signals.rate, signals.step("x"), np.abs(signals.pressure_difference)
+    rate = signals.rate
     rests = find_rests(pump_volume, rate, limits.pump)
     usual_load = max(limits.load, np.finfo(float).tiny)
-    relative_load = np.where(np.isfinite(load), np.minimum(load, usual_load) / usual_load, 1.0)
+    # arrays are changed in place: a long recording has few copies
+    relative_load = np.abs(signals.pressure_difference)
+    is_missing = ~np.isfinite(relative_load)
+    np.minimum(relative_load, usual_load, out=relative_load)
+    relative_load /= usual_load
+    relative_load[is_missing] = 1.0
     # a leak may equalise the pressures: the piston that it moves is as fast as the load was just before
-    relative_load = np.sqrt(largest_before(relative_load, max(1, round(MIN_REST * rate))))
-    limit = np.maximum(limits.creep * relative_load, limits.noise)
-    excess = np.abs(average_over(AVERAGING_TIME, np.nan_to_num(x_step) * rate, rate)) - limit
+    limit = largest_before(relative_load, max(1, round(MIN_REST * rate)))
+    del relative_load, is_missing
+    np.sqrt(limit, out=limit)
+    limit *= limits.creep
+    np.maximum(limit, limits.noise, out=limit)
+    velocity = np.nan_to_num(signals.step("x"))
+    velocity *= rate
+    excess = average_over(AVERAGING_TIME, velocity, rate)
+    np.abs(excess, out=excess)
+    excess -= limit
+    del velocity, limit
     margin = math.ceil(AVERAGING_TIME * rate)
 
     def extend_both_ways(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
@@ -660,13 +675,21 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
 
     is_turning = extend_both_ways(~rests)  # averages next to motion contain some of it
     window = min(max(1, round(MIN_REST * rate)), len(rests))  # [samples]
-    sums = np.cumsum(np.pad([excess, is_turning], ((0, 0), (1, 0))), axis=1)
-    mean_excess, n_turning = sums[:, window:] - sums[:, :-window]  # over the window after each sample, times its length
-    is_lowering = ~is_turning & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0.0), window)
+    # over the window after each sample, times its length
+    mean_excess, n_turning = (_window_sums(values, window) for values in (excess, is_turning))
+    is_lowering = ~is_turning & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0), window)
     for first, length in find_runs(~is_lowering).tolist():
         if length < INFERENCE.rest.lasting * rate and not is_turning[first : first + length].any():
             is_lowering[first : first + length] = True
     return extend_both_ways(is_lowering)
+
+
+def _window_sums(values: NDArray[Any], length: int) -> NDArray[Any]:
+    """Sum each of the values (n,) and the `length` - 1 values after it, shape (n - `length` + 1,)."""
+    sums = np.cumsum(values)
+    windows = sums[length - 1 :].copy()
+    windows[1:] -= sums[:-length]
+    return windows
 
 
 def largest_before(values: Array, length: int) -> Array:

@@ -21,7 +21,7 @@ from sealscope.diagnosis.inference.changes.features import (
 )
 from sealscope.diagnosis.inference.changes.level_changes import (
     fit_pressure_levels,
-    motion_columns,
+    motion_speed,
     pattern_tests,
     pressure_level_rows,
     top_speed,
@@ -66,10 +66,10 @@ class SignalWindow(SavedAttributes):
         if not self._means.size:
             # subtracted from all blocks, against rounding
             self._means = np.array([channels["p_A"].mean(), channels["p_B"].mean()])
-        motion = motion_columns(channels, rate)  # speed first; None if no motion is recorded
-        speed = 0.0 if motion is None else top_speed(motion)
+        speeds = motion_speed(channels, rate)  # None if no motion is recorded
+        speed = 0.0 if speeds is None else top_speed(speeds)
         max_speed = max(speed, float(self._rows[:, _SPEED].max(initial=0.0)) if self._rows.size else 0.0)
-        fraction_moving = 1.0 if motion is None else float(time_in_motion(motion[None, :, 0], max_speed, rate)[0])
+        fraction_moving = 1.0 if speeds is None else float(time_in_motion(speeds[None], max_speed, rate)[0])
         # design matrix of the regression of the mean pressures on the motion
         design = pressure_level_rows(channels, rate, self._means, max_speed)
         single_block = {name: values[None] for name, values in channels.items()}  # arrays (1, n) of one block

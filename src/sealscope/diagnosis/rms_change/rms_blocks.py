@@ -22,11 +22,13 @@ from sealscope.recordings.corrections.gaps import flag_bridged
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.quality import is_mostly_clipped
 from sealscope.recordings.recording import Array, Recording
-from sealscope.signals.details import QUANTITIES, Details, details, mean_squares, segment_means
-from sealscope.signals.filters import IntArray
+from sealscope.signals.details import QUANTITIES, details, find_inside, mean_squares, segment_means
+from sealscope.signals.filters import IntArray, reach
 
 #: Wavelet quantities on which an alarm may rest: d1 is almost only noise, and d3d4 follows from d3 and d4.
 JUDGED = ("d2", "d3", "d4")
+#: Most samples whose wavelet details are computed together.
+_STRETCH = 2**18
 #: Features of a block's duty, in the order of the columns of `RmsBlocks.duty`.
 DUTY = tuple(vars(RMS_PRIORS.duty))
 
@@ -82,22 +84,28 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 
     Its ends are left out, as the wavelet transform depends on padding there.
     """
-    chambers = judged_chambers(recording)
-    transformed = details(recording[chambers[0]])
-    inside = transformed.inside()
+    chambers, inside = judged_chambers(recording), find_inside(len(recording))
     bounds = np.array([inside.start, inside.stop])
-    log_rms, duty = _measure_blocks(recording, _measure_details(recording, chambers, transformed, bounds), bounds)
+    log_rms, duty = _measure_blocks(recording, _measure_details(recording, chambers, bounds), bounds)
     return log_rms[0], duty[0]
 
 
-def _measure_details(recording: Recording, chambers: Sequence[str], first: Details, bounds: IntArray) -> Array:
+def _measure_details(recording: Recording, chambers: Sequence[str], bounds: IntArray) -> Array:
     """Compute the mean squares (n, 5 c) of the details of c chamber pressures in blocks that end at `bounds` (n + 1,).
 
-    `first`: details of the first chamber; those of the others are computed one at a time, as they are long.
+    The details are computed for a few blocks at a time, with the samples on which they depend: those of a long
+    recording are many.
     """
-    energies = [mean_squares(first, bounds)]
-    energies += [mean_squares(details(recording[chamber]), bounds) for chamber in chambers[1:]]
-    return np.concatenate(energies, axis=1)
+    before, after = reach()[-1]
+    n_blocks, length = len(bounds) - 1, int(np.diff(bounds).max())
+    size = max(1, _STRETCH // length)  # blocks at a time
+    energies = []
+    for first in range(0, n_blocks, size):
+        limits = bounds[first : first + size + 1]
+        begin, end = limits[0] - before, limits[-1] + after
+        parts = [mean_squares(details(recording[chamber][begin:end]), limits - begin) for chamber in chambers]
+        energies.append(np.hstack(parts))
+    return np.concatenate(energies)
 
 
 def _measure_blocks(recording: Recording, energies: Array, bounds: IntArray) -> tuple[Array, Array]:
@@ -113,13 +121,16 @@ def _measure_blocks(recording: Recording, energies: Array, bounds: IntArray) -> 
     else:
         load = recording[chambers[0]] - recording[chambers[0]].mean()
     command = recording.channels.get("u", np.zeros(len(recording)))  # without u: equal in all blocks
-    squares = np.stack([command, np.gradient(command) * recording.rate, load])
-    squares *= squares
+    means, square_means = [], []  # over all samples, and over each block
+    for signal in (command, np.gradient(command) * recording.rate, load):  # one by one, as they are long
+        squares = np.square(signal)
+        means.append(squares.mean())
+        square_means.append(segment_means(squares[None], bounds)[0])
     # lower limit, so that the logarithm is finite in blocks at standstill
-    floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * squares.mean(axis=1, keepdims=True), np.finfo(float).tiny)
+    floor = np.maximum(RMS_PRIORS.blocks.standstill**2 * np.array(means)[:, None], np.finfo(float).tiny)
     with np.errstate(divide="ignore", over="ignore"):
         log_rms = 0.5 * np.log(energies)
-        duty_log_rms = 0.5 * np.log(segment_means(squares, bounds) + floor)  # rows: command, its rate, load
+        duty_log_rms = 0.5 * np.log(square_means + floor)  # rows: command, its rate, load
     direction = segment_means(load[None], bounds) / np.exp(duty_log_rms[-1:])  # mean over RMS of the load
     return log_rms, np.vstack([duty_log_rms, direction]).T
 
@@ -132,14 +143,12 @@ def cut_blocks(recording: Recording) -> RmsBlocks:
     is stuck, whose log RMS has no mean.
     """
     chambers = judged_chambers(recording)
-    transformed = details(recording[chambers[0]])
     cycle = find_cycle(recording)
-    bounds, phases = _block_bounds(transformed.inside(), recording.rate, cycle)
+    bounds, phases = _block_bounds(find_inside(len(recording)), recording.rate, cycle)
     if len(bounds) == 1:  # too short for a block
         no_rms, no_duty = np.empty((0, len(QUANTITIES) * len(chambers))), np.empty((0, len(DUTY)))
         return RmsBlocks(recording.t[bounds], no_rms, no_duty, chambers, cycle)
-    energies = _measure_details(recording, chambers, transformed, bounds)
-    del transformed
+    energies = _measure_details(recording, chambers, bounds)
     log_rms, duty = _measure_blocks(recording, energies, bounds)
     times = recording.t[0] + bounds / recording.rate
     is_complete = ~flag_bridged(recording, bounds)

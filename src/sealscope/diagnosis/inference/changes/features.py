@@ -19,7 +19,7 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, motion_columns, top_speed
+from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, motion_speed, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Information, StepTest, step_test
@@ -159,11 +159,11 @@ def _split_blocks(recording: Recording, length: int) -> tuple[Array, dict[str, A
     if recording.bridged is not None:
         missing = recording.bridged[: count * length].reshape(count, length)
         blocks = {name: np.where(missing, np.nan, values) for name, values in blocks.items()}
-    motion = motion_columns(recording.channels, recording.rate)
+    speed = motion_speed(recording.channels, recording.rate)
     is_moving = np.ones(count, dtype=bool)
-    if motion is not None:
-        speeds = motion[: count * length, 0].reshape(count, length)
-        is_moving = is_in_motion(time_in_motion(speeds, top_speed(motion), recording.rate))
+    if speed is not None:
+        speeds = speed[: count * length].reshape(count, length)
+        is_moving = is_in_motion(time_in_motion(speeds, top_speed(speed), recording.rate))
     return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, blocks, is_moving
 
 

@@ -43,6 +43,8 @@ from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import TINY
 
 _PRIORS = CHANGES.levels
+#: Most samples whose rows are computed together.
+_STRETCH = 2**18
 #: Iterations of the scatter of differences between blocks.
 _SCATTER_ITERATIONS = 20
 #: Channels that show a motion, in the order of preference.
@@ -72,29 +74,41 @@ def find_motion_channel(channels: Collection[str]) -> str | None:
     return next((name for name in MOTIONS if name in channels), None)
 
 
-def motion_columns(channels: Mapping[str, Array], rate: float) -> Array | None:
-    """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
+def motion_speed(channels: Mapping[str, Array], rate: float) -> Array | None:
+    """Compute the speed of a motion (n,): the difference of x or theta over a fixed time, or else omega or u itself.
 
-    `rate`: sampling rate [Hz]. The speed is the difference of x or theta over a fixed time, or else omega or u itself;
-    the acceleration is the difference of the speed over that time. Neither is divided by the time, as only the space
-    of the columns matters to a fit. The position is relative to its mean. Missing values are NaN. Return None if none
-    of these channels is recorded.
+    `rate`: sampling rate [Hz]. Missing values are NaN. Return None if none of these channels is recorded.
     """
     name = find_motion_channel(channels)
     if name is None:
         return None
     values = channels[name]
-    half_length = max(1, round(HALF_DIFFERENCE * rate))  # [samples]
-    speed = central_difference(values, half_length) if name in ("x", "theta") else values
-    motion = [speed, central_difference(speed, half_length)]
-    if name == "x":
-        motion.append(values - np.nanmean(values))
+    return central_difference(values, _half_length(rate)) if name in ("x", "theta") else values
+
+
+def motion_columns(channels: Mapping[str, Array], rate: float, mean_position: float | None = None) -> Array | None:
+    """Compute the columns that describe a motion (n, 2 or 3): speed, acceleration and, if recorded, position.
+
+    The speed is that of `motion_speed`; the acceleration is its difference over the same time; the position is relative
+    to its mean, or to `mean_position`. Return None without a speed.
+    """
+    speed = motion_speed(channels, rate)
+    if speed is None:
+        return None
+    motion = [speed, central_difference(speed, _half_length(rate))]
+    if find_motion_channel(channels) == "x":
+        motion.append(channels["x"] - (np.nanmean(channels["x"]) if mean_position is None else mean_position))
     return np.column_stack(motion)
 
 
-def top_speed(motion: Array) -> float:
-    """Compute the 99 % quantile of the magnitude of the speed, the first column of a `motion` (`motion_columns`)."""
-    return max(float(np.nanpercentile(np.abs(motion[:, 0]), 99.0)), TINY)
+def _half_length(rate: float) -> int:
+    """Compute half the time of the differences that are speeds [samples], at the sampling `rate` [Hz]."""
+    return max(1, round(HALF_DIFFERENCE * rate))
+
+
+def top_speed(speed: Array) -> float:
+    """Compute the 99 % quantile of the magnitude of a speed (n,), NaN where missing."""
+    return max(float(np.nanpercentile(np.abs(speed), 99.0)), TINY)
 
 
 def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
@@ -108,7 +122,7 @@ def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
     if not {"p_A", "p_B"} <= set(recording.channels):
         return None
     means = np.array([recording["p_A"].mean(), recording["p_B"].mean()])
-    rows = pressure_level_rows(recording.channels, recording.rate, means)
+    measure = _LevelGrams(recording, means)
     lengths = [len(recording) // count for count in _PRIORS.blocks]  # block lengths [samples], the shortest first
     cycle = find_cycle(recording)
     if cycle is not None:  # try blocks of whole cycles first
@@ -119,26 +133,60 @@ def estimate_levels(recording: Recording) -> tuple[Array, Array] | None:
         count = len(recording) // max(length, 1)
         if length < 2 or count < min_count:  # a block needs both directions of motion
             continue
-        blocks = rows[: count * length].reshape(count, length, rows.shape[1])
-        gram = blocks.transpose(0, 2, 1) @ blocks
-        values = fit_pressure_levels(gram, length, means)
+        values = fit_pressure_levels(measure.blocks(count, length), length, means)
         if values is not None:
             return recording.t[0] + (np.arange(count) + 0.5) * length / recording.rate, values
     return None
 
 
+class _LevelGrams:
+    """Gram matrices of the `pressure_level_rows` of a recording, some blocks at a time: all rows are many.
+
+    `means` (2,) [Pa]: means of the pressures.
+    """
+
+    def __init__(self, recording: Recording, means: Array) -> None:
+        needed = {"p_A", "p_B", find_motion_channel(recording.channels)}
+        self._channels = {name: values for name, values in recording.channels.items() if name in needed}
+        self._rate, self._means = recording.rate, means
+        self._margin = 2 * _half_length(recording.rate)  # samples on which speed and acceleration depend
+        self._max_speed = 0.0
+        self._mean_position: float | None = None
+        speed = motion_speed(self._channels, recording.rate)
+        if speed is None:
+            return
+        is_known = np.isfinite(speed) & np.isfinite(central_difference(speed, _half_length(recording.rate)))
+        if "x" in self._channels:
+            is_known &= np.isfinite(self._channels["x"])
+            self._mean_position = float(np.nanmean(self._channels["x"]))
+        self._max_speed = top_speed(np.where(is_known, speed, 0.0))
+
+    def blocks(self, count: int, length: int) -> Array:
+        """Compute the Gram matrices (count, m, m) of the first `count` blocks of `length` samples."""
+        size, grams = max(1, _STRETCH // length), list[Array]()
+        for first in range(0, count, size):
+            last = min(first + size, count)
+            begin = max(0, first * length - self._margin)
+            part = {name: values[begin : last * length + self._margin] for name, values in self._channels.items()}
+            rows = pressure_level_rows(part, self._rate, self._means, self._max_speed, self._mean_position)
+            blocks = rows[first * length - begin :][: (last - first) * length].reshape(last - first, length, -1)
+            grams.append(blocks.transpose(0, 2, 1) @ blocks)
+        return np.concatenate(grams)
+
+
 def pressure_level_rows(
-    channels: Mapping[str, Array], rate: float, means: Array, max_speed: float | None = None
+    channels: Mapping[str, Array], rate: float, means: Array, max_speed: float, mean_position: float | None = None
 ) -> Array:
     """Build the rows (n, m) of the fit of pressure levels: 1, sign of the speed, motion (`motion_columns`), p_A, p_B.
 
     The rows of samples at rest or without a known motion are zero. If no motion is recorded, the rows are 1, p_A, p_B.
     `rate`: sampling rate [Hz]; `means` (2,) [Pa]: subtracted from the pressures, against rounding; `max_speed`: highest
-    speed, by default `top_speed`. A sample is at rest below the fraction `levels.slowest` (`priors.toml`) of it.
+    speed: a sample is at rest below the fraction `levels.slowest` (`priors.toml`) of it; `mean_position`: as in
+    `motion_columns`.
     """
-    motion = motion_columns(channels, rate)
+    motion = motion_columns(channels, rate, mean_position)
     n_motion = 0 if motion is None else 1 + motion.shape[1]
-    rows = np.empty((len(channels["p_A"]), 3 + n_motion))  # filled in place: they are the largest array of a verdict
+    rows = np.empty((len(channels["p_A"]), 3 + n_motion))
     rows[:, 0] = 1.0
     for place, (name, mean) in enumerate(zip(("p_A", "p_B"), means, strict=True)):
         np.subtract(channels[name], mean, out=rows[:, 1 + n_motion + place])
@@ -146,7 +194,6 @@ def pressure_level_rows(
         return rows
     is_known = np.asarray(np.isfinite(motion).all(axis=1))
     motion[~is_known] = 0.0
-    max_speed = top_speed(motion) if max_speed is None else max_speed
     is_moving = is_known & (np.abs(motion[:, 0]) > _PRIORS.slowest * max_speed)
     np.sign(motion[:, 0], out=rows[:, 1])
     rows[:, 2 : 1 + n_motion] = motion

@@ -182,26 +182,33 @@ def find_rests(increments: Array, rate: float, limit: float, shortest: float = M
     window, min_length = max(1, round(AVERAGING_TIME * rate)), max(2, round(shortest * rate))  # [samples]
     if len(increments) < window + min_length:
         return np.zeros(len(increments), dtype=bool)
-    sums = np.concatenate([[0.0], np.cumsum(np.where(np.isfinite(increments), increments, 0.0))])
     is_slow = np.empty(len(increments) - window + 1, dtype=bool)
-    _flag_slow_windows(np.asarray(increments, dtype=float), sums, window, limit * window / rate, is_slow)
+    sums = np.zeros(window + 1)
+    _flag_slow_windows(np.asarray(increments, dtype=float), sums, limit * window / rate, is_slow)
     is_rest_start = np.empty(len(increments) - min_length + 1, dtype=bool)
     _flag_runs(extend_flags(is_slow, window), min_length, is_rest_start)
     return extend_flags(is_rest_start, min_length)
 
 
 @kernel
-def _flag_slow_windows(increments: Any, sums: Any, window: int, limit: float, is_slow: Any) -> None:
+def _flag_slow_windows(increments: Any, sums: Any, limit: float, is_slow: Any) -> None:
     """Flag windows of samples, by their first sample, whose sum is at most `limit` and that miss no sample.
 
-    `sums` (n + 1,): sums of the known `increments` (n,) before each sample.
+    `increments` (n,), NaN where missing; `sums` (length of a window + 1,), zeros: space for the last sums of the known
+    increments, in a ring.
     """
-    n_missing = 0
+    window, total, n_missing = len(sums) - 1, 0.0, 0
+    place = 0  # in the ring, of the last sum; the sum before the window follows it
     for i in range(len(increments)):
-        n_missing += 0 if np.isfinite(increments[i]) else 1
+        is_known = np.isfinite(increments[i])
+        total += increments[i] if is_known else 0.0
+        n_missing += 0 if is_known else 1
+        place = place + 1 if place < window else 0
+        sums[place] = total
         first = i - window + 1
         if first >= 0:
-            is_slow[first] = n_missing == 0 and abs(sums[i + 1] - sums[first]) <= limit
+            before = place + 1 if place < window else 0
+            is_slow[first] = n_missing == 0 and abs(total - sums[before]) <= limit
             n_missing -= 0 if np.isfinite(increments[first]) else 1
 
 
