@@ -603,16 +603,17 @@ def _limit_of_rest(mean_speed: float, noise: float, rate: float, fraction: float
 
 def _speed_and_noise(increments: Array, rate: float) -> tuple[float, float]:
     """Compute the mean speed in motion, and the standard deviation of the noise of a speed (`max_rest_rate`)."""
-    velocity = increments[np.isfinite(increments)] * rate
-    speed = np.abs(velocity)
-    if speed.size:
-        np.minimum(speed, np.quantile(speed, SPEED_QUANTILE), out=speed)
-    mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
-    del speed
+    velocity = increments[np.isfinite(increments)]
+    velocity *= rate
     # sixth differences of white noise have 924 times its variance; every second value only, since neighbouring
     # increments share a sample
     differences = np.abs(np.diff(velocity[::2], 6))
     noise = SD_PER_MEDIAN * float(np.median(differences)) / math.sqrt(924.0) if len(differences) else 0.0
+    del differences
+    speed = np.abs(velocity, out=velocity)
+    if speed.size:
+        np.minimum(speed, np.quantile(speed, SPEED_QUANTILE), out=speed)
+    mean_speed = float(speed @ speed) / max(float(speed.sum()), np.finfo(float).tiny)
     return mean_speed, noise
 
 
@@ -622,12 +623,13 @@ def find_lowering_limits(pump_volume: Array, signals: Signals) -> LoweringLimits
     `pump_volume`: as in `flag_lowering`.
     """
     max_flow = max_rest_rate(pump_volume, signals.rate)
-    speed_and_noise = _speed_and_noise(signals.step("x"), signals.rate)
-    load = np.abs(signals.pressure_difference)[~find_rests(pump_volume, signals.rate, max_flow)]  # while it turns
+    speed_and_noise = _speed_and_noise(np.diff(signals["x"]), signals.rate)
+    load = signals.compute_pressure_difference()[~find_rests(pump_volume, signals.rate, max_flow)]  # while it turns
+    np.nan_to_num(np.abs(load, out=load), copy=False)
     return LoweringLimits(
         pump=max_flow,
         creep=_limit_of_rest(*speed_and_noise, signals.rate, INFERENCE.rest.lowers),
-        load=float(np.median(np.nan_to_num(load))) if load.size else 0.0,
+        load=float(np.median(load)) if load.size else 0.0,
         noise=_limit_of_rest(*speed_and_noise, signals.rate, fraction=0.0),
         time=len(load) / signals.rate,
     )
@@ -650,7 +652,8 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
     rests = find_rests(pump_volume, rate, limits.pump)
     usual_load = max(limits.load, np.finfo(float).tiny)
     # arrays are changed in place: a long recording has few copies
-    relative_load = np.abs(signals.pressure_difference)
+    relative_load = signals.compute_pressure_difference()
+    np.abs(relative_load, out=relative_load)
     is_missing = ~np.isfinite(relative_load)
     np.minimum(relative_load, usual_load, out=relative_load)
     relative_load /= usual_load
@@ -661,7 +664,7 @@ def flag_lowering(pump_volume: Array, signals: Signals, limits: LoweringLimits |
     np.sqrt(limit, out=limit)
     limit *= limits.creep
     np.maximum(limit, limits.noise, out=limit)
-    velocity = np.nan_to_num(signals.step("x"))
+    velocity = np.nan_to_num(np.diff(signals["x"]), copy=False)
     velocity *= rate
     excess = average_over(AVERAGING_TIME, velocity, rate)
     np.abs(excess, out=excess)

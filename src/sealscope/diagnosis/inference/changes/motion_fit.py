@@ -81,13 +81,13 @@ def select_motion(recording: Recording) -> Motion | None:
         return None
     values, rate = recording[name], recording.rate
     is_position = name in ("x", "theta")
-    raw_speed = rate * np.gradient(values) if is_position else values
-    speed = average_over(AVERAGING_TIME, raw_speed, rate)
+    increments = np.diff(values) if is_position else values / rate  # changes of the position between samples
+    slowest = max_rest_rate(increments, rate, fraction=CHANGES.healthy.slowest)
+    del increments
+    speed = average_over(AVERAGING_TIME, rate * np.gradient(values) if is_position else values, rate)
     acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
     is_known = np.isfinite(speed) & np.isfinite(acceleration) & np.isfinite(values)
     is_known &= np.isfinite(recording["p_A"]) & np.isfinite(recording["p_B"])
-    increments = np.diff(values) if is_position else values / rate  # changes of the position between samples
-    slowest = max_rest_rate(increments, rate, fraction=CHANGES.healthy.slowest)
     rows = np.flatnonzero(is_known & (np.abs(speed) > slowest))
     if len(rows) < MIN_ROWS:
         return None

@@ -100,7 +100,13 @@ class Signals:
     @cached_property
     def pressure_difference(self) -> Array:
         """p_A - p_B [Pa] in the middle of each sampling interval, without the sensor offset, shape (n - 1,)."""
-        return self.mean("p_A") - self.mean("p_B") - self._offset
+        return self.compute_pressure_difference()
+
+    def compute_pressure_difference(self) -> Array:
+        """Compute `pressure_difference` anew, which the caller may change; it is not kept."""
+        difference = self._difference("p_A", "p_B")
+        difference -= self._offset
+        return difference
 
     @property
     def pressure_root(self) -> Array:
@@ -110,7 +116,13 @@ class Signals:
     @cached_property
     def port_difference(self) -> Array:
         """p_1 - p_2 [Pa] of the two ports of pump or valve, in the middle of each sampling interval, shape (n - 1,)."""
-        return self.mean("p_1") - self.mean("p_2")
+        return self._difference("p_1", "p_2")
+
+    def _difference(self, name: str, other: str) -> Array:
+        """Compute the difference (n - 1,) of the means of two channels, neither of which is kept."""
+        difference = interval_means(self._channels[name])
+        difference -= interval_means(self._channels[other])
+        return difference
 
     @cached_property
     def absolute_pressure(self) -> Mapping[str, Array]:

@@ -302,7 +302,9 @@ class RecordedBalance:
             channels = derive_drive_signals(channels, self.rig, rate)
         signals = Signals(channels, rate)
         pumped = self.equations[0].left(signals)
-        return np.where(flag_lowering(pumped, signals), np.nan, pumped)
+        is_lowering = flag_lowering(pumped, signals)
+        del signals  # its arrays are as long as the recording
+        return np.where(is_lowering, np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:
         """Compute the pump's flow [m^3/s] beyond the one that moves the piston, shape (n - 1,), at least 0.
@@ -614,10 +616,11 @@ class RecordedBalance:
         equation = self.equations[0] if regime is None else regime.equations[0]
         if regime is not None:
             limits = find_rest_limits(channels, rate, equation)
-        signals = Signals(channels, rate, offset=offset, rest_limits=limits)
-        pressure = np.abs(signals.pressure_difference)
-        left = equation.left
-        is_moving, is_holding = signals.moving(left) > 0.0, signals.holding(left) > 0.0
+        signals = Signals(channels, rate, rest_limits=limits)
+        is_moving, is_holding = signals.moving(equation.left) > 0.0, signals.holding(equation.left) > 0.0
+        del signals  # its arrays are as long as the recording
+        pressure = Signals(channels, rate, offset=offset).compute_pressure_difference()
+        np.abs(pressure, out=pressure)
         states = ~is_moving & ~is_holding, is_moving, is_holding
         return StateLoads(*(StateLoad.measure(pressure, is_counted) for is_counted in states))
 
