@@ -93,19 +93,26 @@ def measure_levels(recording: Recording) -> tuple[Array, Array]:
 def _measure_details(recording: Recording, chambers: Sequence[str], bounds: IntArray) -> Array:
     """Compute the mean squares (n, 5 c) of the details of c chamber pressures in blocks that end at `bounds` (n + 1,).
 
-    The details are computed for a few blocks at a time, with the samples on which they depend: those of a long
-    recording are many.
+    The details are computed for some samples at a time, with those on which they depend, as they are many in a long
+    recording: for a few blocks, or for parts of a long block.
     """
     before, after = reach()[-1]
-    n_blocks, length = len(bounds) - 1, int(np.diff(bounds).max())
-    size = max(1, _STRETCH // length)  # blocks at a time
+    parts = np.ceil(np.diff(bounds) / _STRETCH).astype(np.int64)  # of each block
+    starts = np.repeat(np.cumsum(parts) - parts, parts)  # number of the first part of its block, for each part
+    lengths = np.repeat(np.diff(bounds) / parts, parts)
+    edges = np.repeat(bounds[:-1], parts) + np.rint((np.arange(len(starts)) - starts) * lengths).astype(np.int64)
+    edges = np.append(edges, bounds[-1])
+    size = max(1, _STRETCH // int(np.diff(edges).max()))  # parts at a time
     energies = []
-    for first in range(0, n_blocks, size):
-        limits = bounds[first : first + size + 1]
+    for first in range(0, len(starts), size):
+        limits = edges[first : first + size + 1]
         begin, end = limits[0] - before, limits[-1] + after
-        parts = [mean_squares(details(recording[chamber][begin:end]), limits - begin) for chamber in chambers]
-        energies.append(np.hstack(parts))
-    return np.concatenate(energies)
+        chunk = [mean_squares(details(recording[chamber][begin:end]), limits - begin) for chamber in chambers]
+        energies.append(np.hstack(chunk))
+    if len(starts) == len(parts):
+        return np.concatenate(energies)
+    sums = np.add.reduceat(np.concatenate(energies) * np.diff(edges)[:, None], np.cumsum(parts) - parts)
+    return np.asarray(sums / np.diff(bounds)[:, None])
 
 
 def _measure_blocks(recording: Recording, energies: Array, bounds: IntArray) -> tuple[Array, Array]:

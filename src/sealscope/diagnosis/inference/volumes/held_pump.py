@@ -47,7 +47,8 @@ def estimate_pump_leakage(
     windows, last_end = [], -np.inf
     for hold in holds:
         begin = max(last_end, hold.t[0] - INFERENCE.held_oil.before)  # not within the previous hold
-        samples = np.flatnonzero(is_known & (t > begin) & (t < hold.t[0]))
+        first, last = int(np.searchsorted(t, begin, side="right")), int(np.searchsorted(t, hold.t[0]))
+        samples = first + np.flatnonzero(is_known[first:last])
         windows.append(samples[:: max(1, int(rate / MAX_RATE))])
         last_end = hold.t[-1]
     rows = np.concatenate(windows)
