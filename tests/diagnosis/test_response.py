@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -150,10 +151,23 @@ def test_a_machine_that_is_known_tells_a_leak_from_its_gain_and_its_oil(lpm: flo
     judged = record(102, **({"leak": f"{lpm} L/min"} if lpm else {}))
     leak = detector.observe(judged, healthy).leak
     true_rise = lpm * LITRE_PER_MINUTE / float(np.mean(np.abs(judged["p_A"] - judged["p_B"])))
-    assert leak.rise.value == pytest.approx(true_rise, rel=0.1, abs=7e-13)
+    # at the optimum of a nonlinear model a large leak reads some 15 % low, within its interval
+    assert leak.rise.value == pytest.approx(true_rise, rel=0.2, abs=7e-13)
     assert lpm * LITRE_PER_MINUTE < leak.bound_flow
     flow, half = leak.rise_flow.value, WITHIN_95 * math.hypot(leak.rise_flow.deviation, 0.17 * leak.rise_flow.value)
     assert flow - half <= lpm * LITRE_PER_MINUTE <= flow + half
+
+
+def test_the_fit_ends_at_its_optimum_whatever_the_last_digits() -> None:
+    """Where the steps stop above the optimum, the last digits of the samples decide where, and what a step scores."""
+    recording = ss.simulate(command="3 sin(4t)", duration=60.0, seed=2).only(("u", "p_A", "p_B"))
+    scores = []
+    for factor in (1.0, 1.0 + 1e-9, 1.0 - 1e-7):
+        channels = {**recording.channels, "p_A": factor * recording["p_A"]}
+        leak = measure_leak(replace(recording, channels=channels), THESIS)
+        assert leak is not None and leak.step is not None
+        scores.append(leak.step.score)
+    assert np.ptp(scores) < 0.1 * np.mean(scores)
 
 
 def test_the_law_of_most_healthy_recordings_is_that_of_the_machine() -> None:

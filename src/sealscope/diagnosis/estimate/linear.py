@@ -10,18 +10,21 @@ integrated out by a Schur complement. All blocks, recordings and equations of th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.linalg.lapack import dposv
 
+from sealscope.compiled import large_law
 from sealscope.recordings.recording import Array
 
 #: Relative increase of a matrix diagonal, against rounding.
 RIDGE = 1e-10
 #: Largest prior precision of a coefficient over that by the data: enough to fix the coefficient.
-_MAX_PRIOR = 1e9
+MAX_PRIOR = 1e9
 _LOG_2_PI = float(np.log(2.0 * np.pi))
 
 
@@ -45,6 +48,36 @@ def solve(matrix: Array, right: Array) -> Array:
     if has_failed:  # not positive definite, by rounding
         solution = np.asarray(np.linalg.solve(scaled, scaled_right))
     return np.asarray(solution / right_scale)
+
+
+@large_law
+def solve_in_place(matrix: Any, values: Any, scale: Any) -> None:
+    """Solve a system of equations as `solve` does, in compiled code.
+
+    `matrix` (n, n): positive semidefinite, of which the upper triangle is used and overwritten by D L' of its factors
+    L D L'; `values` (n,): right side, replaced by the solution; `scale` (n,): scratch.
+    """
+    n = len(values)
+    for i in range(n):
+        scale[i] = 1.0 / math.sqrt(matrix[i, i]) if matrix[i, i] > 0.0 else 1.0
+    for i in range(n):
+        values[i] *= scale[i]
+        for j in range(i, n):
+            matrix[i, j] *= scale[i] * scale[j]
+        matrix[i, i] += RIDGE
+    for i in range(n):
+        inverse = 1.0 / matrix[i, i]
+        for k in range(i + 1, n):
+            factor = matrix[i, k] * inverse
+            values[k] -= factor * values[i]
+            for j in range(k, n):
+                matrix[k, j] -= factor * matrix[i, j]
+    for i in range(n - 1, -1, -1):
+        for j in range(i + 1, n):
+            values[i] -= matrix[i, j] * values[j]
+        values[i] /= matrix[i, i]
+    for i in range(n):
+        values[i] *= scale[i]
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,4 +223,4 @@ def limit_precisions(prior: Array, precision: Array) -> Array:
 
     This is enough to fix a coefficient, and 0 for a column of zeros, whose coefficient `solve` makes 0.
     """
-    return np.minimum(prior, _MAX_PRIOR * np.diag(precision))
+    return np.minimum(prior, MAX_PRIOR * np.diag(precision))

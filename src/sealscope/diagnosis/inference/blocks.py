@@ -24,7 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.estimate.linear import RIDGE, Gaussian, limit_precisions, solve
+from sealscope.compiled import kernel, large_law, law
+from sealscope.diagnosis.estimate.linear import MAX_PRIOR, RIDGE, Gaussian, solve, solve_in_place
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
 from sealscope.diagnosis.inference.onset import History, Information
 from sealscope.diagnosis.inference.rows.row_weights import (
@@ -47,6 +48,7 @@ DRIFT_DEGREE = 2
 UNSTEADY = ("piston", "pump", "bias", "outside")
 #: Maximum number of Gauss-Newton steps to the offset of p_A - p_B.
 _MAX_OFFSET_STEPS = 3
+_TINY = float(np.finfo(float).tiny)
 
 
 @dataclass(frozen=True, eq=False)
@@ -341,7 +343,7 @@ class ColumnRoles:
 
         The error is that of the driving pressure [Pa] for a laminar leak, that of its root [Pa^0.5] for an orifice. It
         is 0 if no pressure drives the column's term, and in an equation without flow offset, whose column is needed to
-        remove the error (`_shift_offset`). The prior standard deviation of the sensor's offset [Pa] is limited to the
+        remove the error (`_sum_products`). The prior standard deviation of the sensor's offset [Pa] is limited to the
         mean of abs(p_A - p_B - zero) over `blocks`: pressures recorded in counts are much smaller numbers.
         """
         driver = self.drivers[column] if self.bias is not None else ""
@@ -461,65 +463,189 @@ class _NormalEquations(NamedTuple):
 
 
 def _build_normal_equations(
-    gram: Array, polynomials: Array, nuisance: list[int], test: int, left: int
+    gram: Array, polynomials: Array, nuisance: Sequence[int], test: int, left: int
 ) -> _NormalEquations:
     """Build the normal equations of a regression on drifting nuisance columns and one tested column.
 
     `gram` (K, m, m): Gram matrices of K blocks; `polynomials` (K, n_polynomials): drift polynomials; `nuisance`,
     `test`, `left`: indices of the nuisance columns, of the tested one and of the left side.
     """
-    n, n_polynomials = len(nuisance), polynomials.shape[1]
-    size = n * n_polynomials
-    # sum over k of gram[k, i, j] P_p P_q by one matrix product, which is faster than einsum
-    products = (polynomials[:, :, None] * polynomials[:, None, :]).reshape(len(gram), n_polynomials**2)
-    sums = gram[:, nuisance][:, :, nuisance].reshape(len(gram), n * n).T @ products
-    # a column for each pair of a nuisance column (i or j) and a polynomial (p or q): (i, j, p, q) to (i p, j q)
-    precision = sums.reshape(n, n, n_polynomials, n_polynomials).transpose(0, 2, 1, 3).reshape(size, size)
-    moment = np.einsum("ki,kp->ip", gram[:, nuisance, left], polynomials).ravel()
-    return _NormalEquations(
-        Gaussian(precision, moment, float(gram[:, left, left].sum())),
-        coupling=np.einsum("ki,kp->kip", gram[:, nuisance, test], polynomials).reshape(len(gram), size),
-        energy=gram[:, test, test],
-        tested_moment=gram[:, test, left],
+    sums, size = _Sums.allocate(len(gram), (len(nuisance) + 1) * polynomials.shape[1]), polynomials.shape[1]
+    _sum_products(gram, polynomials, np.array(nuisance, np.int64), (test, left, -1), 0.0, np.zeros(len(gram)), 0, sums)
+    normal = sums.normal_equations(gram, left)  # last are the columns of the offset, which are zero
+    nuisance_sums = Gaussian(
+        normal.nuisance.precision[:-size, :-size], normal.nuisance.moment[:-size], normal.nuisance.square
     )
+    return normal._replace(nuisance=nuisance_sums, coupling=normal.coupling[:, :-size])
 
 
-def _fit_nuisance(
-    normal: _NormalEquations, deviations: Array, prior_mean: Array, n_rows: float
-) -> tuple[Array, Array, Array, float]:
-    """Fit all coefficients of a regression except the tested one, and the residual variance of a row.
+class _Sums(NamedTuple):
+    """Arrays of `_NormalEquations` that `_sum_products` writes, with c columns and K blocks."""
 
-    `normal`: normal equations, from which the tested coefficient, free in each block, is eliminated; `deviations`,
-    `prior_mean` (c,): standard deviations and means of the normal priors on the c other coefficients (a deviation of 0
-    fixes a coefficient, an infinite one is no prior); `n_rows`: number of rows in all blocks.
+    precision: Array  # (c, c)
+    moment: Array  # (c,)
+    coupling: Array  # (K, c)
+    energy: Array  # (K,)
+    tested_moment: Array  # (K,)
 
-    The variance of a row, `row_variance`, weights the prior, and so determines the fit: both are found by iteration,
-    until the variance changes by at most the fraction `TOLERANCE`, or for `MAX_ITERATIONS`. Rows that overlap are
-    correlated, as if their variance were OVERLAP times as large. The weight of the prior and the returned variance
-    contain this factor. Returns `coefficients`, `prior_precision`, `prior_moment` and `variance` of `_EquationFit`.
+    @staticmethod
+    def allocate(n_blocks: int, size: int) -> _Sums:
+        """Make the arrays for `size` columns."""
+        return _Sums(*(np.empty(shape) for shape in ((size, size), size, (n_blocks, size), n_blocks, n_blocks)))
+
+    def normal_equations(self, gram: Array, left: int) -> _NormalEquations:
+        """Make the normal equations with these sums; `gram`, `left`: as in `_build_normal_equations`."""
+        nuisance = Gaussian(self.precision, self.moment, float(gram[:, left, left].sum()))
+        return _NormalEquations(nuisance, self.coupling, self.energy, self.tested_moment)
+
+
+@large_law
+def _sum_products(
+    gram: Any,
+    polynomials: Any,
+    nuisance: Any,
+    columns: tuple[int, int, int],
+    offset: float,
+    tested: Any,
+    first: int,
+    sums: Any,
+) -> None:
+    """Write the sums of products of a regression's columns over the rows of K blocks to `sums` (`_Sums`).
+
+    Each nuisance column, and last that of an error of the sensor offset, is multiplied by each drift polynomial.
+    `columns`: indices of the tested column, of the left side, and of the flow offset's column, -1 without one. The
+    tested column is a pressure or its root times the sampling interval dt, and the flow offset's is dt: `offset` [Pa]
+    or [Pa^0.5] times dt is subtracted from the former, and the column of the error is -g dt, the derivative of the
+    volume balance with respect to the offset, where g are the coefficients `tested` (K,). Without a flow offset nothing
+    is corrected, and the last column is zero. Products of nuisance columns before the one at index `first`, which do
+    not depend on the offset, stay as they are. For the other arguments see `_build_normal_equations`.
     """
-    data = normal.eliminate_tested()
-    min_variance = 1e-14 * normal.nuisance.square / n_rows  # rounding errors of the sums
-    row_variance = max(data.square / n_rows, min_variance)
-    for _ in range(MAX_ITERATIONS):
-        # prior precision times the variance; the deviation of a drift is relative to the coefficient, which may be 0:
-        # the precision is then infinite
-        with np.errstate(divide="ignore", over="ignore"):
-            precision = OVERLAP * row_variance / deviations**2
-        # the diagonal of `data` would be no measure of the limit, as the elimination may leave only rounding errors
-        prior_precision = limit_precisions(precision, normal.nuisance.precision)
-        prior_moment = prior_precision * prior_mean
-        coefficients = (data + Gaussian(np.diag(prior_precision), prior_moment)).mean
-        # by the normal equations, the difference is the sum of squared residuals plus c' P (c - mu), with the prior's
-        # precision P and mean mu; this is about OVERLAP row variances for each coefficient with a prior, a small share
-        # with many rows
-        previous, row_variance = (
-            row_variance,
-            max((data.square - float(data.moment @ coefficients)) / n_rows, min_variance),
-        )
-        if abs(row_variance - previous) <= TOLERANCE * previous:
+    test, left, bias = columns
+    n, n_polynomials = len(nuisance), polynomials.shape[1]
+    shift = offset if bias >= 0 else 0.0
+    for i in range(first * n_polynomials, len(sums.moment)):
+        sums.moment[i] = 0.0
+        for j in range(i + 1):
+            sums.precision[i, j] = 0.0
+    for k in range(len(gram)):
+        block, factors = gram[k], polynomials[k]
+        sums.energy[k] = block[test, test] - 2.0 * shift * block[bias, test] + shift * shift * block[bias, bias]
+        sums.tested_moment[k] = block[test, left] - shift * block[bias, left]
+        for i in range(n + 1):
+            # the column of the error is a multiple of the flow offset's column
+            row, factor = (nuisance[i], 1.0) if i < n else (bias, -tested[k] if bias >= 0 else 0.0)
+            by_test = factor * (block[row, test] - shift * block[row, bias])
+            for p in range(n_polynomials):
+                sums.coupling[k, i * n_polynomials + p] = by_test * factors[p]
+            if i < first:
+                continue
+            for p in range(n_polynomials):
+                place, weight = i * n_polynomials + p, factor * factors[p]
+                sums.moment[place] += weight * block[row, left]
+                for j in range(i + 1):
+                    product = weight * (block[row, nuisance[j]] if j < n else factor * block[row, row])
+                    for q in range(n_polynomials):
+                        sums.precision[place, j * n_polynomials + q] += product * factors[q]
+    for i in range(first * n_polynomials, len(sums.moment)):
+        for j in range(i):
+            sums.precision[j, i] = sums.precision[i, j]
+
+
+@kernel
+def _fit_regression(
+    gram: Any,
+    polynomials: Any,
+    nuisance: Any,
+    columns: tuple[int, int, int],
+    deviations: Any,
+    offset_deviation: float,
+    n_rows: float,
+    sums: Any,
+    fitted: Any,
+) -> tuple[float, float]:
+    """Fit the coefficients of an equation but the tested one, and the sensor offset, by Gauss-Newton steps.
+
+    `deviations` (c,): standard deviations of the normal priors on the coefficients (0 fixes a coefficient, an infinite
+    one is no prior), whose means are 0 except for the last column's, the offset's error; `n_rows`: number of rows in
+    all blocks; for the other arguments see `_sum_products`. Writes the last normal equations to `sums`, and to the rows
+    of `fitted` (3, c) `coefficients`, `prior_precision` and `prior_moment` of `_EquationFit`; returns its `offset` and
+    `variance`.
+
+    The variance of a row weights the prior, and so determines the fit: both are found by iteration, until the variance
+    changes by at most the fraction `TOLERANCE`, or for `MAX_ITERATIONS`. Rows that overlap are correlated, as if their
+    variance were OVERLAP times as large. The weight of the prior and the returned variance contain this factor.
+    """
+    n_blocks, size, left = len(gram), len(deviations), columns[1]
+    n_polynomials = polynomials.shape[1]
+    last, offset, variance = size - n_polynomials, 0.0, 0.0  # `last`: constant of the offset's error
+    precision, factors, moment, scale = np.empty((size, size)), np.empty((size, size)), np.empty(size), np.empty(size)
+    tested = np.zeros(n_blocks)  # g in each block
+    total = 0.0
+    for k in range(n_blocks):
+        total += gram[k, left, left]
+    min_variance = 1e-14 * total / n_rows  # rounding errors of the sums
+    for iteration in range(_MAX_OFFSET_STEPS + 1):
+        first = len(nuisance) if iteration else 0
+        _sum_products(gram, polynomials, nuisance, columns, offset, tested, first, sums)
+        square = _eliminate_tested(sums, precision, moment, total)
+        variance = max(square / n_rows, min_variance)
+        for _ in range(MAX_ITERATIONS):
+            for i in range(size):
+                # the diagonal of `precision` would be no measure of the limit, as the elimination may leave only
+                # rounding errors; the deviation of a drift is relative to the coefficient, which may be 0
+                limit = MAX_PRIOR * sums.precision[i, i]
+                prior = OVERLAP * variance / deviations[i] ** 2 if deviations[i] > 0.0 else np.inf
+                fitted[1, i] = min(prior, limit)
+                fitted[2, i] = -offset * fitted[1, i] if i == last else 0.0
+                fitted[0, i] = moment[i] + fitted[2, i]
+                for j in range(i, size):
+                    factors[i, j] = precision[i, j]
+                factors[i, i] += fitted[1, i]
+            solve_in_place(factors, fitted[0], scale)
+            # by the normal equations, the difference is the sum of squared residuals plus c' P (c - mu), with the
+            # prior's precision P and mean mu; this is about OVERLAP row variances for each coefficient with a prior, a
+            # small share with many rows
+            previous, explained = variance, 0.0
+            for i in range(size):
+                explained += moment[i] * fitted[0, i]
+            variance = max((square - explained) / n_rows, min_variance)
+            if abs(variance - previous) <= TOLERANCE * previous:
+                break
+        step = fitted[0, last]
+        # in the first iteration g is 0, so that the offset has no effect
+        if iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0:
             break
-    return coefficients, prior_precision, prior_moment, max(OVERLAP * row_variance, np.finfo(float).tiny)
+        if iteration > 0 and abs(step) <= TOLERANCE * offset_deviation:
+            break
+        offset += step
+        for k in range(n_blocks):
+            residual = sums.tested_moment[k]
+            for i in range(size):
+                residual -= sums.coupling[k, i] * fitted[0, i]
+            tested[k] = residual / max(sums.energy[k], _TINY)
+    return offset, max(OVERLAP * variance, _TINY)
+
+
+@law
+def _eliminate_tested(sums: Any, precision: Any, moment: Any, square: float) -> float:
+    """Write `_NormalEquations.eliminate_tested` of `sums` to `precision` (upper triangle) and `moment`.
+
+    `square`: sum of squares of the left side; returns it after the elimination.
+    """
+    size = len(moment)
+    for i in range(size):
+        moment[i] = sums.moment[i]
+        for j in range(i, size):
+            precision[i, j] = sums.precision[i, j]
+    for k in range(len(sums.energy)):
+        energy = max(sums.energy[k], _TINY)  # where it is 0, `coupling` and `tested_moment` are 0
+        square -= sums.tested_moment[k] ** 2 / energy
+        for i in range(size):
+            factor = sums.coupling[k, i] / energy
+            moment[i] -= factor * sums.tested_moment[k]
+            for j in range(i, size):
+                precision[i, j] -= factor * sums.coupling[k, j]
+    return square
 
 
 class _EquationFit(NamedTuple):
@@ -583,50 +709,19 @@ def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: 
     offset_deviation = roles.offset_deviation(test, blocks)
     # prior standard deviations of constants and drifts; last those of the offset, whose drift is 0, and whose constant
     # has no prior if the offset has no effect
-    deviations, prior_mean = np.zeros((2, len(nuisance) + 1, n_polynomials))
+    deviations = np.zeros((len(nuisance) + 1, n_polynomials))
     deviations[:-1, 0] = level
     drifts = np.hypot(magnitudes * roles.drift_rate[nuisance], roles.clock_drifts(total)[nuisance])  # in a minute
     deviations[:-1, 1:] = (drifts * (seconds / 60.0))[:, None]
     deviations[-1, 0] = offset_deviation if offset_deviation > 0.0 else np.inf
-    nuisance_and_offset = [*nuisance, gram.shape[1]]  # `_shift_offset` appends the offset's column
-    offset, tested_coefficients = 0.0, np.zeros(len(blocks))  # z, and g in each block
-    for iteration in range(_MAX_OFFSET_STEPS + 1):
-        shifted = _shift_offset(gram, roles, test, tested_coefficients, offset)
-        normal = _build_normal_equations(shifted, polynomials, nuisance_and_offset, test, roles.left)
-        prior_mean[-1, 0] = -offset  # of the remaining error
-        nuisance_fit = _fit_nuisance(normal, deviations.ravel(), prior_mean.ravel(), n_rows)
-        fit = _EquationFit(nuisance, polynomials, normal, offset, *nuisance_fit)
-        step = float(fit.coefficients[-n_polynomials])  # constant part of the last coefficient, the offset's error
-        is_last = iteration == _MAX_OFFSET_STEPS or not offset_deviation > 0.0
-        # in the first iteration g is 0, so that the offset has no effect
-        if is_last or (iteration > 0 and abs(step) <= TOLERANCE * offset_deviation):
-            break
-        offset += step
-        tested_residual = normal.tested_moment - normal.coupling @ fit.coefficients
-        tested_coefficients = tested_residual / np.maximum(normal.energy, np.finfo(float).tiny)
-    return fit
-
-
-def _shift_offset(gram: Array, roles: ColumnRoles, test: int, coefficients: Array, offset: float) -> Array:
-    """Correct one column of Gram matrices for a sensor offset, and append a column for the error of that offset.
-
-    `gram` (K, m, m): Gram matrices of K blocks; `test`: index of the corrected column, a pressure or its root times the
-    sampling interval dt, from which `offset` [Pa] or [Pa^0.5] times dt is subtracted; `coefficients` (K,): coefficient
-    g of this column in each block. The last column of the result (K, m + 1, m + 1) is -g dt, the derivative of the
-    volume balance with respect to the offset. Without a flow offset, whose column is dt, nothing is corrected, and the
-    last column is zero.
-    """
-    size = gram.shape[1]
-    if not offset and not coefficients.any():  # the appended column is zero
-        shifted = np.zeros((len(gram), size + 1, size + 1))
-        shifted[:, :size, :size] = gram
-        return shifted
-    transform = np.zeros((len(gram), size, size + 1))
-    transform[:, :, :size] = np.eye(size)
-    if roles.bias is not None:  # the column of the flow offset is dt
-        transform[:, roles.bias, test] -= offset  # tested column minus offset dt
-        transform[:, roles.bias, size] -= coefficients  # appended column -g dt
-    return np.asarray(transform.transpose(0, 2, 1) @ gram @ transform)
+    sums, fitted = _Sums.allocate(len(gram), deviations.size), np.empty((3, deviations.size))
+    columns, places = (test, roles.left, -1 if roles.bias is None else roles.bias), np.array(nuisance, np.int64)
+    offset, variance = _fit_regression(
+        gram, polynomials, places, columns, deviations.ravel(), offset_deviation, n_rows, sums, fitted
+    )
+    normal = sums.normal_equations(gram, roles.left)
+    coefficients, prior_precision, prior_moment = fitted
+    return _EquationFit(nuisance, polynomials, normal, offset, coefficients, prior_precision, prior_moment, variance)
 
 
 def offset_cost(offset: Any) -> Any:

@@ -159,6 +159,11 @@ class Block(NamedTuple):
     samples: float
     scores: Array
 
+    @property
+    def square(self) -> float:
+        """Sum of squares of the residual [Pa^2]."""
+        return float(self.gram[0, 0])
+
 
 @dataclass(frozen=True, eq=False)
 class Joint:
@@ -167,8 +172,7 @@ class Joint:
     `theta` (K, p): parameters about which the blocks were linearised; `mean` (K p,): fitted deviations from these, in
     units of `priors.unit`, block after block; `factor`: Cholesky factor of their precision, as by `cho_factor`;
     `prior_precision` (K p, K p): prior precision of the same deviations; `variance`: variance of the residual [Pa^2];
-    `squares`: sum of squares of the residual at `theta` [Pa^2]; `samples`: number of known samples; `gain`: decrease of
-    -2 log posterior from `theta` to the fitted parameters in the linearised model.
+    `noise`: the variance inflated by the correlation of the residual, as in `factor`.
     """
 
     priors: Priors
@@ -177,9 +181,7 @@ class Joint:
     factor: tuple[Array, bool]
     prior_precision: Array
     variance: float
-    squares: float
-    samples: float
-    gain: float
+    noise: float
 
     @property
     def fitted(self) -> Array:
@@ -191,21 +193,13 @@ class Joint:
         """Covariance (K p, K p) of the fitted deviations from `theta`."""
         return np.asarray(cho_solve(self.factor, np.eye(self.theta.size), check_finite=False))
 
-    def cost(self, variance: float) -> float:
-        """Compute -2 log posterior of the parameters `theta`, up to a constant, for a noise `variance` [Pa^2]."""
-        return self.squares / variance + prior_cost(self.theta, self.priors, self.prior_precision)
-
     @staticmethod
     def fit(blocks: Sequence[Block], priors: Priors, prior_precision: Array, parameter: int) -> Joint:
         """Fit the parameters of all blocks together, with the `prior_precision` of all deviations.
 
         `parameter`: index of the tested parameter, whose scores (`Block`) show the correlation of the noise.
         """
-        theta = np.array([block.theta for block in blocks])
-        prior_gradient = prior_precision @ ((theta - priors.centre) / priors.unit).ravel()  # at `theta`
-        # row and column 0 of a block's Gram matrix belong to the residual, the others to its derivatives
-        gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
-        gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
+        theta, gram, gradient, prior_gradient = _newton_terms(blocks, priors, prior_precision)
         # variance of the residual at the parameters about which the blocks are linearised (deviations of zero)
         variance, _ = _estimate_noise(blocks, np.zeros(theta.size), parameter)
         inflation = 1.0  # white noise at first
@@ -214,9 +208,7 @@ class Joint:
             vector = gradient / (variance * inflation) - prior_gradient
             mean = cho_solve(factor, vector, check_finite=False)
             variance, inflation = _estimate_noise(blocks, mean, parameter)
-        squares = sum(float(block.gram[0, 0]) for block in blocks)
-        samples = sum(block.samples for block in blocks)
-        return Joint(priors, theta, mean, factor, prior_precision, variance, squares, samples, float(vector @ mean))
+        return Joint(priors, theta, mean, factor, prior_precision, variance, variance * inflation)
 
     def sums(self, parameter: int, step: float) -> Array:
         """Compute the likelihood of the parameters' averages over the recording, as a Gram matrix (p + 1, p + 1).
@@ -274,6 +266,45 @@ def _gram_of_normal(precision: Array, moments: Array, unit: Array) -> Array:
     return np.asarray(0.5 * (gram + gram.T) / units / units[:, None])
 
 
+def _newton_terms(blocks: Sequence[Block], priors: Priors, prior_precision: Array) -> tuple[Array, Array, Array, Array]:
+    """Collect the parameters (K, p) of K blocks and the terms of a Newton step from them, in units of `priors.unit`.
+
+    These are the blocks' Gram matrices of the derivatives (K p, K p), the products of the derivatives with the residual
+    (K p,), and the gradient (K p,) of half of -2 log prior density (`prior_cost`).
+    """
+    theta = np.array([block.theta for block in blocks])
+    # row and column 0 of a block's Gram matrix belong to the residual, the others to its derivatives
+    gram = block_diag(*(block.gram[1:, 1:] for block in blocks))
+    gradient = np.concatenate([block.gram[0, 1:] for block in blocks])
+    return theta, gram, gradient, prior_precision @ ((theta - priors.centre) / priors.unit).ravel()
+
+
+def newton_step(
+    blocks: Sequence[Block], priors: Priors, prior_precision: Array, noise: float, damping: Array
+) -> tuple[Array, float]:
+    """Compute a Newton step of the parameters of K blocks to the minimum of -2 log posterior, (K, p) in `priors.unit`.
+
+    `noise`: variance of the noise [Pa^2]; `damping` (K,): increase of the curvature of each block's residual squares by
+    each parameter, relative to it. Also returns the decrease of -2 log posterior in the linearised model.
+    """
+    theta, gram, gradient, prior_gradient = _newton_terms(blocks, priors, prior_precision)
+    vector = gradient / noise - prior_gradient
+    curvature = gram / noise + prior_precision
+    curvature.flat[:: len(curvature) + 1] += np.repeat(damping, theta.shape[1]) * np.diag(gram) / noise
+    step = cho_solve(cho_factor(curvature, check_finite=False), vector, check_finite=False)
+    return step.reshape(theta.shape), float(vector @ step)
+
+
+def residual_squares(blocks: Sequence[Block], deviations: Array) -> Array:
+    """Compute the residual's sum of squares (K,) [Pa^2] in K blocks by the linearised model.
+
+    `deviations` (K, p): deviations from the parameters of the blocks, in units of `Priors.unit`.
+    """
+    # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
+    directions = np.insert(-deviations, 0, 1.0, axis=1)
+    return np.asarray(np.einsum("ki,kij,kj->k", directions, np.array([block.gram for block in blocks]), directions))
+
+
 def prior_cost(theta: Array, priors: Priors, prior_precision: Array) -> float:
     """Compute -2 log prior density of the parameters `theta` (K, p) of all blocks, up to a constant."""
     deviations = ((theta - priors.centre) / priors.unit).ravel()
@@ -299,12 +330,14 @@ def _estimate_noise(blocks: Sequence[Block], deviations: Array, parameter: int) 
     (K p,): deviations of the parameters from each block's `theta`, in `Priors.unit`; `parameter`: index of the tested
     parameter.
     """
-    # residual at these deviations: (1, -deviations) times the rows of residual and Jacobian
-    directions = [np.append(1.0, -deviation) for deviation in deviations.reshape(len(blocks), -1)]
-    pairs = list(zip(blocks, directions, strict=True))
-    squares = sum(float(direction @ block.gram @ direction) for block, direction in pairs)
+    deviations = deviations.reshape(len(blocks), -1)
     # a sum of squares of at least 1 Pa^2, since the variance is a divisor
-    variance = max(squares, 1.0) / sum(block.samples for block in blocks)
-    scores = np.concatenate([block.scores @ direction for block, direction in pairs])
+    variance = max(float(residual_squares(blocks, deviations).sum()), 1.0) / sum(block.samples for block in blocks)
+    scores = np.concatenate(
+        [
+            block.scores[:, 0] - block.scores[:, 1:] @ deviation
+            for block, deviation in zip(blocks, deviations, strict=True)
+        ]
+    )
     white_variance = variance * sum(float(block.gram[1 + parameter, 1 + parameter]) for block in blocks)
     return variance, max(1.0, float(scores @ scores) / max(white_variance, np.finfo(float).tiny))

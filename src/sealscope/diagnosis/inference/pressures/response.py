@@ -33,7 +33,9 @@ from sealscope.diagnosis.inference.pressures.fit import (
     Normal,
     Priors,
     joint_prior_precision,
+    newton_step,
     prior_cost,
+    residual_squares,
 )
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak, states_flow
 from sealscope.diagnosis.inference.pressures.reduced_rig import (
@@ -76,8 +78,13 @@ _N_STEPS, _MIN_GAIN = 12, 5.0
 _FRACTIONS = np.array([1.0, *np.geomspace(0.5, 0.02, 4)])
 #: Number of conductances from which the fit to a known machine starts.
 _N_CONDUCTANCES = 3
-#: Joint fit of all blocks: maximum number of Gauss-Newton steps; factor on a step after a failed one, and its minimum.
-_N_JOINT_STEPS, _SMALLER_STEP, _SMALLEST_STEP = 20, 0.3, 0.05
+#: Joint fit of all blocks: maximum number of steps; expected decreases of -2 log posterior below which the fit is close
+#: to its minimum, and below which it has converged, a small part of its scatter.
+_N_JOINT_STEPS, _ROUGHLY, _CONVERGED = 20, 10.0, 1.0
+#: Smallest damping of a block, and factors on the damping after a bad step and a good one.
+_MIN_DAMPING, _MORE_DAMPING, _LESS_DAMPING = 0.3, 8.0, 0.1
+#: A step is bad for a block if its squares exceed the expected ones by half of the expected change, plus this.
+_TOLERATED = 0.3
 
 
 def _geometric_grid(middle: float, factor: float, count: int) -> Array:
@@ -499,53 +506,81 @@ def fit_jointly(follower: Follower, blocks: Sequence[Recording], starts: Iterabl
     """Fit the parameters in all K consecutive blocks of a recording together.
 
     `follower`: filter at the first sample; `noise`: variance of the noise [Pa^2]. From each of the `starts`, parameters
-    (K, p), the model is linearised step by step, until a fit explains the recording but for its noise. Returns the best
-    fit; raises LinAlgError if there is none.
+    (K, p), -2 log posterior is minimised by Gauss-Newton steps, until a fit explains the recording but for its noise;
+    the noise is white at first, and then inflated by the correlation of the residual (`Joint.noise`). The model is
+    nonlinear in some blocks: a block is damped in which the residual's squares decrease less than expected
+    (Levenberg-Marquardt). Returns the best fit; raises LinAlgError if there is none.
     """
     states, priors = follower.states, follower.priors
     seconds = float(np.mean([block.duration for block in blocks]))
     prior_precision = joint_prior_precision(len(blocks), priors, seconds)
 
-    def linearise(theta: Array, max_cost: float = math.inf) -> Joint | None:
-        """Simulate all blocks with the parameters `theta` (K, p) and fit them together.
+    def linearise(theta: Array, variance: float, max_cost: float = math.inf) -> tuple[list[Block], float]:
+        """Simulate all blocks with the parameters `theta` (K, p); return their sums, and -2 log posterior of `theta`.
 
-        The result is None if -2 log posterior of `theta` exceeds `max_cost`. The simulation ends as soon as it does.
+        `variance`: that of the noise [Pa^2]. The simulation ends as soon as -2 log posterior exceeds `max_cost`; the
+        sums are then those of the first blocks.
         """
         follower.states, follower.last = states, math.nan
         cost, sums = prior_cost(theta, priors, prior_precision), list[Block]()
         for block, row in zip(blocks, theta, strict=True):
-            if cost > max_cost:
-                return None
-            sums.append(follower.linearise(block, row))
-            cost += float(sums[-1].gram[0, 0]) / noise  # the residual's sum of squares
-        return None if cost > max_cost else Joint.fit(sums, priors, prior_precision, G)
-
-    def converge(joint: Joint) -> Joint:
-        """Take Gauss-Newton steps, or fractions of them, as long as each improves the fit clearly."""
-        fraction = 1.0  # of the next step
-        for _ in range(_N_JOINT_STEPS):
-            if not (joint.gain >= _MIN_GAIN and fraction > _SMALLEST_STEP):
+            if not cost <= max_cost:
                 break
-            step, cost = fraction * (joint.fitted - joint.theta), joint.cost(noise)
-            stepped = linearise(limit_step(joint.theta + step, joint.theta), cost - _MIN_GAIN)
-            if stepped is not None and cost - stepped.cost(noise) >= _MIN_GAIN:
-                joint, fraction = stepped, 1.0
-            else:
-                fraction *= _SMALLER_STEP
-        return joint
+            sums.append(follower.linearise(block, row))
+            cost += sums[-1].square / variance
+        return sums, cost
+
+    def converge(sums: list[Block], variance: float, least_gain: float) -> list[Block]:
+        """Minimise -2 log posterior, from the `sums` over the blocks, until a step gains less than `least_gain`."""
+        damping, cost = np.zeros(len(blocks)), posterior_cost(sums, variance)
+        for _ in range(_N_JOINT_STEPS):
+            step, gain = newton_step(sums, priors, prior_precision, variance, damping)
+            if not gain >= least_gain:
+                break
+            theta = np.array([block.theta for block in sums])
+            stepped = limit_step(theta + step * priors.unit, theta)
+            new_sums, new_cost = linearise(stepped, variance, max_cost=cost)
+            is_bad, is_good = np.ones(len(blocks), dtype=bool), np.zeros(len(blocks), dtype=bool)
+            if len(new_sums) == len(blocks):
+                before, after = (
+                    np.array([block.square for block in blocks_sums]) / variance for blocks_sums in (sums, new_sums)
+                )
+                expected = residual_squares(sums, (stepped - theta) / priors.unit) / variance
+                is_bad = after - expected > 0.5 * np.abs(before - expected) + _TOLERATED
+                is_good = after - expected < 0.2 * np.abs(before - expected) + 0.3 * _TOLERATED
+            if new_cost < cost:
+                sums, cost = new_sums, new_cost
+            elif not is_bad.any() and not damping.any():  # the decrease is too small for the simulation's rounding
+                break
+            damping[is_bad] = np.maximum(_MORE_DAMPING * damping[is_bad], _MIN_DAMPING)
+            damping[is_good] *= _LESS_DAMPING
+            damping[damping < _LESS_DAMPING * _MIN_DAMPING] = 0.0
+        return sums
+
+    def posterior_cost(sums: Sequence[Block], variance: float) -> float:
+        """Compute -2 log posterior of the parameters of all blocks for a `variance` of the noise [Pa^2]."""
+        theta = np.array([block.theta for block in sums])
+        return prior_cost(theta, priors, prior_precision) + sum(block.square for block in sums) / variance
 
     best_cost, best = math.inf, None
     for start in starts:
         try:
-            begin = linearise(start)
-            assert begin is not None  # without a limit of the cost
-            joint = converge(begin)
+            sums, cost = linearise(start, noise)
+            if not math.isfinite(cost):
+                continue
+            sums = converge(sums, noise, _ROUGHLY)
+            joint = Joint.fit(
+                converge(sums, Joint.fit(sums, priors, prior_precision, G).noise, _CONVERGED),
+                priors,
+                prior_precision,
+                G,
+            )
         except np.linalg.LinAlgError:
             continue
-        cost = float(np.nan_to_num(joint.cost(noise), nan=np.inf))
+        cost = posterior_cost(sums, noise)
         if cost < best_cost:
             best_cost, best = cost, joint
-        if is_explained(best_cost, joint.samples):
+        if is_explained(best_cost, sum(block.samples for block in sums)):
             break
     if best is None:
         raise np.linalg.LinAlgError("no start leads to a fit")
