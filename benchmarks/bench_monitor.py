@@ -1,6 +1,7 @@
 """What watching costs: processor time a block, actuators a core, bytes of state, and time from message to store.
 
     python benchmarks/bench_monitor.py [--seconds 600] [--actuators 20] [--paced 0] [--in-phase] [--by volumes]
+        [--gateway 0]
 
 Simulated actuators (p_A, p_B, x, theta, or `--by pressures` p_A, p_B, u, at 500 Hz, blocks of about 3 s in messages of
 1 s) are watched by the library alone, then by a service on one core, from the bytes of the messages (JSON, then CBOR)
@@ -10,12 +11,15 @@ time from the instant when a message is due to its being stored is what an alarm
 another within three seconds, as machines do that nobody started at one instant; with `--in-phase` all begin together,
 and every third second or so all blocks of the detectors are complete at once. Where mosquitto is installed, JSON comes
 from a broker as well, which holds all messages at first, and alarms go out by it. The load of the machine is printed
-beside the times.
+beside the times. With `--gateway N` alone resident memory and processor of services of one and of N actuators are
+measured, each in a process of its own, and what each further actuator takes.
 """
 
 from __future__ import annotations
 
 import argparse
+import ctypes
+import gc
 import io
 import json
 import os
@@ -23,7 +27,9 @@ import sys
 import tempfile
 import threading
 import time
+from contextlib import suppress
 from dataclasses import replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import cbor2
@@ -65,10 +71,14 @@ def main() -> None:
     parser.add_argument("--actuators", type=int, default=20, help="actuators in the service")
     parser.add_argument("--paced", type=int, default=0, help="actuators that send at their own pace")
     parser.add_argument("--by", choices=tuple(CHANNELS), default="volumes", help="what they are watched by")
+    parser.add_argument("--gateway", type=int, default=0, help="actuators for memory and processor of each")
     parser.add_argument("--in-phase", action="store_true", help="all of them begin at one instant")
     chosen = parser.parse_args()
 
     messages = pieces(chosen.seconds, chosen.by)
+    if chosen.gateway:
+        measure_gateway(messages, chosen.gateway, LEARNED[chosen.by])
+        return
     watch = ss.watch("thesis", learn_hours=LEARN_H)
     warm = LEARNED[chosen.by] + 20
     for samples in messages[:warm]:
@@ -91,7 +101,7 @@ def main() -> None:
     }
     for form, dumps in forms.items():
         payloads = [dumps(message(samples)) for samples in messages]
-        spent, took, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by], 1)
+        spent, took, _, _ = served(payloads, chosen.actuators, 0.0, LEARNED[chosen.by], 1)
         print(
             f"service, {form} of {len(payloads[-1])} bytes: {1e3 * spent:.2f} ms of processor a message of 1 s",
             end="; ",
@@ -107,13 +117,13 @@ def main() -> None:
         print(f"service, JSON over MQTT: {rate:.0f} messages/s; publication to alarm {shown} ms", flush=True)
     if chosen.paced:
         phases = 1 if chosen.in_phase else PHASES
-        spent, _, waits = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by], phases)
+        spent, _, waits, memory = served(payloads, chosen.paced, PACED_S, LEARNED[chosen.by], phases)
         median, rare = np.percentile(waits, [50, 99])
         print(f"{chosen.paced} actuators, {form}, a message each second for {PACED_S:.0f} s:", end=" ")
         print(
             f"{100.0 * spent * chosen.paced:.0f} % of a core; message to stored: median {1e3 * median:.0f} ms", end=", "
         )
-        print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {resident() / 1e6:.0f} MB", end="; ")
+        print(f"p99 {1e3 * rare:.0f} ms, most {max(waits):.2f} s; resident {memory / 1e6:.0f} MB", end="; ")
         print(f"load of the machine {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
 
 
@@ -219,8 +229,8 @@ def learn(settings: MonitorSettings, payloads: list[bytes], learned: int, phases
 
 def served(
     payloads: list[bytes], count: int, paced: float, learned: int, phases: int
-) -> tuple[float, float, list[float]]:
-    """Return processor time and time a message [s] of a service that has learned, and how long each message took.
+) -> tuple[float, float, list[float], int]:
+    """Return processor time and time a message [s] of a service that has learned, times of each, and resident bytes.
 
     `paced`: each actuator sends a message a second for so long [s]; 0: as fast as the service takes them; `phases`: the
     actuators begin with the first message, the second, and so on up to so many.
@@ -253,7 +263,7 @@ def served(
                 send(name, payloads[learned + k], due)  # a service that falls behind makes the sender late, too
         wait_for_blocks(rounds * count)
         total = rounds * count
-        measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total])
+        measured.extend([(time.process_time() - began) / total, (time.perf_counter() - clock) / total, resident()])
 
     with tempfile.TemporaryDirectory() as folder:
         settings = MonitorSettings.model_validate(
@@ -264,10 +274,29 @@ def served(
             }
         )
         learn(settings, payloads, learned, phases)
+        gc.collect()
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(None).malloc_trim(0)  # of glibc: what learning took is given back
         service = Service(settings, stdout=io.StringIO(), sources=[source])
         service.run()
         service.store.engine.dispose()
-    return measured[0], measured[1], waits
+    return measured[0], measured[1], waits, int(measured[2])
+
+
+def measure_gateway(messages: list[ss.Recording], count: int, learned: int) -> None:
+    """Print memory and processor of services of one and of `count` actuators."""
+    payloads = [json.dumps(message(samples)).encode() for samples in messages]
+    figures = []
+    for number in (1, count):
+        with get_context("fork").Pool(1) as pool:
+            figures.append(pool.apply(served, (payloads, number, 0.0, learned, 1)))
+    (_, _, _, single), (spent, _, _, several) = figures
+    each = (several - single) / max(count - 1, 1)
+    print(
+        f"service of one actuator: {single / 1e6:.0f} MB; of {count}: {several / 1e6:.0f} MB, {each / 1e6:.2f} MB each",
+        end="; ",
+    )
+    print(f"{100.0 * spent:.2f} % of a core each, for {len(payloads[-1])} bytes of JSON a second")
 
 
 if __name__ == "__main__":

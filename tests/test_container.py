@@ -11,8 +11,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def checker():
-    spec = spec_from_file_location("containerfile", ROOT / ".ci" / "containerfile.py")
+def checker(name="containerfile"):
+    spec = spec_from_file_location(name, ROOT / ".ci" / f"{name}.py")
     module = module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
@@ -50,3 +50,10 @@ def test_it_runs_the_command_as_a_user_without_rights():
     assert kinds["USER"] == "sealscope"
     order = [kind for kind, _ in STEPS]
     assert order.index("USER") < order.index("ENTRYPOINT")
+
+
+def test_on_arm64_the_image_has_all_but_what_has_no_wheel_there(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / ".ci"))
+    names = {re.match(r"[\w.-]+", line)[0] for line in checker("arm64").requirements()}
+    assert {"numba", "scipy", "paho-mqtt", "psycopg", "SQLAlchemy", "pyarrow"} <= names
+    assert "mat-io" not in names

@@ -11,7 +11,7 @@ import math
 import re
 
 _TOKEN = re.compile(
-    r"\(\*.*?\*\)|(?P<real>(?:LREAL#|REAL#)?\d+\.\d+(?:E[+-]?\d+)?)|(?P<whole>\d+)|(?P<name>[A-Za-z]\w*)"
+    r"\(\*.*?\*\)|(?P<real>(?:LREAL#-?|REAL#-?)?\d+\.\d+(?:E[+-]?\d+)?)|(?P<whole>\d+)|(?P<name>[A-Za-z]\w*)"
     r"|(?P<symbol>:=|=>|<=|>=|<>|\.\.|[-+*/()\[\];:,.=<>])|\s+",
     re.DOTALL | re.IGNORECASE,
 )
@@ -54,7 +54,7 @@ class Program:
             kind = match.lastgroup
             if kind == "real":
                 number = float(match[0].rpartition("#")[2])
-                assert number == 0.0 or 1e-38 < number < 1e38, number
+                assert number == 0.0 or 1e-38 < abs(number) < 1e38, number
                 self._tokens.append((kind, repr(number)))
             elif kind:
                 self._tokens.append((kind, match[0] if kind == "symbol" else match[0].lower()))
@@ -106,12 +106,13 @@ class Program:
         return variables
 
     def _list(self):
-        self._next("[")
-        values = [self._expression()]
-        while self._peek() == ",":
-            self._next()
-            values.append(self._expression())
-        self._next("]")
+        """Initial values, each of them one literal."""
+        values = []
+        while self._next() != "]":
+            sign = self._next() if self._peek() == "-" else ""
+            assert self._tokens[self._place][0] in ("real", "whole"), self._tokens[self._place]
+            values.append(sign + self._next())
+            assert self._peek() in (",", "]")
         return f"[{', '.join(values)}]"
 
     def _type(self):

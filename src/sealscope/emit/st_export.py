@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Container, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -12,7 +12,7 @@ from sealscope.emit.c_export import most_parts, parts_a_sample, templates
 from sealscope.emit.program import Program
 from sealscope.emit.specialise import specialise
 from sealscope.emit.stream_program import StreamProgram, result_rows
-from sealscope.emit.structured_text import StText, format_real
+from sealscope.emit.structured_text import StText, format_initial
 
 #: A reading beyond `MAX_READING` of the kernels, which counts as missing, as a product that each compiler reads.
 _MISSING = "LREAL#1.0E37 * LREAL#1.0E37 * LREAL#1.0E37"
@@ -123,7 +123,7 @@ def pieces(unit: StreamProgram, prefix: str, learned: Sequence[float] = ()) -> I
         "text": text,
         "missing": _MISSING,
         "results": result_rows(),
-        "learned": [format_real(number) for number in learned[1:-1]],
+        "learned": [format_initial(number) for number in learned[1:-1]],
         "parts_a_sample": parts_a_sample(unit.settings),
         "most_parts": most_parts(),
         "n_recorded": function_blocks.N_RECORDED,
@@ -150,6 +150,7 @@ def render_st(
 ) -> dict[str, str]:
     """Render the Structured Text of a stream as files by name; the arguments are those of `c_export.render_c`."""
     parts = list(pieces(unit, prefix, learned))
+    functions = [part.name for part in parts if part.kind == "function"]
     head = f"(* {title}\n   Written by Sealscope {version('sealscope')} from {origin}, checksum {unit.checksum}. *)\n"
     values = {
         **{"unit": unit, "prefix": prefix.upper(), "title": title, "origin": origin, "version": version("sealscope")},
@@ -159,32 +160,54 @@ def render_st(
     }
     return {
         f"{prefix}.st": "\n".join([head, *(part.text for part in parts)]),
-        f"{prefix}.scl": "\n".join([head, *(_as_scl(part) for part in parts)]),
+        f"{prefix}.scl": "\n".join([head, *(_as_scl(part, functions) for part in parts)]),
         f"{prefix}.xml": templates().get_template("plcopen.xml.j2").render(values),
         "README.md": templates().get_template("st_readme.md.j2").render(values),
     }
 
 
-def _as_scl(part: Piece) -> str:
-    """Write a part as a source of TIA Portal: names in quotation marks, and other words for its head and body."""
+def _as_scl(part: Piece, functions: Sequence[str]) -> str:
+    """Write a part as a source of TIA Portal: its own names in quotation marks, local ones behind a number sign.
+
+    `functions`: names of the export's functions. A function's variables are temporary there, and constants are no
+    arrays.
+    """
     if part.kind == "dataType":
         return part.text.replace(f"TYPE {part.name} :", f'TYPE "{part.name}"')
-    lines = []
-    has_begun = False
-    for line in part.text.splitlines():
-        if re.match(r"FUNCTION(_BLOCK)? ", line):
-            lines.append(re.sub(r"^(FUNCTION(?:_BLOCK)?) (\w+)", r'\1 "\2"', line))
-            lines.append("{ S7_Optimized_Access := 'TRUE' }")
-        elif re.match(r"(VAR\w*|END_VAR)\b", line) or (not has_begun and line.startswith("    ")):
-            lines.append(re.sub(r": (\w+_(?:STATE|\w+));", _quote_type, line))
-        elif line.startswith("END_FUNCTION"):
-            lines.append(line)
-        else:
-            if not has_begun and line and not line.startswith("(*"):
-                lines.append("BEGIN")
-                has_begun = True
-            lines.append(line)
-    return "\n".join([*lines, ""])
+    head = re.search(r"^(FUNCTION(?:_BLOCK)?) (\w+)(.*)\n", part.text, flags=re.MULTILINE)
+    assert head is not None
+    declarations = part.text[head.end() : part.text.rindex("END_VAR\n")] + "END_VAR\n"
+    variables = "VAR_TEMP" if part.kind == "function" else "VAR"
+    declarations = re.sub(r"^VAR( CONSTANT)?$", variables, declarations, flags=re.MULTILINE)
+    declarations = re.sub(r": (\w+);", _quote_type, declarations)
+    names = {name.lower() for _, found in part.sections for name, _, _ in found}
+    names |= {part.name.lower()} if part.kind == "function" else set()
+    heading = f'{part.text[: head.start()]}{head[1]} "{head[2]}"{head[3]}'
+    attribute, body = "{ S7_Optimized_Access := 'TRUE' }", _mark_names(part.body, names, functions)
+    return f"{heading}\n{attribute}\n{declarations}BEGIN\n{body}END_{head[1]}\n"
+
+
+#: A comment, a bracket, or a name that is no field; then, before what a call's argument is assigned to, ":=".
+_WORD = re.compile(r"\(\*.*?\*\)|[()]|(?<![\w.#])[A-Za-z]\w*(?P<assigned>\s*:=)?", flags=re.DOTALL)
+
+
+def _mark_names(body: str, names: Container[str], functions: Sequence[str]) -> str:
+    """Mark local names by a number sign, but not those of a call's arguments, and quote the export's functions."""
+    depth = 0
+
+    def mark(match: re.Match[str]) -> str:
+        nonlocal depth
+        word = match[0]
+        depth += (word == "(") - (word == ")")
+        if word[0] in "()":
+            return word
+        name = word.partition(":")[0].strip()
+        if name in functions and name.lower() not in names:
+            return word.replace(name, f'"{name}"', 1)
+        is_argument = depth > 0 and match["assigned"]
+        return f"#{word}" if name.lower() in names and not is_argument else word
+
+    return _WORD.sub(mark, body)
 
 
 def _quote_type(match: re.Match[str]) -> str:

@@ -36,6 +36,7 @@ from sealscope.emit.program import (
     iter_expressions,
     parts,
 )
+from sealscope.errors import InputError
 
 _TYPES: dict[Kind, str] = {"real": "LREAL", "whole": "DINT", "truth": "BOOL"}
 _BINARY = {"+": "+", "-": "-", "*": "*", "/": "/", "and": "AND", "or": "OR", "==": "=", "!=": "<>"}
@@ -201,7 +202,7 @@ class _BlockText:
         """Declare a constant table."""
         values = self._program.tables[name]
         kind: Kind = "real" if any(isinstance(value, float) for value in values) else "whole"
-        numbers = ", ".join(format_constant(Constant(value, kind)) for value in values)
+        numbers = ", ".join(format_initial(value) if kind == "real" else str(value) for value in values)
         return f"    {self._names[f'table_{name}']} : ARRAY [0..{len(values) - 1}] OF {_TYPES[kind]} := [{numbers}];"
 
     def _block(self, statements: Iterable[Statement], indent: str, names: dict[str, str]) -> Iterator[str]:
@@ -404,6 +405,10 @@ def _product(number: float) -> str:
     return f"({' * '.join([literal, *factors])})" if factors else literal
 
 
-def format_real(number: float) -> str:
-    """Render a real number as a literal or product of literals."""
-    return format_constant(Constant(float(number), "real"))
+def format_initial(number: float) -> str:
+    """Render a real number as an initial value: one literal, with its sign in it, as edition 2 has them."""
+    if abs(number) >= _LARGEST:
+        raise InputError(f"an initial value of Structured Text must be below {_LARGEST:g}, got {number:g}")
+    if abs(number) < 1.0 / _LARGEST:
+        return "LREAL#0.0"
+    return _product(abs(number)).replace("#", "#-" if number < 0 else "#")
