@@ -16,7 +16,7 @@ import sealscope as ss
 from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.blocks import information
 from sealscope.diagnosis.inference.onset import Information, fit_history, step_test
-from sealscope.diagnosis.inference.rows.weak_form import test_function
+from sealscope.diagnosis.inference.rows.weak_form import SPAN, peak_weight, row_weight, stride_samples
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array
 from sealscope.units import LITRE_PER_MINUTE
@@ -45,7 +45,8 @@ def balance() -> None:
     fitted = fit_history(step_information, test, with_step=True)
     before = float((unit * fitted.mean)[blocks.time < ONSET].mean())
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(11.0, 3.2), layout="constrained")
-    phi = test_function(recording.rate).ravel()
+    stride, peak = stride_samples(recording.rate), peak_weight(recording.rate)
+    phi = np.array([row_weight(k, stride, peak) for k in range(SPAN * stride)])
     t = (np.arange(phi.size) + 0.5) / recording.rate
     left.plot(t, phi, label=r"$\phi$ [1/s]")
     left.plot(t, np.gradient(phi, t) / 10.0, "--", label=r"$\dot\phi/10$ [1/s$^2$]")

@@ -50,7 +50,7 @@ def test_a_new_term_reaches_python_c_st_and_the_unit(monkeypatch):
     python = python_conductance(recording)
     assert python != python_before
     n = int(changed[-1, RESULTS.index("blocks")])
-    assert np.mean(python[:n][-WINDOW:]) == pytest.approx(changed[-1, conductance], rel=1e-5)
+    assert np.mean(python[:n][-WINDOW:]) == pytest.approx(changed[-1, conductance], rel=1e-12)
     in_st, _ = run_st(unit, samples)
     assert in_st == pytest.approx(changed[-len(in_st) :], rel=1e-9, abs=1e-25)
     increments, added = len(before.settings.expressions), len(unit.settings.expressions)

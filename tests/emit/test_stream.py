@@ -7,14 +7,20 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings, stream_kernels, stream_layout
+from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
+from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.compiler import find_compiler
 from sealscope.emit.run_program import CompiledStream
+from sealscope.emit.single_precision import iter_blocks
 from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import stream_program
 from sealscope.errors import InputError
+from sealscope.recordings.recording import Recording
 
+from ..diagnosis import test_lowered_loads as lowered_loads
 from ..diagnosis.balance_machine import machine, step
 from .st_evaluator import Program
 
@@ -121,6 +127,58 @@ def test_c_equals_the_compiled_kernels_to_the_bit(seed):
     expected = np.array(list(c_stream(unit).feed(samples, parts_a_sample(unit.settings))))
     assert len(expected) > 25
     assert np.array_equal(results[-len(expected) :], expected)
+
+
+@pytest.mark.parametrize(
+    ("rig", "flow", "rate"),
+    [
+        ("thesis", "theta", 16.0),
+        pytest.param("thesis", "omega", 22.0, marks=pytest.mark.slow),
+        pytest.param("thesis", "q_pump", 25.0, marks=pytest.mark.slow),
+        pytest.param("single-rod-eha", "theta", 25.0, marks=pytest.mark.slow),
+    ],
+)
+def test_a_watch_and_a_controller_state_the_same_bits(rig, flow, rate):
+    """Conductance, deviation and score of each block, with lost readings and an encoder the other way round."""
+    rig, recording = ss.load_rig(rig), machine(3, G=step(0.0, 4e-13, at=75.0), duration=100.0, rate=rate)
+    speed = np.gradient(recording["theta"], 1.0 / rate)
+    flows = {"theta": -recording["theta"], "omega": speed, "q_pump": speed * rig.pump.q_b / (2.0 * np.pi)}
+    channels = {name: {**recording.channels, **flows}[name].copy() for name in ("p_A", "p_B", flow, "x")}
+    channels[flow][round(30.0 * rate) :][:3] = channels["p_A"][round(82.0 * rate)] = np.nan
+    unit = stream_program(StreamSettings.from_rig(rig, rate, flow, 1000.0))
+    stream, scores = c_stream(unit), {}
+    blocks = dict(iter_blocks(stream, np.stack([*channels.values()], axis=1)))
+    stream.initialise()
+    for results in stream.feed(np.stack([*channels.values()], axis=1), parts_a_sample(unit.settings)):
+        scores[int(stream.state.block_end) - 1] = results[RESULTS.index("score")]
+    live, detector, n = LiveBalance(rig, tuple(channels)), StepDetector(), 0
+    length = unit.settings.counts[0] * unit.settings.counts[1]
+    for part in live.take(SampleRun(recording.t, channels, rate, follows=False)):
+        for block in () if isinstance(part, NotJudged) else part:
+            number = round(block.begin * rate / length)
+            detector.take(block.begin, block.end, block.g, block.sd)
+            assert (block.total, block.sd) == tuple(blocks[number])
+            assert number not in scores or max(detector.log_e(), 0.0) == scores[number]
+            n += 1
+    assert n >= 30 and max(scores.values()) > 5.0
+
+
+@pytest.mark.slow
+def test_recordings_that_a_controller_would_misread_are_refused(tmp_path):
+    """A load that is lowered past the resting pump, and a speed without a sign."""
+    rig = RIG.with_overrides({"cylinder.A_B": lowered_loads.AREA_A})
+    damped, two_way = lowered_loads.flight(2), machine(1, duration=120.0, rate=100.0)
+    speed = np.abs(np.gradient(two_way["theta"], 0.01))
+    unsigned = Recording(two_way.t, {**two_way.channels, "omega": speed}, {**two_way.units, "omega": "rad/s"}, 100.0)
+    for machine_rig, recording in ((rig, damped), (RIG, unsigned)):
+        with pytest.raises(InputError, match="blocks that differ in number 1: its load is lowered"):
+            ss.export_controller(
+                tmp_path, rig=machine_rig, rate=recording.rate, flow="omega", learn=[recording],
+                false_alarms_per_1000_h=1e-3,
+            )  # fmt: skip
+    signed = unsigned.channels | {"omega": np.gradient(two_way["theta"], 0.01)}
+    healthy = Recording(two_way.t, signed, unsigned.units, 100.0)
+    assert ss.export_controller(tmp_path, rate=100.0, flow="omega", learn=[healthy]).learned_blocks > 30
 
 
 def test_a_state_of_a_controller_is_small():

@@ -91,7 +91,7 @@ def test_a_soft_sensor_says_what_the_live_balance_says(version, recording, tmp_p
         n_blocks=int(results["blocks"]),
     )
     for name, value in theirs.items():
-        assert results[name] == pytest.approx(value, rel=1e-5), name
+        assert results[name] == pytest.approx(value, rel=1e-9), name
     assert results["q_low"] < results["q"] < results["q_high"]
     assert results["alarm"] == 1.0 and results["score"] > results["threshold"]
     assert results["q_leak_low"] < LEAK / 6e4 < results["q_leak_high"]

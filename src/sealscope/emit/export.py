@@ -11,11 +11,13 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import StreamSettings
+from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
 from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
-from sealscope.emit.single_precision import check_error, learn_basis, measure_error
+from sealscope.emit.single_precision import MOST_ERROR, check_error, iter_blocks, learn_basis, measure_error
 from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
@@ -95,8 +97,9 @@ def export_controller(
     Raises
     ------
     InputError
-        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate,
-        single precision errs too much, or learning needs a C compiler and there is none.
+        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate, or
+        the monitor estimates otherwise from it, single precision errs too much, or learning needs a C compiler and
+        there is none.
 
     Examples
     --------
@@ -131,6 +134,7 @@ def export_controller(
     blocks, error = 0, None
     if samples:
         stream, blocks = _learn(unit, samples, words)
+        _check_against_watch(CompiledStream(unit, render_c(unit, **words), prefix), samples, machine)
         if precision == "single":
             unit = stream_program(unit.settings._replace(basis=learn_basis(stream)))
             error = _prove_single(stream.unit, unit, samples, words)
@@ -184,6 +188,39 @@ def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str,
     if not blocks:
         raise InputError("recordings to learn from must have a minute of motion or more, got none that was estimated")
     return stream, blocks
+
+
+def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], rig: Rig) -> None:
+    """Raise InputError unless the live balance estimates the same conductances from each recording.
+
+    Both run the same kernels, but a controller knows no loads that are lowered past the resting pump, restores no sign
+    of a flow, and tells a reversed one by fewer symptoms.
+    """
+    settings = stream.unit.settings
+    n_block = settings.counts[0] * settings.counts[1]
+    for k, samples in enumerate(recordings, 1):
+        stream.initialise()
+        stated = {int(number): estimate for number, estimate in iter_blocks(stream, samples)}
+        channels = dict(zip(settings.channels, samples.T, strict=True))
+        run = SampleRun(np.arange(len(samples)) / settings.rate, channels, settings.rate, follows=False)
+        parts = LiveBalance(rig, settings.channels).take(run)
+        results = [blocks for blocks in parts if not isinstance(blocks, NotJudged)]
+        watched = {round(b.begin * settings.rate / n_block): (b.total, b.sd) for blocks in results for b in blocks}
+        last = max(watched, default=-1)  # the live balance waits for what follows a block
+        numbers = watched.keys() | {number for number in stated if number <= last}
+        differing = [
+            number
+            for number in numbers
+            if number not in stated
+            or number not in watched
+            or not np.abs(np.subtract(stated[number], watched[number])).max() <= MOST_ERROR * watched[number][1]
+        ]
+        if differing:
+            raise InputError(
+                f"a recording to learn from must show a controller what it shows the monitor, got {len(differing)} of "
+                f"{len(numbers)} blocks that differ in number {k}: its load is lowered past the resting pump, or its "
+                "flow has no sign or the wrong one"
+            )
 
 
 def _prove_single(

@@ -44,7 +44,7 @@ class CompiledStream:
         self.state = type("State", (ctypes.Structure,), {"_fields_": fields})()
         with tempfile.TemporaryDirectory(prefix="sealscope-c-") as folder:
             self._library = self._compile(Path(folder), texts)
-        self._call("init")
+        self.initialise()
 
     def _compile(self, folder: Path, texts: Mapping[str, str]) -> ctypes.CDLL:
         """Compile the files to a shared library, and load it; raise InputError if the compiler fails."""
@@ -66,6 +66,10 @@ class CompiledStream:
         function = getattr(self._library, f"{self._prefix}_{name}")
         function.restype = ctypes.c_bool if name in ("step", "restore") else None
         return function(ctypes.byref(self.state), *arguments)
+
+    def initialise(self) -> None:
+        """Begin anew, without what was learned from samples."""
+        self._call("init")
 
     def resume(self) -> None:
         """Begin with samples anew, with what was learned: save and restore."""

@@ -50,7 +50,8 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause
 from sealscope.errors import InputError
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import CHANNEL_UNITS, flow_source
+from sealscope.recordings.quality import sensor_limit
 from sealscope.recordings.recording import Array
 from sealscope.storage.plain_state import (
     SavedAttributes,
@@ -171,8 +172,7 @@ class LiveBalance(SavedAttributes):
         if not self._balances:
             needed = format_ways(rig.circuit.watched_by)
             raise InputError(f"a live balance must have {needed}, got {', '.join(names) or 'nothing'}")
-        pump_names = [name for name in ("theta", "omega") if name in names]  # none behind a servo valve
-        needed_names = {"x", "p_A", "p_B", *pump_names[:1]}  # the pump's angle, or else its speed
+        needed_names = {"x", "p_A", "p_B", flow_source(names)}
         needed_names |= {name for balance in self._balances for term in balance.terms for name in term.needs}
         self.names = tuple(name for name in names if name in needed_names)  # channels that the balances read
         self.size_error = size_error(rig)  # relative standard error of all flows, and that of a leak's flow
@@ -220,10 +220,20 @@ class LiveBalance(SavedAttributes):
                 self._stream = stream = new_stream
             stream.restart(float(run.t[0]))
         # the samples complete at most one block at a time, as one may change what the next is compared with
-        size = math.ceil(0.5 * BLOCK_SECONDS * self._rate)
+        channels, size = self._mark_missing(run.channels), math.ceil(0.5 * BLOCK_SECONDS * self._rate)
         for first in range(0, len(run.t), size):
-            piece = {name: run.channels[name][first : first + size] for name in self.names}
+            piece = {name: values[first : first + size] for name, values in channels.items()}
             yield from self._take_blocks(stream.push(piece))
+
+    def _mark_missing(self, channels: Mapping[str, Array]) -> dict[str, Array]:
+        """Select the channels in use, NaN in each sample that lacks one of them or has a value that no sensor reads."""
+        selected = {name: channels[name] for name in self.names}
+        is_present = np.logical_and.reduce(
+            [np.abs(values) <= sensor_limit(CHANNEL_UNITS[name]) for name, values in selected.items()]
+        )
+        if is_present.all():
+            return selected
+        return {name: np.where(is_present, values, np.nan) for name, values in selected.items()}
 
     def _make_stream(self) -> BlockStream:
         """Build the object that divides samples at the present rate into blocks, and stores the samples of each."""
@@ -370,7 +380,7 @@ class LiveBalance(SavedAttributes):
             begin,
             end,
             g=total - weighted_shift / precision,
-            sd=precision**-0.5,
+            sd=math.sqrt(1.0 / precision),
             total=total,
             offset=math.sqrt(weighted_variance) / precision,
             pressure=float(block.mean_pressure()[0]),

@@ -109,7 +109,8 @@ class StepDetector:
 
         `deviation` is the standard error of `g`. The first block after `forget` only sets the level of the filters.
         """
-        take_block(self._memory, begin, end, g, deviation)
+        elapsed = np.round((begin - self._number("end")) / (end - begin)) + 1.0  # whole blocks, against rounding
+        take_block(self._memory, elapsed, begin, end, g, deviation)
 
     def log_e(self, min_log_e: float = -np.inf) -> float:
         """Compute log M, the evidence that the coefficient has risen.

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import ast
 import linecache
+import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from itertools import count
@@ -22,7 +23,8 @@ from typing import Any
 
 import numpy as np
 
-from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals
+from sealscope.compiled import kernel
+from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.recording import Array
 from sealscope.units import P_ATM
@@ -83,7 +85,7 @@ def _interval_values(node: ast.expr, s: Signals, displacement: float) -> Any:
         return {"+": np.add, "-": np.subtract, "*": np.multiply, "/": np.divide}[operator](left, right)
     if isinstance(node, ast.Name):
         if node.id in DIRECTIONS:
-            return s.direction_weights(*DIRECTIONS[node.id])
+            return np.where(np.isnan(interval_means(s.speed)), np.nan, s.direction_weights(*DIRECTIONS[node.id]))
         if node.id == "pressure_difference":
             return s.pressure_difference
         return {"dt": s.dt, "rate": s.rate, "displacement": displacement}[node.id]
@@ -110,7 +112,17 @@ def _point_values(node: ast.expr, s: Signals) -> Any:
     if name == "absolute":
         assert isinstance(value, ast.Name)
         return s.absolute_pressure[value.id]
-    return np.log(_point_values(value, s))
+    points = np.asarray(_point_values(value, s))
+    logarithms = np.empty(points.shape)
+    _take_logarithms(points, logarithms)
+    return logarithms
+
+
+@kernel
+def _take_logarithms(values: Any, logarithms: Any) -> None:
+    """Compute logarithms by the function that streams call: NumPy's may differ in the last bit."""
+    for i in range(len(values)):
+        logarithms[i] = math.log(values[i])
 
 
 def _call(node: ast.expr) -> tuple[str, ast.expr]:
@@ -120,13 +132,15 @@ def _call(node: ast.expr) -> tuple[str, ast.expr]:
     return node.func.id, node.args[0]
 
 
-def build_increments(expressions: Sequence[str], channels: Mapping[str, int]) -> Callable[..., None]:
+def build_increments(
+    expressions: Sequence[str], channels: Mapping[str, int], limits: Mapping[str, float]
+) -> Callable[..., None]:
     """Write a function that evaluates expressions over one interval of the last samples, for `compiled.large_law`.
 
     The function's arguments are `ring` (channels, width), in whose columns sample k stands at k modulo the width; the
     interval k, from sample k to k + 1; `half`, the samples on either side of the central difference that shows the
     direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`:
-    rows of `ring` by name.
+    rows of `ring` by name; `limits`: `MAX_READING`, beyond which a reading is missing, and `BEYOND`, a missing one.
     """
     lines = [
         "def compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:",
@@ -137,10 +151,12 @@ def build_increments(expressions: Sequence[str], channels: Mapping[str, int]) ->
     words = {node.id for text in expressions for node in ast.walk(parse_expression(text)) if isinstance(node, ast.Name)}
     if words & set(DIRECTIONS):
         x, p_A, p_B = (channels[name] for name in ("x", "p_A", "p_B"))
-        lines += [f"    {word} = 0.0" for word in DIRECTIONS]
+        lines += [f"    {word} = 0.0" for word in DIRECTIONS] + ["    is_known = True"]
         lines += [
             "    for i in range(k, k + 2):  # either end of the interval counts half",
-            f"        is_outward = ring[{x}, (i + half) % width] >= ring[{x}, max(i - half, 0) % width]",
+            f"        x_before, x_after = ring[{x}, max(i - half, 0) % width], ring[{x}, (i + half) % width]",
+            "        is_known = is_known and max(abs(x_before), abs(x_after)) < MAX_READING",
+            "        is_outward = x_after >= x_before",
             f"        A_carries = ring[{p_A}, i % width] > ring[{p_B}, i % width]",
         ]
         for word, (outward, by_A) in DIRECTIONS.items():
@@ -148,10 +164,12 @@ def build_increments(expressions: Sequence[str], channels: Mapping[str, int]) ->
             lines += [f"        if {conditions}:", f"            {word} += 0.5"]
     for column, text in enumerate(expressions):
         lines.append(f"    out[{column}] = {_interval_text(parse_expression(text), 'k', channels)}")
+    if words & set(DIRECTIONS):  # without a direction the interval counts as one with a missing reading
+        lines += ["    if not is_known:", "        out[0] = BEYOND"]
     source = "\n".join([*lines, ""])
     file = f"<terms {next(_numbers)}>"
     linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)
-    namespace: dict[str, Any] = {"Any": Any, "math": __import__("math")}
+    namespace: dict[str, Any] = {"Any": Any, "math": math, **limits}
     exec(compile(source, file, "exec"), namespace)
     return namespace["compute_increments"]  # type: ignore[no-any-return]
 

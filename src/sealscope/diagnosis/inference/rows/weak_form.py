@@ -18,11 +18,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import kernel, large_law, law
 from sealscope.recordings.recording import Array
 
 #: Distance of neighbouring test functions [s] and its minimum [samples]; how many distances a test function spans.
@@ -32,6 +33,8 @@ SPAN = 4
 MIN_WEIGHT = 0.1
 #: Limit of integrals that count as readings of a sensor: squares of larger ones might overflow.
 MAX_READING = 1e100
+#: Reading of a missing sample in streams, whose increments are beyond `MAX_READING`.
+BEYOND = 1e20 * MAX_READING
 
 
 class Rows(NamedTuple):
@@ -66,21 +69,56 @@ def strides_in(seconds: float, rate: float) -> int:
 
 
 @lru_cache(maxsize=8)
-def test_function(rate: float) -> Array:
-    """Compute the test function phi [1/s], bell-shaped with the integral 1, in the middle of each sampling interval.
+def peak_weight(rate: float) -> float:
+    """Compute the value of the test function in its middle [1/s], by which its sum over the samples is the `rate`."""
+    n_support = SPAN * stride_samples(rate)
+    s = (np.arange(n_support) + 0.5) * 2.0 / n_support - 1.0
+    return float(rate / np.sum((1.0 - s * s) ** 4))
 
-    `rate`: sampling rate [Hz]. The result has the shape (SPAN, stride): each row is the part of the test function over
-    one stride of samples.
+
+@law
+def row_weight(interval: int, n_stride: int, peak: float) -> float:
+    """Compute the test function phi [1/s] in the middle of a sampling interval, counted from the function's begin."""
+    s = (interval + 0.5) * 2.0 / (SPAN * n_stride) - 1.0  # -1 to 1 over the support
+    return peak * (1.0 - s * s) ** 4
+
+
+@large_law
+def add_to_rows(unfinished: Any, increments: Any, k: int, n_stride: int, peak: float) -> None:
+    """Add the increments (c,) over sampling interval k, weighted by the test function, to the rows that contain it.
+
+    The row that began `age` strides ago is at its number modulo `SPAN` of `unfinished` (SPAN, c); a new one begins at
+    0. At the end of a stride, row k // `n_stride` - `SPAN` + 1 is finished. Streams and files sum in this order.
     """
-    stride = stride_samples(rate)
-    s = (np.arange(SPAN * stride) + 0.5) * 2.0 / (SPAN * stride) - 1.0  # -1 to 1 over the support
-    phi = (1.0 - s * s) ** 4
-    # stored by columns: BLAS reads the transpose fastest
-    return np.asfortranarray((phi * (rate / phi.sum())).reshape(SPAN, stride))
+    stride, k_in_stride = k // n_stride, k % n_stride
+    if k_in_stride == 0:
+        for j in range(len(increments)):
+            unfinished[stride % SPAN, j] = 0.0
+    for age in range(SPAN):
+        slot = (stride - age) % SPAN
+        weight = row_weight(age * n_stride + k_in_stride, n_stride, peak)
+        for j in range(len(increments)):
+            unfinished[slot, j] += weight * increments[j]
 
 
-_phi = test_function(1e4).ravel()  # at a rate [Hz] at which `OVERLAP` has converged
-_stride = len(_phi) // SPAN
+@kernel
+def _integrate(increments: Any, n_stride: int, peak: float, unfinished: Any, values: Any, is_whole: Any) -> None:
+    """Write the rows (r, c) of `increments` (c, n), and flag those without a missing sample; others are zeros."""
+    present = np.empty(len(increments))
+    for k in range((len(values) + SPAN - 1) * n_stride if len(values) else 0):
+        for j in range(len(increments)):
+            present[j] = increments[j, k]
+        add_to_rows(unfinished, present, k, n_stride, peak)
+        row = k // n_stride - SPAN + 1
+        if k % n_stride == n_stride - 1 and row >= 0:
+            for j in range(values.shape[1]):
+                is_whole[row] &= abs(unfinished[row % SPAN, j]) < MAX_READING  # False for NaN
+            for j in range(values.shape[1]):
+                values[row, j] = unfinished[row % SPAN, j] if is_whole[row] else 0.0
+
+
+_stride = stride_samples(1e4)  # at a rate [Hz] at which `OVERLAP` has converged
+_phi = np.array([row_weight(k, _stride, 1.0) for k in range(SPAN * _stride)])
 #: Variance of a sum over overlapping rows of white noise, relative to independent rows.
 OVERLAP = 1.0 + 2.0 * sum(
     float(_phi[k * _stride :] @ _phi[: -k * _stride]) / float(_phi @ _phi) for k in range(1, SPAN)
@@ -91,24 +129,14 @@ def weak_form_rows(increments: Sequence[Array], rate: float) -> Rows:
     """Compute the rows of a regression in weak form: the integrals of c columns, weighted by each test function.
 
     `increments`: for each column its increments (n,) between samples, NaN where missing; `rate`: sampling rate [Hz].
-    Each test function spans `SPAN` pieces of samples as long as the distance of neighbouring ones (`stride_samples`),
-    and gives one row if it lies within the samples. A piece with a missing sample, or with integrals beyond
-    `MAX_READING`, counts as zeros, and its rows are not `whole`.
+    Each test function gives one row if it lies within the samples. A row with a missing sample, or with an integral
+    beyond `MAX_READING`, is of zeros and not `whole`.
     """
-    stride = stride_samples(rate)
-    n_pieces = len(increments[0]) // stride
-    n_rows = max(0, n_pieces - SPAN + 1)
-    pieces = np.concatenate([increment[: n_pieces * stride] for increment in increments]).reshape(-1, stride)
-    # integrals of each column over each piece, times each of the SPAN parts of the test function
-    integrals: Array = (pieces @ test_function(rate).T).reshape(len(increments), n_pieces, SPAN)
-    is_usable = np.asarray((np.abs(integrals) < MAX_READING).all(axis=(0, 2)))  # False for NaN
-    integrals[:, ~is_usable] = 0.0
-    values: Array = np.zeros((n_rows, len(increments)))
-    is_whole = np.ones(n_rows, dtype=bool)
-    for part in range(SPAN):  # row i is the sum over the pieces i + part
-        values += integrals[:, part : part + n_rows, part].T
-        is_whole &= is_usable[part : part + n_rows]
-    time = (np.arange(n_rows, dtype=float) + 0.5 * SPAN) * stride / rate
+    n_stride, columns = stride_samples(rate), np.stack(increments)
+    n_rows = max(0, columns.shape[1] // n_stride - SPAN + 1)
+    values, is_whole = np.zeros((n_rows, len(increments))), np.ones(n_rows, dtype=bool)
+    _integrate(columns, n_stride, peak_weight(rate), np.zeros((SPAN, len(increments))), values, is_whole)
+    time = (np.arange(n_rows, dtype=float) + 0.5 * SPAN) * n_stride / rate
     return Rows(time, values, is_whole)
 
 

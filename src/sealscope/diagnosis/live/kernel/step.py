@@ -141,17 +141,17 @@ def _log_normalisation(n: float) -> float:
 
 
 @large_law
-def take_estimate(d: Any, begin: float, end: float, g: float, deviation: float) -> None:
+def take_estimate(d: Any, elapsed: float, begin: float, end: float, g: float, deviation: float) -> None:
     """Add the estimate g of the coefficient in the block from `begin` to `end` [s], of the standard error `deviation`.
 
-    The first block after `forget_onsets` only sets the level of the filters.
+    `elapsed`: blocks since the last one, 1 if none is left out, and at least 1. The first block after `forget_onsets`
+    only sets the level of the filters.
     """
     if d.unit == 0.0:
         d.unit = deviation
     y, relative = g / d.unit, deviation / d.unit
     variance = relative * relative
     d.n_blocks += 1
-    elapsed = max((begin - d.end) / (end - begin) + 1.0, 1.0)  # blocks since the last one; 1: should they overlap
     d.end = end
     if d.has_level == 0:
         d.has_level = 1
@@ -164,7 +164,7 @@ def take_estimate(d: Any, begin: float, end: float, g: float, deviation: float) 
             d.log_prior[q] = add_logs(_STAYS + d.log_weights[q], _CHANGED)
         _add_onsets(d, begin, end)
     for q in range(_N_WALKS):
-        level_variance = d.level_variance[q] + WALKS[q] * elapsed
+        level_variance = d.level_variance[q] + WALKS[q] * max(elapsed, 1.0)
         d.innovation[q], d.variance[q] = y - d.level[q], level_variance + variance
         d.gain[q] = level_variance / d.variance[q]
         d.square[q] = d.innovation[q] * d.innovation[q] / d.variance[q]
@@ -512,9 +512,9 @@ def forget_steps(memory: Any) -> None:
 
 
 @kernel
-def take_block(memory: Any, begin: float, end: float, g: float, deviation: float) -> None:
+def take_block(memory: Any, elapsed: float, begin: float, end: float, g: float, deviation: float) -> None:
     """Add the estimate of a block."""
-    take_estimate(memory[0], begin, end, g, deviation)
+    take_estimate(memory[0], elapsed, begin, end, g, deviation)
 
 
 @large_law

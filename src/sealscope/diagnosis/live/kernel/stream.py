@@ -51,12 +51,15 @@ from sealscope.diagnosis.inference.rows.row_weights import (
     workspace_shapes,
 )
 from sealscope.diagnosis.inference.rows.weak_form import (
+    BEYOND,
     MAX_READING,
     MIN_STRIDE,
     SPAN,
     STRIDE,
+    add_to_rows,
+    peak_weight,
     stride_samples,
-    test_function,
+    strides_in,
 )
 from sealscope.diagnosis.live.coefficients import (
     MISFIT,
@@ -94,8 +97,6 @@ PAUSE = float(LIVE.watch.pause)
 WEIGHED_A_CALL, ADDED_A_CALL, HALVINGS = 2, 12, 20
 #: Blocks from which on the times of the detector of steps begin anew, and by how many.
 _MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
-#: Readings of a missing sample over `MAX_READING`.
-BEYOND = 1e20
 #: Parts of the work at the end of a block: `phase` of the record.
 (
     IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, TAKE, WEIGH, DECIDE,
@@ -248,7 +249,11 @@ class StreamSettings(NamedTuple):
 
         The difference is the central one of the position, whose sign is the direction of motion.
         """
-        return stride_samples(self.rate), round(BLOCK_SECONDS / STRIDE), max(1, round(HALF_DIFFERENCE * self.rate))
+        return (
+            stride_samples(self.rate),
+            strides_in(BLOCK_SECONDS, self.rate),
+            max(1, round(HALF_DIFFERENCE * self.rate)),
+        )
 
 
 def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
@@ -354,7 +359,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
 
     rate = settings.rate
     n_stride, block_strides, half = settings.counts
-    n_support, n_block = SPAN * n_stride, n_stride * block_strides
+    n_block = n_stride * block_strides
     block_seconds, pause = n_block / rate, PAUSE * rate / n_block
     channels, n_columns = settings.channels, len(settings.expressions)
     row_p_A, row_p_B, row_flow, row_x = range(len(channels))
@@ -365,9 +370,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     width = 2 * half + 2
     # a number of samples after which all that is counted modulo repeats
     period = math.lcm(width, n_stride * SPAN, n_block * (SUPPORT + 1))
-    # phi = peak (1 - s^2)^4; the first value of `test_function` is in the middle of the first sampling interval, where
-    # s = 1/n_support - 1
-    peak = float(test_function(rate)[0, 0]) / (1.0 - (1.0 / n_support - 1.0) ** 2) ** 4
+    peak = peak_weight(rate)
     order = 0.5 + 0.5 * BOUND_PROBABILITY  # of a two-sided interval
     quantiles = tuple(float(stdtrit(freedom, order)) for freedom in range(1, WINDOW))  # Student's t
     own_size_error, own_displacement, own_threshold = settings.size_error, settings.displacement, settings.log_threshold
@@ -377,7 +380,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     # without a basis the names are not used
     constant, combination, prediction, leak_scale, left_scale = basis or ((), (), (), 1.0, 1.0)
     unit = 1.0 if basis is None else basis.conductance_unit
-    increments = build_increments(settings.expressions, {name: k for k, name in enumerate(channels)})
+    limits = {"MAX_READING": MAX_READING, "BEYOND": BEYOND}
+    increments = build_increments(settings.expressions, {name: k for k, name in enumerate(channels)}, limits)
     compute_increments = large_law(increments)
 
     @law
@@ -444,8 +448,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
             m.ring[row_p_A, newest], m.ring[row_p_B, newest] = p_A, p_B
             m.ring[row_flow, newest], m.ring[row_x, newest] = flow, x
         else:  # the leak's increment is beyond `MAX_READING` in each interval with such a sample
-            m.ring[row_p_A, newest], m.ring[row_p_B, newest] = BEYOND * MAX_READING, -BEYOND * MAX_READING
-            m.ring[row_flow, newest], m.ring[row_x, newest] = BEYOND * MAX_READING, BEYOND * MAX_READING
+            m.ring[row_p_A, newest], m.ring[row_p_B, newest] = BEYOND, -BEYOND
+            m.ring[row_flow, newest] = m.ring[row_x, newest] = BEYOND
         m.sample_count = n_samples + 1 if n_samples + 1 < 2 * period else n_samples + 1 - period
         k = n_samples - half - 1  # the newest interval that has `half` samples after it
         if k < 0:
@@ -453,13 +457,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         compute_increments(m.ring, k, half, rate, m.displacement, m.increments)
         add_pressure_difference(m, k)
         stride, k_in_stride = k // n_stride, k % n_stride
-        for age in range(SPAN):  # add to the row that began `age` strides ago, weighted by its test function phi(s)
-            slot = (stride - age) % SPAN  # of this row in `unfinished`
-            s = (age * n_stride + k_in_stride + 0.5) * 2.0 / n_support - 1.0  # -1 .. 1 over the row
-            phi = peak * (1.0 - s * s) ** 4
-            for j in range(n_columns):
-                row_sum = 0.0 if age == 0 and k_in_stride == 0 else m.unfinished[slot, j]  # a new row begins at 0
-                m.unfinished[slot, j] = row_sum + phi * m.increments[j]
+        add_to_rows(m.unfinished, m.increments, k, n_stride, peak)
         # number of the row that is finished at the end of this stride; < 0 if it began before the first sample
         row = stride - SPAN + 1
         if k_in_stride < n_stride - 1 or row < 0:
@@ -618,7 +616,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         number, g = m.history[k, _HISTORY_NUMBER], m.history[k, _COMPARABLE_G]
         if steps.has_level == 1 and number - steps.end > pause:
             step.forget_onsets(steps)
-        step.take_estimate(steps, number, number + 1.0, g, math.sqrt(m.history[k, _VARIANCE]))
+        step.take_estimate(steps, number - steps.end + 1.0, number, number + 1.0, g, math.sqrt(m.history[k, _VARIANCE]))
         m.block_end = number + 1.0
         m.n_tested += 1
 
