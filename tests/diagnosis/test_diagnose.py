@@ -143,8 +143,8 @@ def test_no_part_of_a_diagnosis_spreads_small_matrices_over_threads(
 def test_no_part_of_a_summary_spreads_small_matrices_over_threads(
     healthy: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    threads = count_threads(monkeypatch, machine, "inspect_recording", "healthy_surprisals")
+    threads = count_threads(monkeypatch, machine, "inspect_recording", "stored_surprisals")
     levels = count_threads(monkeypatch, HealthyLevels, "learn")
     with threadpool_limits(limits=2):
         machine.summarise_healthy(healthy, load_rig("thesis"), "run.nc")
-    assert threads | levels == {name: {1} for name in ("inspect_recording", "healthy_surprisals", "learn")}
+    assert threads | levels == {name: {1} for name in ("inspect_recording", "stored_surprisals", "learn")}

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 from scipy.special import betainc, ndtr
 
-from sealscope.evaluation.scalar_search import find_minimum, find_near_root, find_root
+from sealscope.evaluation.scalar_search import find_minimum, find_root
 
 FUNCTIONS = {
     "cubic": (lambda x: x**3 - 2.0, 0.0, 2.0),
@@ -48,28 +48,6 @@ def test_a_root_may_be_an_end():
 def test_without_a_change_of_sign_there_is_no_root(function):
     with pytest.raises(ValueError, match="change its sign"):
         find_root(function, 0.0, 1.0)
-
-
-@pytest.mark.parametrize("start", [-1.7, -1.5, -1.3])
-def test_a_near_root_is_found_in_few_steps(start):
-    calls = []
-
-    def function(x):
-        calls.append(x)
-        return float(ndtr(x)) - 0.07
-
-    slope = np.exp(-0.5 * start**2) / np.sqrt(2.0 * np.pi)
-    assert find_near_root(function, start, slope, -9.0, 9.0) == pytest.approx(brentq(function, -9.0, 9.0), rel=1e-12)
-    calls.clear()
-    find_near_root(function, start, slope, -9.0, 9.0)
-    assert len(calls) < 8
-
-
-@pytest.mark.parametrize(
-    ("function", "slope"), [(np.tanh, -1.0), (np.tanh, 0.1), (lambda x: float("nan"), 1.0), (np.sign, 1.0)]
-)
-def test_a_root_that_is_not_near_is_left_to_bisection(function, slope):
-    assert find_near_root(function, 0.9, slope, -2.0, 2.0) is None
 
 
 @given(st.floats(-0.9, 0.9))

@@ -13,11 +13,11 @@ from collections.abc import Callable
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sealscope.compiled import cache_directory
 from sealscope.recordings.recording import Recording, compute_once
-from sealscope.storage.kept_results import MISSING, SUFFIX, keep_result, remove_oldest, restore_result
+from sealscope.storage.kept_results import MISSING, SUFFIX, keep_result, plain_json, remove_oldest, restore_result
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -58,18 +58,30 @@ def learn_once(
 
     def restore_or_compute(samples: Recording) -> _T:
         """Restore the result from disk, or compute and keep it."""
-        folder = results_folder()
-        if folder is None:
-            return compute(samples)
-        content = json.dumps([_digest(samples), key, None if rig is None else rig.as_dict()], default=str)
-        file = folder / (sha256(content.encode()).hexdigest() + SUFFIX)
-        result = restore_result(file)
-        if result is MISSING:
-            result = compute(samples)
-            keep_result(file, result)
-        return result  # type: ignore[no-any-return]
+        assumed = None if rig is None else rig.as_dict()
+        return _restore_or_compute(
+            lambda: json.dumps([_digest(samples), key, assumed], default=str), lambda: compute(samples)
+        )
 
     return compute_once(recording, (*key, rig), restore_or_compute)
+
+
+def keep_once(content: Any, compute: Callable[[], _T]) -> _T:
+    """Return `compute()`, kept on disk by the plain values `content` on which alone it depends."""
+    return _restore_or_compute(lambda: plain_json(content), compute)
+
+
+def _restore_or_compute(content: Callable[[], str], compute: Callable[[], _T]) -> _T:
+    """Restore a result from disk by the text `content()` on which it depends, or compute and keep it."""
+    folder = results_folder()
+    if folder is None:
+        return compute()
+    file = folder / (sha256(content().encode()).hexdigest() + SUFFIX)
+    result = restore_result(file)
+    if result is MISSING:
+        result = compute()
+        keep_result(file, result)
+    return result  # type: ignore[no-any-return]
 
 
 def _digest(recording: Recording) -> str:

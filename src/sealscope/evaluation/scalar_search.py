@@ -15,8 +15,6 @@ _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 #: Relative and absolute tolerance of a root, and largest number of steps to it.
 _RELATIVE_TOLERANCE, _ABSOLUTE_TOLERANCE = 4.0 * float(np.finfo(float).eps), float(np.finfo(float).tiny)
 _MAX_STEPS = 200
-#: Relative step of the secant method after which the error is below the last digit, and largest number of steps.
-_LAST_STEP, _MAX_SECANTS = 1e-9, 12
 
 
 def find_root(function: Callable[[float], float], low: float, high: float) -> float:
@@ -54,29 +52,6 @@ def find_root(function: Callable[[float], float], low: float, high: float) -> fl
             fraction += (c - a) / (b - a) * f_a / (f_c - f_a) * f_b / (f_c - f_b)
         fraction = min(max(fraction, margin), 1.0 - margin)
     return best
-
-
-def find_near_root(
-    function: Callable[[float], float], start: float, slope: float, low: float, high: float
-) -> float | None:
-    """Find a zero of a smooth rising function near `start` by the secant method; None if it does not converge.
-
-    `slope`: approximate slope at `start`. The iteration has converged at x if the next step is at most 1e-9 max(1,
-    |x|), so x should be of the order of one. Returns None if it takes more than 12 steps, leaves the range from `low`
-    to `high`, or meets a slope that is not positive. Near the zero it takes a third of the evaluations of `find_root`.
-    """
-    x, f_x = start, function(start)
-    for _ in range(_MAX_SECANTS):
-        if not slope > 0.0:
-            return None
-        step = -f_x / slope
-        if abs(step) <= _LAST_STEP * max(1.0, abs(x)):
-            return x + step
-        if not low < x + step < high:
-            return None
-        f_before, f_x = f_x, function(x + step)
-        slope, x = (f_x - f_before) / step, x + step
-    return None
 
 
 def find_minimum(function: Callable[[float], float], low: float, high: float, tolerance: float) -> tuple[float, float]:

@@ -30,7 +30,7 @@ _ARRAY, _TUPLE, _TABLE = "array", "tuple", "table"
 def keep_result(file: Path, value: Any) -> None:
     """Write a value to a file, for `restore_result`; a value of another type, or a full disk, leaves no file."""
     try:
-        data = json.dumps(_to_json(value), separators=(",", ":")).encode("ascii")
+        data = plain_json(value).encode("ascii")
     except TypeError:
         return
     with suppress(OSError):
@@ -41,6 +41,11 @@ def keep_result(file: Path, value: Any) -> None:
             Path(name).replace(file)  # whole or not at all for other processes
         except OSError:
             Path(name).unlink(missing_ok=True)
+
+
+def plain_json(value: Any) -> str:
+    """Convert a value to a JSON text without loss; raise TypeError for a type that is not supported."""
+    return json.dumps(_to_json(value), separators=(",", ":"))
 
 
 def restore_result(file: Path) -> Any:

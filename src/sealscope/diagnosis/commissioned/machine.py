@@ -19,7 +19,7 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.commissioned.cross_check import cross_check
 from sealscope.diagnosis.detectors.detector import log_failure, unusable_reason
-from sealscope.diagnosis.detectors.observation import healthy_surprisals, limit_threads
+from sealscope.diagnosis.detectors.observation import limit_threads, stored_surprisals
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
@@ -325,7 +325,7 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str) -> SummarisedRe
             start_s=start_seconds(recording, file),
             summaries=summaries,
             about=describe_recording(recording, inspection),
-            statistics=dict(healthy_surprisals(part, rig)),
+            statistics=stored_surprisals(part, rig),
         )
 
 

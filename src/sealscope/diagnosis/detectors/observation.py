@@ -20,12 +20,12 @@ from sealscope.diagnosis.decision.case import step_key
 from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_key
 from sealscope.diagnosis.detectors.detector import Detector, log_failure, unusable_reason, validate_report
 from sealscope.diagnosis.detectors.registry import detectors
-from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, healthy_summaries
+from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
-from sealscope.diagnosis.learnt import learn_once
+from sealscope.diagnosis.learnt import keep_once, learn_once
 from sealscope.diagnosis.rms_change.rms_detector import RmsChange, compare_summaries, has_same_rate
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, VOLUME_BALANCE
 from sealscope.parameters import Rig
@@ -125,32 +125,41 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
     return None if has_summary else "its samples were not kept, and it has no summary for this method"
 
 
-def healthy_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
-    """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached."""
-    return learn_once(recording, (SURPRISALS,), lambda samples: _compute_surprisals(samples, rig), rig)
+def healthy_surprisals(recording: Recording, rig: Rig, *, shut: bool = False) -> Mapping[str, float]:
+    """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached.
+
+    `shut`: true to assume that valves cut the pump off at rest.
+    """
+    key = (SURPRISALS, "shut" if shut else "open")
+    return learn_once(recording, key, lambda samples: _compute_surprisals(samples, rig, shut), rig)
 
 
-def _compute_surprisals(recording: Recording, rig: Rig) -> Mapping[str, float]:
+def stored_surprisals(recording: Recording, rig: Rig) -> dict[str, float]:
+    """Compute the surprisals of a healthy recording under both assumptions on the valves at rest.
+
+    Those under the assumption that they cut the pump off have keys that begin with `SHUT`, where they differ.
+    """
+    by_open, by_shut = (healthy_surprisals(recording, rig, shut=shut) for shut in (False, True))
+    differing = {key: surprisal for key, surprisal in by_shut.items() if surprisal != by_open.get(key)}
+    return {**by_open, **{f"{SHUT}{key}": surprisal for key, surprisal in differing.items()}}
+
+
+def _compute_surprisals(recording: Recording, rig: Rig, shut: bool) -> Mapping[str, float]:
     """Compute the surprisals of changes of the signals and of the volume balance within a recording, by their keys.
 
-    The volume balance is tested once for each assumption on the valves at rest that the recording allows. Without a
-    balance the pressure response, which then judges, is tested.
+    `shut`: as in `healthy_surprisals`. Without a balance the pressure response, which then judges, is tested.
     """
     surprisals = _max_surprisals(observe_signals(recording))
-    balance = VolumeBalance(rig)
-    reports: Mapping[bool, Observed] = {}  # key: True if valves are assumed to cut the pump off at rest
+    balance, report = VolumeBalance(rig), None
     if unusable_reason(balance, recording) is None:
         try:
             with np.errstate(all="ignore"):
-                reports = balance.observe_regimes(recording)
+                report = balance.observe_alone(recording, shut=shut)
         except Exception as error:
             log_failure(balance.name, distribution=None, error=error)
-    for is_shut, report in reports.items():
-        prefix = SHUT if is_shut else ""
-        surprisals |= {f"{prefix}{key}": surprisal for key, surprisal in _max_surprisals(report).items()}
-    if not reports and PRESSURE_RESPONSE in detectors():
-        surprisals |= _max_surprisals(run_detector(PRESSURE_RESPONSE, recording, (), rig))
-    return surprisals
+    if report is None and PRESSURE_RESPONSE in detectors():
+        report = run_detector(PRESSURE_RESPONSE, recording, (), rig)
+    return surprisals if report is None else {**surprisals, **_max_surprisals(report)}
 
 
 def _max_surprisals(report: Observed) -> dict[str, float]:
@@ -175,38 +184,50 @@ def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
-        surprisals = (
-            healthy.statistics if isinstance(healthy, SummarisedRecording) else healthy_surprisals(healthy, rig)
-        )
-        if shut:
-            shut_keys = [key for key in surprisals if key.startswith(SHUT)]
+        if isinstance(healthy, Recording):
+            surprisals = healthy_surprisals(healthy, rig, shut=shut)
+        else:
+            surprisals = healthy.statistics
+            shut_keys = [key for key in surprisals if shut and key.startswith(SHUT)]
             surprisals = {**surprisals, **{key.removeprefix(SHUT): surprisals[key] for key in shut_keys}}
         for key, surprisal in surprisals.items():
             surprisals_by_key[key].append(surprisal)
-    for observables in compare_healthy(baseline):
-        for data in {observable.data for observable in observables}:
-            max_surprisal = max(observable.surprisal for observable in observables if observable.data == data)
-            surprisals_by_key[comparison_key(data)].append(max_surprisal)
+    summaries = comparable_summaries(baseline)
+    comparisons = keep_once(("healthy comparisons", summaries), lambda: list(map(_rarest, compare_healthy(summaries))))
+    for rarest in comparisons:
+        for data, surprisal in rarest.items():
+            surprisals_by_key[comparison_key(data)].append(surprisal)
     return HealthyNull(surprisals_by_key)
 
 
-def compare_healthy(baseline: Sequence[Healthy]) -> Iterator[Sequence[Observable]]:
-    """Compare the ringing of each healthy recording with that of all others, and yield the test results of each.
+def _rarest(observables: Sequence[Observable]) -> dict[str, float]:
+    """Collect the largest surprisal of test results by the kind of their data."""
+    ascending = sorted(observables, key=lambda observable: observable.surprisal)
+    return {observable.data: observable.surprisal for observable in ascending}
 
-    Recordings with other chambers or another sampling rate than the first usable one are left out. If fewer than
-    `MIN_COMPARED` remain, nothing is yielded.
+
+def comparable_summaries(baseline: Sequence[Healthy]) -> list[Summary]:
+    """Collect the summaries of the ringing of healthy recordings that can be compared with each other.
+
+    Recordings with other chambers or another sampling rate than the first usable one are left out.
     """
     detector = RmsChange()
     usable_entries = [entry for entry in baseline if _unusable_baseline(detector, entry) is None]
     summaries = healthy_summaries(detector, usable_entries)
-    comparable = [
+    return [
         summary
         for summary in summaries
         if summary["chambers"] == summaries[0]["chambers"] and has_same_rate(summary["rate"], summaries[0]["rate"])
     ]
-    if len(comparable) < MIN_COMPARED:
+
+
+def compare_healthy(summaries: Sequence[Summary]) -> Iterator[Sequence[Observable]]:
+    """Compare the ringing of each healthy recording with that of all others, and yield the test results of each.
+
+    `summaries`: those of recordings that can be compared; with fewer than `MIN_COMPARED` nothing is yielded.
+    """
+    if len(summaries) < MIN_COMPARED:
         return
-    for k, summary in enumerate(comparable):
-        other_summaries = comparable[:k] + comparable[k + 1 :]
-        observables, _ = compare_summaries(summary, other_summaries, summary["chambers"])
+    for k, summary in enumerate(summaries):
+        observables, _ = compare_summaries(summary, [*summaries[:k], *summaries[k + 1 :]], summary["chambers"])
         yield observables

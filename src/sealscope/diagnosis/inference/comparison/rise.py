@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from functools import partial
+import math
 from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
-from sealscope.evaluation.scalar_search import find_near_root, find_root
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
 
@@ -20,8 +20,10 @@ NODES = 32
 MAX_LOG = 4.0
 #: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
 NEGLIGIBLE = 16.0
-#: Number of parts of a large mixture that give the first estimate of a quantile, and step for the slope there.
-SAMPLED, SLOPE_STEP = 1000, 1e-3
+#: Number of parts of a large mixture that give the first estimate of a quantile; maximum number of steps to it; and
+#: distance [standard deviations] beyond which a normal distribution has no probability of the order of rounding.
+SAMPLED, MAX_STEPS, NEGLIGIBLE_TAIL = 128, 200, 9.0
+ROOT_HALF, ROOT_PI = math.sqrt(0.5), math.sqrt(math.pi)
 
 
 class Mixture(NamedTuple):
@@ -36,30 +38,56 @@ class Mixture(NamedTuple):
 
     def quantile(self, probability: float) -> float:
         """Compute the value below which the mixture lies with the given probability."""
-        from scipy.special import ndtr, ndtri
+        from scipy.special import ndtri
 
         # scale by the mean deviation (each counts up to 1000 times the smallest): the quantile is then of order one
         scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
-        scaled = self._replace(centres=self.centres / scale, deviations=self.deviations / scale)
+        centres, deviations = self.centres / scale, self.deviations / scale
+        return scale * float(_find_quantile(self.weights, deviations, centres, probability, float(ndtri(probability))))
 
-        def excess(value: float, mixture: Mixture = scaled) -> float:
-            """Compute the probability of values below `value`, minus the wanted `probability`."""
-            return float(mixture.weights @ ndtr((value - mixture.centres) / mixture.deviations)) - probability
 
-        part_quantiles = scaled.centres + ndtri(probability) * scaled.deviations
-        low, high = float(part_quantiles.min()), float(part_quantiles.max())  # the quantile is between them
-        root = None
-        if len(self.weights) > 4 * SAMPLED:  # begin at the quantile of a sample of the normal distributions
-            weights, deviations, centres = (values[:: len(values) // SAMPLED] for values in scaled)
-            sample = Mixture(weights / weights.sum(), deviations, centres)
-            sample_excess = partial(excess, mixture=sample)
-            if sample_excess(low) < 0.0 < sample_excess(high):
-                start = find_root(sample_excess, low, high)
-                difference = sample_excess(start + SLOPE_STEP) - sample_excess(start - SLOPE_STEP)
-                root = find_near_root(excess, start, difference / (2.0 * SLOPE_STEP), low, high)
-        if root is None:  # without a change of sign, all parts have nearly the same quantile
-            root = low if not excess(low) < 0.0 < excess(high) else find_root(excess, low, high)
-        return scale * root
+@kernel
+def _find_quantile(weights: Array, deviations: Array, centres: Array, probability: float, z: float) -> float:
+    """Find the quantile of a `Mixture` at a `probability` by Newton's method between bounds, to 12 digits.
+
+    `z`: the quantile of the standard normal distribution. That of the mixture lies between those of its parts. A search
+    among a sample of the parts gives the first estimate.
+    """
+    n = weights.size
+    lowest, highest, value = np.inf, -np.inf, 0.0
+    for k in range(n):
+        part = centres[k] + z * deviations[k]
+        lowest, highest, value = min(lowest, part), max(highest, part), value + weights[k] * part
+    if not math.isfinite(highest - lowest):
+        return lowest
+    for sample in range(2):
+        stride = 1 if sample else max(1, n // SAMPLED)
+        if not sample and stride == 1:
+            continue
+        low, high, total = lowest, highest, 0.0
+        for k in range(0, n, stride):
+            total += weights[k]
+        for _ in range(MAX_STEPS):
+            excess, density = -probability * total, 0.0
+            for k in range(0, n, stride):
+                u = (value - centres[k]) / deviations[k]
+                if u > NEGLIGIBLE_TAIL:
+                    excess += weights[k]
+                elif u > -NEGLIGIBLE_TAIL:
+                    excess += weights[k] * 0.5 * math.erfc(-u * ROOT_HALF)
+                    density += weights[k] / deviations[k] * math.exp(-0.5 * u * u)
+            if excess == 0.0:
+                break
+            low, high = (value, high) if excess < 0.0 else (low, value)
+            step = -excess / (density * ROOT_HALF / ROOT_PI) if density > 0.0 else np.inf
+            is_newton = low < value + step < high
+            if not is_newton:  # Newton's step leaves the bounds
+                step = 0.5 * (low + high) - value
+            value += step
+            # the error after a step of Newton's method is about its square
+            if abs(step) <= (1e-6 if is_newton else 1e-13) * max(1.0, abs(value)):
+                break
+    return value
 
 
 class Rise(NamedTuple):

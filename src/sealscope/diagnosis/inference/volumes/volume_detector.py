@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -304,18 +304,18 @@ class VolumeBalance:
             return report
         return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
-    def observe_regimes(self, recording: Recording) -> Mapping[bool, Observed]:
-        """Report on a recording without a baseline, with open valves (False) and, if the pump rests, shut ones (True).
+    def observe_alone(self, recording: Recording, *, shut: bool) -> Observed | None:
+        """Report on a recording without a baseline; None without a balance.
 
-        Empty without a balance.
+        `shut`: true to assume, if the pump rests in the recording, that valves then cut it off from the cylinder.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
-            balances = [self.balance(recording)]  # a balance without a position, or None
+            balance = self.balance(recording)  # a balance without a position, or None
         else:
-            regimes = [regime for regime in (recorded.open, recorded.shut) if regime is not None]
-            balances = [self._build_balance(recording, regime, recorded.shut) for regime in regimes]
-        return {balance.shut: self._report(balance, ()) for balance in balances if balance is not None}
+            regime = recorded.shut if shut and recorded.shut is not None else recorded.open
+            balance = self._build_balance(recording, regime, recorded.shut)
+        return None if balance is None else self._report(balance, ())
 
     def _report(self, balance: RecordedBalance, healthy: Sequence[RecordingSums]) -> Observed:
         """Report on a volume balance: test results, leakage, and the judged part of the recording.
