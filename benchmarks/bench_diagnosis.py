@@ -86,7 +86,11 @@ def of_many(count: int, duration: float, cores: int) -> float:
         call = [sys.executable, "-m", "sealscope", "diagnose", "--format", "jsonl", *files]
         return seconds(
             lambda: subprocess.run(
-                call, check=True, capture_output=True, preexec_fn=lambda: os.sched_setaffinity(0, allowed)
+                call,
+                check=True,
+                capture_output=True,
+                env={**os.environ, "PYTHONDONTWRITEBYTECODE": ""},  # as an installed package, which has its bytecode
+                preexec_fn=lambda: os.sched_setaffinity(0, allowed),
             )
         )
 

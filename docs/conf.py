@@ -172,12 +172,14 @@ def speed() -> str:
             lines.append(f"| one run, {case} | {1e3 * seconds:.0f} | {100 * ratio:.0f} % of {peer} |")
     lines += ["", f"Measured {solvers['measured']} on {solvers['machine']}.", ""]
     lines += [
-        "| verdicts | seconds of processor | peak MiB | most of the process's time |",
-        "| --- | --- | --- | --- |",
+        "| work | seconds of processor (asked) | over those of 30 November | peak MiB (asked) | most of the time |",
+        "| --- | --- | --- | --- | --- |",
     ]
     for work, row in verdicts["rows"].items():
         shares = ", ".join(f"{area} {100 * share:.0f} %" for area, share in row.get("shares", {}).items())
-        lines.append(f"| {work} | {row['seconds']:.2g} | {row['MiB']:.0f} | {shares} |")
+        asked, memory = (f" ({row[name]:g})" if row.get(name) else "" for name in ("asked", "asked MiB"))
+        ratio = f"{row['ratio']:.2f}" if "ratio" in row else ""
+        lines.append(f"| {work} | {row['seconds']:.2g}{asked} | {ratio} | {row['MiB']:.0f}{memory} | {shares} |")
     if verdicts["growth"]:
         growth = ", ".join(f"{power:.1f} of the {name}" for name, power in verdicts["growth"].items())
         lines += ["", f"The time, or where stated the memory, grows as the power {growth}."]
