@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 
 from sealscope.emit.c_export import render_c
 from sealscope.emit.stream_program import StreamProgram
+from sealscope.fmu.description import templates
 from sealscope.fmu.variables import SENSOR_RESULTS, VALUES, Variable, input_variables, output_variables, rig_variable
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
@@ -15,53 +16,6 @@ from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 FAILURES: Mapping[int, str] = {1: "pump.q_b must be > 0 m^3/rev"}
 #: The only parameter of the rig that the balance reads: the pump's displacement [m^3/rev].
 DISPLACEMENT = "pump.q_b"
-#: Functions of the unit: `y` begins with the time to the next sample [s], after which the state stands.
-_GLUE = """\
-/* The functions of the unit (unit.c), which feed samples to the estimator of leak.c. */
-#include "leak.h"
-#include "unit.h"
-
-void sealscope_start(int64_t *code, const double *values, const double *inputs, double x_0, double *y)
-{{
-    leak_state *state = (leak_state *)(void *)(y + 1);
-    (void)inputs;
-    (void)x_0;
-    y[0] = 0.0;
-    leak_init(state);
-    state->displacement = values[{index}] / {full_turn!r};
-    *code = (values[{index}] > 0.0) ? 0 : 1;
-}}
-
-void sealscope_advance(int64_t *code, const double *values, const double *inputs, const double *slopes, double *y,
-                       double span, int64_t steps)
-{{
-    leak_state *state = (leak_state *)(void *)(y + 1);
-    double t = y[0];
-    (void)values;
-    (void)steps;
-    while (t < span - {tolerance!r}) {{ /* a sample at the end is the next step's first */
-        leak_sample(state, inputs[0] + (slopes[0] * t), inputs[1] + (slopes[1] * t), inputs[2] + (slopes[2] * t),
-                    inputs[3] + (slopes[3] * t));
-        while (leak_step(state)) {{
-        }}
-        t += {interval!r};
-    }}
-    y[0] = t - span;
-    *code = 0;
-}}
-
-void sealscope_report(const double *values, const double *inputs, double *y, double *results)
-{{
-    leak_state *state = (leak_state *)(void *)(y + 1);
-    int32_t k;
-    (void)values;
-    (void)inputs;
-    leak_results(state);
-    for (k = 0; k < {n_results}; ++k) {{
-        results[k] = state->results[k];
-    }}
-}}
-"""
 
 
 def variables(rig: Rig, channels: tuple[str, ...]) -> Iterator[Variable]:
@@ -72,15 +26,22 @@ def variables(rig: Rig, channels: tuple[str, ...]) -> Iterator[Variable]:
 
 
 def sensor_sources(unit: StreamProgram, title: str) -> dict[str, str]:
-    """Render the C sources of a soft sensor by file name."""
+    """Render the C sources of a soft sensor by file name.
+
+    The memory `y` of its functions begins with the time to the next sample [s], after which the state stands.
+    """
     files = render_c(unit, prefix="leak", title=title, origin="a unit", alarm_rate=1.0)
     interval = 1.0 / unit.settings.rate
-    glue = _GLUE.format(
-        index=VALUES.index(DISPLACEMENT),
-        full_turn=2.0 * math.pi,
-        interval=interval,
-        tolerance=1e-6 * interval,
-        n_results=len(SENSOR_RESULTS),
+    glue = (
+        templates()
+        .get_template("sensor.c.j2")
+        .render(
+            index=VALUES.index(DISPLACEMENT),
+            full_turn=2.0 * math.pi,
+            interval=interval,
+            tolerance=1e-6 * interval,
+            n_results=len(SENSOR_RESULTS),
+        )
     )
     return {"leak.h": files["leak.h"], "leak.c": files["leak.c"], "sensor.c": glue}
 
