@@ -33,15 +33,15 @@ from sealscope.diagnosis.hold.readings import (
 from sealscope.diagnosis.hold.regression import (
     Alternative,
     Column,
-    Mixture,
     RateFit,
-    fit_rate,
+    RateRegression,
     pool_fits,
 )
 from sealscope.diagnosis.hold.result import HoldCurve
 from sealscope.diagnosis.hold.set_up import SetUp
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import relative_compression
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_hold_offsets, small_difference_factor
+from sealscope.diagnosis.inference.comparison.rise import Mixture
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD
@@ -317,7 +317,7 @@ class HeldLoad:
                 )
                 thermal.append(Alternative((1.0 - stopped) * weight, bends))
         settling = self._settling(readings, HOLD.settling.travel)
-        fits = [fit_rate(readings, base, [settling, terms], self.duration) for terms in (thermal, resting) if terms]
+        fits = [self._regression.fit_rate(base, [settling, terms]) for terms in (thermal, resting) if terms]
         logs = [fit.log_evidence for fit in fits]
         if resting:  # a piston on its stop follows no temperature, and does not creep
             logs[1] -= 0.5 * (fits[1].rate.mean / fits[1].rate.deviation) ** 2
@@ -354,6 +354,11 @@ class HeldLoad:
         """Readings of the travel [mm]."""
         return read_channel(self.t, np.asarray(self.travel), HOLD.noise.position)
 
+    @cached_property
+    def _regression(self) -> RateRegression:
+        """Regression of the travel."""
+        return RateRegression(self._travel_readings, self.duration)
+
     def _read_compression(self, p: Array, length: float) -> tuple[Readings, Readings, list[Column]]:
         """Read an absolute pressure `p` (n,) [Pa], and the travel [mm] that a column of a `length` [mm] gives way.
 
@@ -387,7 +392,7 @@ class HeldLoad:
         clocks = self._clocks(compression)[: len(EXPONENTS)]
         if len(clocks) > 1:  # a steady gain, too, whatever its law
             clocks.append(LeakClock(clocks[0].weight, t / 60.0))
-        fit = self._fit_laws(compression, base, alternatives, clocks)
+        fit = self._fit_laws(RateRegression(compression, self.duration), base, alternatives, clocks)
         return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
 
     @cached_property
@@ -398,7 +403,7 @@ class HeldLoad:
             volume, time = set_up.collected
             prior = HOLD.collected
             deviation = math.hypot(prior.deviation * volume, prior.drop * 1e-6) / time
-            flow = Mixture(np.ones(1), np.array([volume / time]), np.array([deviation]))
+            flow = Mixture(np.ones(1), np.array([deviation]), np.array([volume / time]))
         elif (meter := self._channel("q_leak")) is not None:
             flow = self._metered_flow(meter)
         else:
@@ -410,6 +415,21 @@ class HeldLoad:
             return leak._replace(flow=leak.rate.scale(MM_PER_MINUTE * area))
         return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow)
 
+    @cached_property
+    def creep_interval(self) -> tuple[float, float] | None:
+        """95 % interval of the creep [mm/min]; None without a position."""
+        return None if self.creep is None else self.creep.rate.interval
+
+    @cached_property
+    def leak_intervals(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
+        """95 % intervals of the leak's rate [mm/min] and flow [m^3/s]; None for what is unknown."""
+        rate, flow, area = self.leak.rate, self.leak.flow, self.set_up.area(self.loaded)
+        rate_ends = None if rate is None else rate.interval
+        if flow is None or rate_ends is None or area is None:
+            return rate_ends, None if flow is None else flow.interval
+        low, high = rate_ends
+        return rate_ends, (MM_PER_MINUTE * area * low, MM_PER_MINUTE * area * high)
+
     def _metered_flow(self, meter: Array) -> Mixture:
         """Estimate the mean flow [m^3/s] of a leakage flow meter, with its zero and gain."""
         readings = read_channel(self.t, meter, ML_PER_MINUTE)
@@ -418,8 +438,8 @@ class HeldLoad:
         scaled = readings._replace(
             values=readings.values / scale, loose=readings.loose / scale, quantum=readings.quantum / scale
         )
-        level = Column(np.ones_like(t))
-        fit = fit_rate(scaled, [level], [self._settling(readings, (0.1, 1.0))], self.duration, from_first=False)
+        regression = RateRegression(scaled, self.duration, from_first=False)
+        fit = regression.fit_rate([Column(np.ones_like(t))], [self._settling(readings, (0.1, 1.0))])
         return fit.rate.scale(scale).add_error(INFERENCE.size.meter * abs(fit.rate.mean) * scale)
 
     def _leak_by_travel(self) -> LeakEstimate:
@@ -436,7 +456,7 @@ class HeldLoad:
                 base.append(Column(column, 1.0, math.hypot(deviation, width)))
                 if np.ptp(column) > LEAST_BEND:
                     base += self._misfit(readings.t, column, oil.misfit * float(np.ptp(column)))
-        fit = self._fit_leak(readings, base, HOLD.settling.travel)
+        fit = self._fit_leak(self._regression, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
     def _leak_by_pressure(self) -> LeakEstimate:
@@ -447,7 +467,7 @@ class HeldLoad:
         length, deviation = self.column
         pressures, compression, base = self._read_compression(p, -length)
         sizes = [length * strain for strain in HOLD.settling.strain]
-        fit = self._fit_leak(compression, base, sizes)
+        fit = self._fit_leak(RateRegression(compression, self.duration), base, sizes)
         rate = fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
         if self.creep is not None:
             rate = rate.add_error(self.creep.rate.deviation)
@@ -461,38 +481,39 @@ class HeldLoad:
     def _is_at_stop(self) -> bool:
         """True if the piston stands still while the loaded chamber's pressure changes."""
         p = self._pressure(self.loaded)
-        if p is None or self.creep is None:
+        if p is None or self.creep is None or self.creep_interval is None:
             return False
         _, compression = average_parts(self.t, relative_compression(p).sum(axis=0), 10)
-        low, high = self.creep.rate.interval
+        low, high = self.creep_interval
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
         return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
 
     def _fit_laws(
         self,
-        readings: Readings,
+        regression: RateRegression,
         base: Sequence[Column],
         alternatives: Sequence[Sequence[Alternative]],
         clocks: Sequence[LeakClock],
     ) -> RateFit:
         """Fit the rate [mm/min] under each law of a leak (`clocks`), and pool the laws."""
-        t = readings.t
+        t = regression.readings.t
         fits, logs = [], []
-        speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
+        speed = float(np.ptp(regression.readings.values)) / (self.duration / 60.0)
         for clock in clocks:
             law = [] if clock.spare is None else [Column(speed * clock.spare, 0.0, 1.0)]
             bend = float(np.ptp(speed * self._bend(t, clock.minutes, self.duration / 60.0)))
             if bend > LEAST_BEND:
                 law += self._misfit(t, clock.minutes, INFERENCE.held_oil.misfit * bend)
-            fits.append(fit_rate(readings, [Column(clock.minutes), *base, *law], alternatives, self.duration))
+            fits.append(regression.fit_rate([Column(clock.minutes), *base, *law], alternatives))
             logs.append(math.log(clock.weight) + fits[-1].log_evidence)
         return pool_fits(fits, logs)
 
-    def _fit_leak(self, readings: Readings, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
+    def _fit_leak(self, regression: RateRegression, base: Sequence[Column], sizes: Sequence[float]) -> RateFit:
         """Fit the rate of a leak [mm/min] under each law, with temperature and what settles."""
+        readings = regression.readings
         alternatives = [self._settling(readings, sizes), self._cooling(readings)]
         columns = [*base, *self._thermal_columns(readings.t)]
-        fit = self._fit_laws(readings, columns, alternatives, self._clocks(readings))
+        fit = self._fit_laws(regression, columns, alternatives, self._clocks(readings))
         return fit._replace(rate=fit.rate.add_error(self.rounding))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_left
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,8 +11,8 @@ import numpy as np
 from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
 from sealscope.diagnosis.hold.plan import predict_rate_error
-from sealscope.diagnosis.hold.regression import Mixture, pool_mixtures
 from sealscope.diagnosis.hold.result import HoldResult
+from sealscope.diagnosis.inference.comparison.rise import Mixture, pool_mixtures
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
 from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD
@@ -30,23 +31,25 @@ _CLOSE = "close the line at the valve: if it still sinks, the line leaks"
 def judge_hold(hold: HeldLoad) -> HoldResult:
     """Judge a hold against the limit that the caller states, if any."""
     set_up, leak, limit = hold.set_up, hold.leak, hold.set_up.limit
-    creep = None if hold.creep is None else hold.creep.rate
-    pressure = hold.mean_pressure
+    creep, creep_ends = None if hold.creep is None else hold.creep.rate, hold.creep_interval
+    (rate_ends, flow_ends), pressure = hold.leak_intervals, hold.mean_pressure
     reference = limit.pressure if limit is not None and limit.pressure is not None else set_up.reference
     converted = None if reference is None or leak.flow is None else _convert_flow(leak.flow, pressure, reference)
-    compared, scale = leak.rate, MM_PER_MINUTE
+    converted_ends = None if converted is None else converted.interval
+    compared, interval, scale = leak.rate, rate_ends, MM_PER_MINUTE
     if limit is not None and limit.kind == "flow":
-        compared, scale = (leak.flow if limit.pressure is None else converted), 1.0
+        compared, interval, scale = leak.flow, flow_ends, 1.0
+        if limit.pressure is not None:
+            compared, interval = converted, converted_ends
     bound = None if limit is None else limit.value / scale
-    interval = None if compared is None else compared.interval
     result = None
     if bound is not None:
         result = "undecided" if interval is None else decide_result(interval, bound)
-    shown = leak.rate if leak.flow is None else leak.flow
-    has_leak = shown is not None and shown.interval[0] > 0.0
+    shown, shown_ends = (leak.rate, rate_ends) if leak.flow is None else (leak.flow, flow_ends)
+    has_leak = shown_ends is not None and shown_ends[0] > 0.0
     if shown is not None and hold.warming > HOLD.cooling.steady:  # the prior of cooling is an assumption
         has_leak &= shown.below(0.0) < HOLD.other.sure
-    sinks = creep is not None and creep.interval[0] > 0.0
+    sinks = creep_ends is not None and creep_ends[0] > 0.0
     by_cooling = sinks and not has_leak
     causes = _list_causes(hold) if has_leak else (COOLING,) if by_cooling else ()
     minutes = None
@@ -63,12 +66,12 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
         start_s=None if t is None else float(t[0]),
         end_s=None if t is None else float(t[-1]),
         creep_mm_per_min=None if creep is None else creep.mean,
-        creep_interval_mm_per_min=None if creep is None else creep.interval,
+        creep_interval_mm_per_min=creep_ends,
         leak_lpm=None if leak.flow is None else leak.flow.mean / LITRE_PER_MINUTE,
-        leak_interval_lpm=_interval_lpm(leak.flow),
+        leak_interval_lpm=_convert_ends(flow_ends),
         pressure_bar=None if pressure is None else pressure / BAR,
         leak_at_lpm=None if converted is None else converted.mean / LITRE_PER_MINUTE,
-        leak_at_interval_lpm=_interval_lpm(converted),
+        leak_at_interval_lpm=_convert_ends(converted_ends),
         at_bar=None if converted is None or reference is None else reference / BAR,
         result=result,
         limit=None if limit is None else limit.text,
@@ -84,12 +87,9 @@ def judge_hold(hold: HeldLoad) -> HoldResult:
     )
 
 
-def _interval_lpm(flow: Mixture | None) -> tuple[float, float] | None:
-    """Convert the interval of a flow [m^3/s] to L/min; None for None."""
-    if flow is None:
-        return None
-    low, high = flow.interval
-    return low / LITRE_PER_MINUTE, high / LITRE_PER_MINUTE
+def _convert_ends(ends: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Convert the interval of a flow from m^3/s to L/min; None for None."""
+    return None if ends is None else (ends[0] / LITRE_PER_MINUTE, ends[1] / LITRE_PER_MINUTE)
 
 
 def _convert_flow(flow: Mixture, pressure: float | None, reference: float) -> Mixture | None:
@@ -124,21 +124,22 @@ def _weigh_piston(hold: HeldLoad) -> int:
 
     A closed other side gains what passes the piston. Its pressure rises by it, and falls as the piston sinks.
     """
-    gain, leak = hold.gain, hold.leak
-    if gain is None or leak.rate is None:
+    gain, leak, (rate_ends, _) = hold.gain, hold.leak, hold.leak_intervals
+    if gain is None or leak.rate is None or rate_ends is None:
         return 0
+    low, high = gain.interval
     prior, is_material = HOLD.other, abs(gain.mean) > HOLD.other.material * abs(leak.rate.mean)
     p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
     is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > prior.tank * BAR
-    if is_closed and is_material and gain.interval[0] > 0.0:
+    if is_closed and is_material and low > 0.0:
         return 1
     area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
     ratio = 1.0 if area is None or other_area is None else other_area / area
     travel = Mixture(np.ones(1), np.zeros(1), np.zeros(1)) if hold.creep is None else hold.creep.rate
     gained = ratio * (travel.mean + gain.mean)
     error = ratio * math.hypot(travel.deviation, gain.deviation)
-    falls = is_material and gain.interval[1] < 0.0
-    if (is_closed or falls) and gained + WITHIN_95 * error < leak.rate.interval[0]:
+    falls = is_material and high < 0.0
+    if (is_closed or falls) and gained + WITHIN_95 * error < rate_ends[0]:
         return -1
     return 0
 
@@ -162,15 +163,17 @@ def find_minutes(hold: HeldLoad, margin: float) -> float | None:
     if fit is None:
         return None
     length, _ = hold.column
-    n_readings, total = len(fit.fit), minutes
-    while total < LONGEST_ADVISED:
-        total *= TRIED_RATIO
-        half = WITHIN_95 * predict_rate_error(
-            total, n_readings * total / minutes, fit.noise, fit.s, hold.duration, length, hold.warming
-        )
-        if half < margin:
-            return float(math.ceil(total - minutes))
-    return None
+    noise, n_readings = fit.noise, len(fit.fit) / minutes
+
+    def suffices(total: float) -> bool:
+        """Test whether a hold of `total` minutes makes the half-width small enough."""
+        error = predict_rate_error(total, n_readings * total, noise, fit.s, hold.duration, length, hold.warming)
+        return WITHIN_95 * error < margin
+
+    n_tried = max(math.ceil(math.log(LONGEST_ADVISED / minutes) / math.log(TRIED_RATIO)), 0)
+    totals = [minutes * TRIED_RATIO**k for k in range(1, n_tried + 1)]
+    k = bisect_left(totals, True, key=suffices)
+    return float(math.ceil(totals[k] - minutes)) if k < len(totals) else None
 
 
 def describe_oil(hold: HeldLoad) -> str:
@@ -198,14 +201,15 @@ def _describe(
     """Describe the result of a hold in a sentence or two."""
     parts, leak = [], hold.leak
     place = "" if hold.mean_pressure is None else f" at {hold.mean_pressure / BAR:.3g} bar"
-    if hold.creep is not None:
-        mean, low, high = hold.creep.rate.mean, *hold.creep.rate.interval
+    if hold.creep is not None and hold.creep_interval is not None:
+        mean, (low, high) = hold.creep.rate.mean, hold.creep_interval
         if high < 0.0:
             parts.append(f"rises by {format_estimate(-mean, -high, -low)} mm/min{place}")
         else:
             parts.append(f"sinks by {format_estimate(mean, low, high)} mm/min{place}")
-    if leak.flow is not None:
-        mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in leak.flow.interval)
+    _, flow_ends = hold.leak_intervals
+    if leak.flow is not None and flow_ends is not None:
+        mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in flow_ends)
         if low > 0.0:
             words = f"leak {format_estimate(mean, low, high)} mL/min"
         else:

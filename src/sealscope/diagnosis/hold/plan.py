@@ -17,7 +17,7 @@ from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
 #: Durations that are tried [min], and the duration that is planned if no leak to detect is stated.
 HOLD_MINUTES, DEFAULT_MINUTES = (1.0, 2.0, 3.0, 5.0, 10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 240.0), 10.0
 #: Most readings in the formula; more count by their smaller noise.
-MAX_READINGS = 240
+MAX_READINGS = 120
 #: Readings a second that are assumed of a logger.
 READINGS_PER_SECOND = 1.0
 
@@ -34,11 +34,9 @@ def predict_rate_error(
     m = int(min(max(n_readings, 4.0), MAX_READINGS))
     t = 60.0 * minutes * (np.arange(m) + 0.5) / m
     columns = [Column(t / 60.0), Column(np.ones(m))]
-    if warming == 0.0:
-        return predict_deviation(t, columns, noise, s, duration, m / n_readings)
     size = HOLD.cooling.expansion * length * warming
-    courses = [Column(np.expm1(-t / time), 0.0, size) for time in HOLD.cooling.times]
-    return max(predict_deviation(t, [*columns, course], noise, s, duration, m / n_readings) for course in courses)
+    courses = [[Column(np.expm1(-t / time), 0.0, size)] for time in HOLD.cooling.times] if size else [[]]
+    return predict_deviation(t, columns, courses, noise, s, duration, m / n_readings)
 
 
 class PlannedHold(NamedTuple):

@@ -17,34 +17,29 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
-from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.compiled import kernel
 from sealscope.diagnosis.hold.readings import Readings
+from sealscope.diagnosis.inference.comparison.rise import LEAST_WEIGHT, Mixture, pool_mixtures
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.recordings.recording import Array
 
 #: Points of the grid of log s^2 about its most probable value, in standard deviations sqrt(2/m).
-VARIANCE_POINTS = np.array([-1.5, -0.5, 0.5, 1.5, 2.5, 3.5])
+VARIANCE_POINTS = np.arange(-2.0, 6.0)
 #: Iterations that find the most probable variance.
 N_ITERATIONS = 3
 #: Combinations whose log likelihood, at the most probable variance, is lower than the best by more are left out.
 MAX_DECREASE = 14.0
-#: Smallest weight of a component of a mixture, relative to the largest.
-LEAST_WEIGHT = 1e-5
-#: Half of an interval's probability outside, and iterations of a bisection for a quantile.
-TAIL, N_BISECTIONS = 0.025, 30
-#: Number of factors into which an uncertain one is divided.
-N_FACTORS = 15
 #: Smallest standard deviation of the noise of a mean, in the readings' unit.
 LEAST_DEVIATION = 1e-6
 #: Ridge on the diagonal of the relative covariance of the noise.
 RIDGE = 1e-9
+#: Least pivot of the normal equations, of a coefficient that nothing tells.
+LEAST_PIVOT = 1e-30
 
 
 class Column(NamedTuple):
@@ -93,67 +88,6 @@ def list_noises(duration: float) -> list[Noise]:
     return noises
 
 
-@dataclass(frozen=True, eq=False)
-class Mixture:
-    """A mixture of normal distributions: `weights` (k,) of sum 1, `means` (k,) and standard `deviations` (k,)."""
-
-    weights: Array
-    means: Array
-    deviations: Array
-
-    @property
-    def mean(self) -> float:
-        """Mean of the mixture."""
-        return float(self.weights @ self.means)
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the mixture."""
-        return float(np.sqrt(self.weights @ (self.deviations**2 + (self.means - self.mean) ** 2)))
-
-    def below(self, value: float) -> float:
-        """Compute the probability of values below `value`."""
-        from scipy.special import ndtr
-
-        return float(self.weights @ ndtr((value - self.means) / self.deviations))
-
-    def quantile(self, probability: float) -> float:
-        """Compute the value below which the mixture has a `probability`."""
-        reach = 40.0 * self.deviations
-        low, high = float((self.means - reach).min()), float((self.means + reach).max())
-        for _ in range(N_BISECTIONS):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if self.below(middle) < probability else (low, middle)
-        return 0.5 * (low + high)
-
-    @cached_property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval (low, high)."""
-        return self.quantile(TAIL), self.quantile(1.0 - TAIL)
-
-    def scale(self, factor: float, deviation: float = 0.0) -> Mixture:
-        """Multiply the quantity by `factor`, whose logarithm has a standard `deviation`, in quantiles."""
-        if deviation == 0.0:
-            return Mixture(self.weights, factor * self.means, abs(factor) * self.deviations)
-        normal = NormalDist()
-        factors = [factor * math.exp(deviation * normal.inv_cdf((k + 0.5) / N_FACTORS)) for k in range(N_FACTORS)]
-        return pool_mixtures([self.scale(number) for number in factors], np.full(N_FACTORS, 1.0 / N_FACTORS))
-
-    def add_error(self, deviation: float) -> Mixture:
-        """Add an independent normal error to the quantity."""
-        return Mixture(self.weights, self.means, np.hypot(self.deviations, deviation))
-
-
-def pool_mixtures(mixtures: Sequence[Mixture], weights: Array) -> Mixture:
-    """Pool mixtures (k,) with `weights` (k,) of sum 1."""
-    pairs = zip(mixtures, weights, strict=True)
-    return Mixture(
-        np.concatenate([weight * mixture.weights for mixture, weight in pairs]),
-        np.concatenate([mixture.means for mixture in mixtures]),
-        np.concatenate([mixture.deviations for mixture in mixtures]),
-    )
-
-
 class RateFit(NamedTuple):
     """Posterior of the rate, the first coefficient, and the most probable fit of the readings."""
 
@@ -173,120 +107,146 @@ def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
     return fits[int(weights.argmax())]._replace(rate=rate)
 
 
-def fit_rate(
-    readings: Readings, base: Sequence[Column], alternatives: Sequence[Sequence[Alternative]], duration: float,
-    *, from_first: bool = True,
-) -> RateFit:  # fmt: skip
-    """Fit the readings of a hold, and average over noise and `alternatives`.
+class RateRegression:
+    """Regression of the `readings` of a hold of a `duration` [s], under each alternative for their noise.
 
-    `base`: columns that all fits have, of which the first is that of the rate; `alternatives`: for each optional term
-    its possible columns; `duration` [s]: of the hold; `from_first`: the readings count from the first.
-    """
-    t, y = readings.t, readings.values - (readings.values[0] if from_first else 0.0)
-    columns = [*base, *(column for options in alternatives for option in options for column in option.columns)]
-    choices, log_priors = _list_choices(alternatives, len(base))
-    values = np.column_stack([y, *(column.values for column in columns), np.zeros(len(y))])
-    # the last column is empty, with a coefficient of prior variance 1; it fills the place of an absent one
-    precision = np.array([*(column.deviation**-2.0 for column in columns), 1.0])[choices]
-    mean = np.array([*(column.mean for column in columns), 0.0])[choices]
-    is_proper = precision > 0.0
-    log_priors = log_priors + 0.5 * np.log(np.where(is_proper, precision, 1.0)).sum(axis=1)
-    freedom = max(len(t) - int((~is_proper[0]).sum()), 1)
-    # means tell the size of their noise; passages are too few, and readings beside them have errors of known size
-    scales = [share * readings.quantum for share in HOLD.noise.steps] if readings.quantum else [1.0]
-    noises = [(noise, s) for noise in list_noises(duration) for s in scales]
-    grams, log_noise = [], []
-    for noise, s in noises:
-        covariance = s**2 * noise.covariance(t, duration) + np.diag(readings.loose**2)
-        factor = np.linalg.cholesky(covariance)
-        whitened = np.linalg.solve(factor, values)
-        grams.append(whitened.T @ whitened)
-        log_noise.append(math.log(noise.weight / len(scales)) - float(np.log(np.diag(factor)).sum()))
-    gram, n_choices = np.array(grams), len(choices)
-    products = gram[:, 1:, 1:][:, choices[:, :, None], choices[:, None, :]].reshape(-1, *2 * choices.shape[1:])
-    system = _System(
-        products,
-        gram[:, 1:, 0][:, choices].reshape(len(products), -1),
-        np.repeat(gram[:, 0, 0], n_choices),
-        np.tile(precision, (len(noises), 1)),
-        np.tile(mean, (len(noises), 1)),
-    )
-    prior = (np.array(log_noise)[:, None] + log_priors).ravel()
-    floor, factors, log_step = LEAST_DEVIATION**2, np.ones(1), 0.0
-    variance = np.ones(len(prior))
-    if not readings.quantum:
-        variance = np.maximum(system.square / len(t), floor)
-        log_step = 0.5 * math.log(2.0 / freedom)
-        factors = np.exp(math.sqrt(2.0 / freedom) * VARIANCE_POINTS)
-        for _ in range(N_ITERATIONS):
-            misfit, _ = system.misfit(variance)
-            variance = np.maximum(variance * np.maximum(misfit, RIDGE) / freedom, floor)
-    misfit, log_det = system.misfit(variance)
-    profile = prior - 0.5 * (len(t) * np.log(variance) + log_det + misfit)
-    kept = np.flatnonzero(profile > profile.max() - MAX_DECREASE)
-    grid = np.maximum(factors[:, None] * variance[kept], floor)
-    rows: NDArray[np.intp] = np.tile(kept, len(grid))
-    grid = grid.ravel()
-    misfit, log_det, coefficients, covariance = system.take(rows).posterior(grid)
-    logs = prior[rows] - 0.5 * (len(t) * np.log(grid) + log_det + misfit) + log_step
-    weights = np.exp(logs - logs.max())
-    best = int(weights.argmax())
-    noise, s = noises[rows[best] // n_choices]
-    design = values[:, 1:][:, choices[rows[best] % n_choices]]
-    band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance[best], design), 0.0))
-    deviations = np.sqrt(np.maximum(covariance[:, 0, 0], np.finfo(float).tiny))
-    usual = weights > LEAST_WEIGHT
-    return RateFit(
-        Mixture(*(series[usual] for series in (weights / weights.sum(), coefficients[:, 0], deviations))),
-        design @ coefficients[best],
-        band,
-        noise,
-        s * float(np.sqrt(grid[best])),
-        float(logs.max() + np.log(weights.sum())),
-    )
-
-
-class _System(NamedTuple):
-    """Normal equations of k fits of p columns.
-
-    `products` (k, p, p), `with_y` (k, p), `square` (k,): whitened products of the columns, with y, and of y;
-    `precision`, `mean` (k, p): of the coefficients' priors.
+    `from_first`: the readings count from the first.
     """
 
-    products: Array
-    with_y: Array
-    square: Array
-    precision: Array
-    mean: Array
+    def __init__(self, readings: Readings, duration: float, *, from_first: bool = True) -> None:
+        """Factorise the covariances of the noise, which all fits share."""
+        self.readings, self.duration = readings, duration
+        self.y = readings.values - (readings.values[0] if from_first else 0.0)
+        # means tell the size of their noise; passages are too few, and readings beside them have errors of known size
+        scales = [share * readings.quantum for share in HOLD.noise.steps] if readings.quantum else [1.0]
+        self.noises = [(noise, s) for noise in list_noises(duration) for s in scales]
+        covariances = [
+            s**2 * noise.covariance(readings.t, duration) + np.diag(readings.loose**2) for noise, s in self.noises
+        ]
+        factors = np.linalg.cholesky(np.array(covariances))
+        self.whitening = np.linalg.inv(factors)
+        log_det = np.log(np.diagonal(factors, axis1=1, axis2=2)).sum(axis=1)
+        self.log_noise = np.log([noise.weight / len(scales) for noise, _ in self.noises]) - log_det
 
-    def take(self, rows: NDArray[np.intp]) -> _System:
-        """Select fits by their indices."""
-        return _System(*(values[rows] for values in self))
+    def fit_rate(self, base: Sequence[Column], alternatives: Sequence[Sequence[Alternative]]) -> RateFit:
+        """Fit the readings, and average over noise and `alternatives`.
 
-    def _equations(self, variance: Array) -> tuple[Array, Array]:
-        """Build matrix (k, p, p) and right side (k, p) of the posterior for variances (k,) of the noise."""
-        matrix = self.products / variance[:, None, None]
-        diagonal = np.arange(matrix.shape[1])
-        matrix[:, diagonal, diagonal] += self.precision
-        return matrix, self.with_y / variance[:, None] + self.precision * self.mean
+        `base`: columns that all fits have, of which the first is that of the rate; `alternatives`: for each optional
+        term its possible columns.
+        """
+        columns = [*base, *(column for options in alternatives for option in options for column in option.columns)]
+        choices, log_priors = _list_choices(alternatives, len(base))
+        values = np.column_stack([self.y, *(column.values for column in columns), np.zeros(len(self.y))])
+        # the last column is empty, with a coefficient of prior variance 1; it fills the place of an absent one
+        precision = np.array([*(column.deviation**-2.0 for column in columns), 1.0])[choices]
+        mean = np.array([*(column.mean for column in columns), 0.0])[choices]
+        is_proper = precision > 0.0
+        log_priors = log_priors + 0.5 * np.log(np.where(is_proper, precision, 1.0)).sum(axis=1)
+        m = len(self.y)
+        freedom = float(max(m - int((~is_proper[0]).sum()), 1))
+        whitened = self.whitening @ values
+        gram = whitened.transpose(0, 2, 1) @ whitened
+        n_choices, quantum = len(choices), self.readings.quantum
+        rows = np.arange(len(gram) * n_choices)
+        prior = (self.log_noise[:, None] + log_priors).ravel()
+        variance = np.ones(len(rows)) if quantum else np.repeat(gram[:, 0, 0], n_choices) / m
+        # the rate is the last coefficient, which needs no back substitution
+        system = (
+            gram,
+            np.ascontiguousarray(choices[:, ::-1]) % (values.shape[1] - 1) + 1,
+            precision[:, ::-1].copy(),
+            mean[:, ::-1].copy(),
+        )
+        solution = np.empty((len(rows), 3))
+        _solve_rates(*system, rows, variance, freedom, 0 if quantum else N_ITERATIONS, solution)
+        profile = prior - 0.5 * (m * np.log(variance) + solution[:, 0])
+        rows = np.flatnonzero(profile > profile.max() - MAX_DECREASE)
+        log_step, grid = 0.0, variance[rows]
+        if not quantum:
+            spread = math.sqrt(2.0 / freedom)
+            log_step = math.log(spread)
+            grid = np.maximum(np.exp(spread * VARIANCE_POINTS)[:, None] * grid, LEAST_DEVIATION**2).ravel()
+            rows = np.tile(rows, len(VARIANCE_POINTS))
+        solution = np.empty((len(rows), 3))
+        _solve_rates(*system, rows, grid, freedom, 0, solution)
+        logs = prior[rows] - 0.5 * (m * np.log(grid) + solution[:, 0]) + log_step
+        weights = np.exp(logs - logs.max())
+        best = int(weights.argmax())
+        noise, s = self.noises[rows[best] // n_choices]
+        usual = weights > LEAST_WEIGHT
+        fit, band = self._draw_fit(gram, values, choices, precision, mean, int(rows[best]), float(grid[best]))
+        return RateFit(
+            Mixture(weights[usual] / weights[usual].sum(), solution[usual, 1], solution[usual, 2]),
+            fit,
+            band,
+            noise,
+            s * float(np.sqrt(grid[best])),
+            float(logs.max() + np.log(weights.sum())),
+        )
 
-    def _misfit(self, variance: Array, right: Array, coefficients: Any) -> Array:
-        """Compute the weighted squares of residuals and of deviations from the priors (k,)."""
-        shift = (self.precision * self.mean**2).sum(axis=1)
-        return np.asarray(self.square / variance + shift - (right * coefficients).sum(axis=1))
+    def _draw_fit(
+        self, gram: Array, values: Array, choices: NDArray[np.intp], precision: Array, mean: Array, row: int,
+        variance: float,
+    ) -> tuple[Array, Array]:  # fmt: skip
+        """Compute the fitted readings (m,) of one combination, and their standard deviation (m,)."""
+        n, c = divmod(row, len(choices))
+        used = choices[c] % (values.shape[1] - 1) + 1
+        matrix = gram[n][np.ix_(used, used)] / variance + np.diag(precision[c])
+        right = gram[n][used, 0] / variance + precision[c] * mean[c]
+        design, covariance = values[:, used], np.linalg.inv(matrix)
+        band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance, design), 0.0))
+        return design @ (covariance @ right), band
 
-    def misfit(self, variance: Array) -> tuple[Array, Array]:
-        """Compute the misfit (k,), and the log determinant (k,) of the posterior's matrix."""
-        matrix, right = self._equations(variance)
-        coefficients = np.linalg.solve(matrix, right[..., None])[..., 0]
-        return self._misfit(variance, right, coefficients), np.linalg.slogdet(matrix)[1]
 
-    def posterior(self, variance: Array) -> tuple[Array, Array, Array, Array]:
-        """Compute misfit, log determinant, coefficients (k, p) and covariance (k, p, p) of the posterior."""
-        matrix, right = self._equations(variance)
-        covariance: Array = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-        coefficients: Array = np.asarray((covariance @ right[..., None])[..., 0], dtype=np.float64)
-        return self._misfit(variance, right, coefficients), np.linalg.slogdet(matrix)[1], coefficients, covariance
+@kernel
+def _solve_rates(
+    gram: Any,
+    choices: Any,
+    precision: Any,
+    mean: Any,
+    rows: Any,
+    variances: Any,
+    freedom: float,
+    n_iterations: int,
+    solution: Any,
+) -> None:
+    """Solve the normal equations of k combinations of noise and columns, and write `solution` (k, 3).
+
+    `gram` (n, q, q): whitened products of the readings (index 0) and columns for each noise; `choices`, `precision`,
+    `mean` (c, p): columns of a combination and priors of their coefficients, that of the rate the last; `rows` (k,):
+    noise times c, plus combination; `variances` (k,): of the noise, replaced by the most probable in `n_iterations`.
+    Written are the misfit with the log determinant of the matrix, and the rate's deviation and mean.
+    """
+    n_choices, p = choices.shape
+    factor, right = np.empty((p, p)), np.empty(p)
+    for k in range(len(rows)):
+        noise, choice = divmod(rows[k], n_choices)
+        products = gram[noise]
+        for iteration in range(n_iterations + 1):
+            variance = variances[k]
+            misfit, log_det = products[0, 0] / variance, 0.0
+            for i in range(p):
+                column = choices[choice, i]
+                weight = precision[choice, i]
+                right_value = products[column, 0] / variance + weight * mean[choice, i]
+                misfit += weight * mean[choice, i] ** 2
+                for j in range(i + 1):
+                    value = products[column, choices[choice, j]] / variance
+                    if i == j:
+                        value += weight
+                    for m in range(j):
+                        value -= factor[i, m] * factor[j, m]
+                    factor[i, j] = math.sqrt(max(value, LEAST_PIVOT)) if i == j else value / factor[j, j]
+                for m in range(i):
+                    right_value -= factor[i, m] * right[m]
+                right[i] = right_value / factor[i, i]
+                misfit -= right[i] ** 2
+                log_det += 2.0 * math.log(factor[i, i])
+            if iteration < n_iterations:
+                variances[k] = max(variance * max(misfit, RIDGE) / freedom, LEAST_DEVIATION**2)
+        solution[k, 0] = misfit + log_det
+        solution[k, 1] = 1.0 / factor[p - 1, p - 1]
+        solution[k, 2] = right[p - 1] / factor[p - 1, p - 1]
 
 
 def _list_choices(alternatives: Sequence[Sequence[Alternative]], n_base: int) -> tuple[NDArray[np.intp], Array]:
@@ -309,15 +269,24 @@ def _list_choices(alternatives: Sequence[Sequence[Alternative]], n_base: int) ->
 
 
 def predict_deviation(
-    t: Array, columns: Sequence[Column], noise: Noise, s: float, duration: float, white: float = 1.0
+    t: Array,
+    base: Sequence[Column],
+    alternatives: Sequence[Sequence[Column]],
+    noise: Noise,
+    s: float,
+    duration: float,
+    white: float = 1.0,
 ) -> float:
     """Predict the standard deviation of the rate, the first coefficient, from readings at `t` (m,) of a planned hold.
 
-    The formula is that of `fit_rate`, without readings: the posterior covariance does not depend on them. `s`,
-    `white`: standard deviation of the noise, and variance of its white part over s^2; `duration` [s]: time by which a
-    random walk reaches the `noise`'s ratio.
+    The formula is that of `fit_rate`, without readings: the posterior covariance does not depend on them. The largest
+    for the `base` with each of the `alternatives` is returned. `s`, `white`: standard deviation of the noise, and
+    variance of its white part over s^2; `duration` [s]: time by which a random walk reaches the `noise`'s ratio.
     """
-    factor = np.linalg.cholesky(noise.covariance(t, duration, white))
-    whitened = np.linalg.solve(factor, np.column_stack([column.values for column in columns])) / s
-    matrix = whitened.T @ whitened + np.diag([column.deviation**-2.0 for column in columns])
-    return float(np.sqrt(np.linalg.inv(matrix)[0, 0]))
+    inverse = np.linalg.inv(np.linalg.cholesky(noise.covariance(t, duration, white))) / s
+    variances = []
+    for columns in alternatives:
+        whitened = inverse @ np.column_stack([column.values for column in (*base, *columns)])
+        priors = np.diag([column.deviation**-2.0 for column in (*base, *columns)])
+        variances.append(np.linalg.inv(whitened.T @ whitened + priors)[0, 0])
+    return float(np.sqrt(max(variances)))

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +25,9 @@ NEGLIGIBLE = 16.0
 #: Number of parts of a large mixture that give the first estimate of a quantile; maximum number of steps to it; and
 #: distance [standard deviations] beyond which a normal distribution has no probability of the order of rounding.
 SAMPLED, MAX_STEPS, NEGLIGIBLE_TAIL = 128, 200, 9.0
+#: Number of factors into which an uncertain one is divided, and least weight of a part of a pooled mixture, over the
+#: largest.
+N_FACTORS, LEAST_WEIGHT = 15, 1e-5
 ROOT_HALF, ROOT_PI = math.sqrt(0.5), math.sqrt(math.pi)
 
 
@@ -35,6 +40,39 @@ class Mixture(NamedTuple):
     weights: Array
     deviations: Array
     centres: Array
+
+    @property
+    def mean(self) -> float:
+        """Mean of the mixture."""
+        return float(self.weights @ self.centres)
+
+    @property
+    def deviation(self) -> float:
+        """Standard deviation of the mixture."""
+        return float(np.sqrt(self.weights @ (self.deviations**2 + (self.centres - self.mean) ** 2)))
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval (low, high)."""
+        return self.quantile(0.5 - 0.5 * BOUND_PROBABILITY), self.quantile(0.5 + 0.5 * BOUND_PROBABILITY)
+
+    def scale(self, factor: float, deviation: float = 0.0) -> Mixture:
+        """Multiply the quantity by `factor`, whose logarithm has a standard `deviation`, in quantiles."""
+        if deviation == 0.0:
+            return Mixture(self.weights, abs(factor) * self.deviations, factor * self.centres)
+        normal = NormalDist()
+        factors = [factor * math.exp(deviation * normal.inv_cdf((k + 0.5) / N_FACTORS)) for k in range(N_FACTORS)]
+        return pool_mixtures([self.scale(number) for number in factors], np.full(N_FACTORS, 1.0 / N_FACTORS))
+
+    def add_error(self, deviation: float) -> Mixture:
+        """Add an independent normal error to the quantity."""
+        return self._replace(deviations=np.hypot(self.deviations, deviation))
+
+    def below(self, value: float) -> float:
+        """Compute the probability of values below `value`."""
+        from scipy.special import ndtr
+
+        return float(self.weights @ ndtr((value - self.centres) / self.deviations))
 
     def quantile(self, probability: float) -> float:
         """Compute the value below which the mixture lies with the given probability."""
@@ -88,6 +126,16 @@ def _find_quantile(weights: Array, deviations: Array, centres: Array, probabilit
             if abs(step) <= (1e-6 if is_newton else 1e-13) * max(1.0, abs(value)):
                 break
     return value
+
+
+def pool_mixtures(mixtures: Sequence[Mixture], weights: Array) -> Mixture:
+    """Pool mixtures (k,) with `weights` (k,) of sum 1, without parts of a negligible weight."""
+    pairs = zip(mixtures, weights, strict=True)
+    parts = [mixture._replace(weights=weight * mixture.weights) for mixture, weight in pairs]
+    pooled = Mixture(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+    is_counted = pooled.weights > LEAST_WEIGHT * pooled.weights.max()
+    counted, deviations, centres = (values[is_counted] for values in pooled)
+    return Mixture(counted / counted.sum(), deviations, centres)
 
 
 class Rise(NamedTuple):
