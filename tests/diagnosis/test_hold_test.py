@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.watched import load_watched
+from sealscope.diagnosis.hold.recorded_holds import is_hold_results, read_hold_results
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.errors import InputError, SealscopeError
 from sealscope.monitor.verdicts import judge_recording
@@ -174,7 +176,7 @@ def test_a_recording_of_a_held_load_is_judged_by_the_hold_test():
     assert ss.diagnose(moving).holds == ()
 
 
-def test_tests_in_order_of_time_are_a_trend():
+def test_tests_in_order_of_time_are_a_trend(tmp_path):
     recordings = [
         replace(
             record_hold(0.3 * (1.0 + 0.15 * k), minutes=3.0, seed=k, p_B=tank, log_T=True),
@@ -187,6 +189,15 @@ def test_tests_in_order_of_time_are_a_trend():
     assert trend.wear.growth.low <= 0.3e-3 * 0.15 * 3.117 <= trend.wear.growth.high
     assert trend.wear.reach is not None
     assert ("cap the port" in trend.next_check) == (trend.verdict == "leak")
+    lines = [json.dumps(hold.as_dict()) for recording in recordings for hold in ss.hold_test(recording, area=AREAS)]
+    (tmp_path / "holds.jsonl").write_text("\n".join(lines) + "\n")
+    assert is_hold_results(tmp_path / "holds.jsonl")
+    by_lines = ss.trend(read_hold_results(tmp_path / "holds.jsonl"), limit="5 mL/min")
+    assert [point.day for point in by_lines.points] == [point.day for point in trend.points]
+    assert by_lines.wear.growth.value == pytest.approx(trend.wear.growth.value, rel=0.02)
+    (tmp_path / "holds.jsonl").write_text(lines[0] + "\n" + lines[1].replace('"leak_lpm": ', '"leak_lpm": "x", "l": '))
+    with pytest.raises(InputError, match=r"leak_lpm.*line 2"):
+        read_hold_results(tmp_path / "holds.jsonl")
 
 
 def test_a_commissioned_machine_and_its_monitor_take_hold_tests(tmp_path):
@@ -200,6 +211,11 @@ def test_a_commissioned_machine_and_its_monitor_take_hold_tests(tmp_path):
     (hold,) = machine.diagnose(sinking).holds
     assert hold.leak_interval_lpm[0] <= 3e-3 * 3.117 <= hold.leak_interval_lpm[1]
     assert (verdict.verdict, verdict.total_lpm) == ("leak", pytest.approx(hold.leak_lpm))
+    for factor in (1.0, 2.0):  # healthy, and twice the healthy creep
+        diagnosis = machine.diagnose(record_hold(0.3 * factor, minutes=1.0, seed=11, p_B=tank, log_T=True))
+        assert "times that of 3 healthy holds" in diagnosis.reason
+        assert factor == 1.0 or diagnosis.verdict != "no leak"
+        assert factor != 1.0 or diagnosis.verdict != "leak"
 
 
 @pytest.mark.parametrize(

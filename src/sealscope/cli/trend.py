@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine
     from sealscope.diagnosis.trend.reading import LeakReading
 
-_FILES = "Recordings of a single machine, or a folder of them."
+_FILES = "Recordings of a single machine, or a folder of them; or results of `hold --format jsonl`."
 _OUTPUT = "Also write a page (.html, .pdf), or .json, or .csv."
 _HEALTHY = "How many of the first recordings are known to be healthy; by default those that --machine knows."
 _YEARS = "Machine-years in which a healthy machine has one false alarm."
@@ -44,8 +44,9 @@ def trend(
     The exit status is 1 if a file could not be read.
     """
     from sealscope.diagnosis.commissioned.machine import recordings_in
+    from sealscope.diagnosis.hold.recorded_holds import is_hold_results, read_hold_results
     from sealscope.diagnosis.trend.machine_trend import trend as trend_of
-    from sealscope.diagnosis.trend.reading import estimate_reading
+    from sealscope.diagnosis.trend.reading import estimate_reading, hold_reading
     from sealscope.diagnosis.verdict.diagnosis import find_machine_name
     from sealscope.recordings.joining import file_seconds
     from sealscope.reporting.trend.page import write_trend_page
@@ -57,10 +58,16 @@ def trend(
     if output is not None:
         _check_output(output, paths)
     readings: list[LeakReading] = []
-    n_undated = 0
+    n_undated = n_failed = 0
     name = "" if stated.commissioned is None else stated.commissioned.name
+    results = [path for path in paths if is_hold_results(path)]
+    for path in results:
+        holds = opt.attempt(path, partial(read_hold_results, path))
+        n_failed += holds is None
+        readings += map(hold_reading, holds or ())
     with opt.progress() as update:
-        for k, (file, recording) in enumerate(stated.read_all(paths)):
+        for k, (file, recording) in enumerate(stated.read_all([path for path in paths if path not in results])):
+            n_readings = len(readings)
             if recording is not None:
                 name = name or find_machine_name(recording.remarks) or ""
                 reading = opt.attempt(file, partial(estimate_reading, recording, stated.rig, file.name))
@@ -69,6 +76,7 @@ def trend(
                     n_undated += 1
                 if reading is not None:
                     readings.append(reading)
+            n_failed += len(readings) == n_readings
             update("recordings", (k + 1) / len(paths))
     if n_undated:
         opt.complain(f"{n_undated} of {len(paths)} files state no time: that of their last change is taken (--every)")
@@ -91,7 +99,7 @@ def trend(
         else:
             write_trend_page(output, result, title=name)
     is_failure = result.verdict in (fail_on or ())
-    if is_failure or len(readings) < len(paths):
+    if is_failure or n_failed:
         raise Exit(opt.FAILED_ON if is_failure else 1)
 
 

@@ -24,13 +24,20 @@ from sealscope.diagnosis.detectors.observation import healthy_null, limit_thread
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
-from sealscope.diagnosis.hold.recorded_holds import describe_holds, held_leakage
+from sealscope.diagnosis.hold.recorded_holds import (
+    HOLD_SUMMARY,
+    describe_holds,
+    estimate_growth,
+    held_leakage,
+    may_be_healthy,
+    summarise_hold,
+)
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
@@ -224,9 +231,20 @@ def diagnose(
             judged_until=inspection.judged_until,
         )
         evidence = examination.decide_by_all()
-        holds = judge_held_recording(recording, machine.areas if machine.area_stated else None, limit)
+        stated_areas = machine.areas if machine.area_stated else None
+        holds = judge_held_recording(recording, stated_areas, limit)
     if holds:
-        evidence = replace(evidence, reason=describe_holds(holds), total_leakage=held_leakage(holds))
+        summaries = [
+            entry.summaries.get(HOLD_SUMMARY)
+            if isinstance(entry, SummarisedRecording)
+            else summarise_hold(judge_held_recording(entry, stated_areas))
+            for entry in healthy
+        ]
+        growth = estimate_growth(summarise_hold(holds), [summary for summary in summaries if summary is not None])
+        reason = describe_holds(holds, growth)
+        if evidence.verdict == NO_LEAK and not may_be_healthy(holds, growth):
+            evidence = decide(Observed(evidence.detector, lack=reason), (), HealthyNull(), false_alarm_probability=0.0)
+        evidence = replace(evidence, reason=reason, total_leakage=held_leakage(holds))
     missing = [str(finding.channel) for finding in comparable.findings if finding.code == MISSING_CHANNEL]
     if missing and evidence.verdict != LEAK:
         doubt = text_of("remark", "channels missing", names=join_names(missing))

@@ -23,6 +23,8 @@ from sealscope.diagnosis.detectors.observation import limit_threads, stored_surp
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.hold.hold_test import judge_held_recording
+from sealscope.diagnosis.hold.recorded_holds import HOLD_SUMMARY, summarise_hold
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -312,6 +314,10 @@ def summarise_healthy(recording: Recording, rig: Rig, file: str) -> SummarisedRe
                 except Exception as error:  # as in a diagnosis, a method that fails is left out
                     distribution = getattr(factory, "distribution", None)  # package of a plug-in, None if built in
                     log_failure(name, distribution, error)
+        cylinder, is_stated = rig.cylinder, rig.states("cylinder.A_A", "cylinder.A_B")
+        holds = judge_held_recording(recording, (cylinder.A_A, cylinder.A_B) if is_stated else None)
+        if (hold := summarise_hold(holds)) is not None:
+            summaries[HOLD_SUMMARY] = hold
         if not summaries:
             raise InputError(f"a healthy recording must have channels that a method can use, got none ({file})")
         if (levels := HealthyLevels().learn(part)) is not None:  # friction, drifts and spectra

@@ -24,6 +24,7 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import COUNTS, FLOW_SOURCES
+from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import inspect
 from sealscope.recordings.recording import Recording
@@ -107,6 +108,8 @@ def hold_test(
     name = os.fspath(file) if file else str(recording.provenance.get("file", "recording"))
     samples = _select_samples(recording)
     findings, moment = inspect(recording), recording.provenance.get("start")
+    if moment is None and (start_s := start_seconds(recording, name)) is not None:
+        moment = np.datetime64(round(start_s - float(samples.t[0])), "s")  # of t = 0
     date = None if moment is None else str(moment)
     parts = _cut_holds(samples, start, end)
     with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine

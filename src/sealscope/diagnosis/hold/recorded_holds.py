@@ -1,13 +1,26 @@
-"""What the results of a hold test add to the diagnosis of a recording of a held load."""
+"""Results of hold tests in the diagnosis of a recording of a held load, and read back from JSON lines."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
 
+import numpy as np
+
+from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.hold.judgement import COOLING, format_estimate
 from sealscope.diagnosis.hold.result import HoldResult
+from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
+from sealscope.errors import InputError, UnreadableFile
+from sealscope.storage.plain_values import convert_type, parse_json
 from sealscope.units import BAR
 
+#: Name of the summary of a healthy hold.
+HOLD_SUMMARY = "hold test"
 #: Next check where hold tests show a growing leak.
 SEPARATE_LEAKS = (
     "Look for oil outside: rod seal, fittings, hoses. If there is none, cap the port of the loaded side at the "
@@ -15,9 +28,63 @@ SEPARATE_LEAKS = (
 )
 
 
-def describe_holds(holds: Sequence[HoldResult]) -> str:
-    """Describe a recording of a held load by the results of its holds."""
+class HeldGrowth(NamedTuple):
+    """Growth of the leak of a held load over that of `n_healthy` healthy holds, at the same pressure.
+
+    `ratio`: leak over that of the healthy holds; `low`, `high`: its 95 % interval.
+    """
+
+    ratio: float
+    low: float
+    high: float
+    n_healthy: int
+
+
+def summarise_hold(holds: Sequence[HoldResult]) -> dict[str, float] | None:
+    """Summarise the longest hold of a healthy recording for `estimate_growth`; None if its leak is unknown."""
+    leakage = held_leakage(holds) if holds else None
+    if leakage is None or leakage.lpm is None or leakage.interval_lpm is None or not leakage.pressure > 0.0:
+        return None
+    low, high = leakage.interval_lpm
+    return {"lpm": leakage.lpm, "half_lpm": 0.5 * (high - low), "bar": leakage.pressure / BAR}
+
+
+def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGrowth | None:
+    """Compare a hold with `healthy` ones (`summarise_hold`); None if a leak is unknown or the healthy ones have none.
+
+    Leaks per pressure scatter between healthy recordings as in a trend (`between` of its priors): the interval is that
+    of Student's t, with the degrees of freedom of the prior and of the recordings.
+    """
+    if hold is None or not healthy:
+        return None
+    levels = np.array([entry["lpm"] / entry["bar"] for entry in healthy])
+    halves = np.array([entry["half_lpm"] / entry["bar"] for entry in healthy])
+    from scipy.special import stdtrit
+
+    n, usual, prior = len(levels), float(levels.mean()), TREND.between
+    if not usual > float(np.sqrt((halves**2).sum())) / n:
+        return None  # a ratio to nothing has no value
+    freedom = prior.freedom + n - 1.0
+    squares = prior.freedom * (prior.volume_balance * usual) ** 2 + float(((levels - usual) ** 2).sum())
+    scatter = math.sqrt(squares / freedom * (1.0 + 1.0 / n))
+    half = math.hypot(float(stdtrit(freedom, 0.975)) * scatter, hold["half_lpm"] / hold["bar"])
+    level = hold["lpm"] / hold["bar"]
+    return HeldGrowth(level / usual, (level - half) / usual, (level + half) / usual, n)
+
+
+def may_be_healthy(holds: Sequence[HoldResult], growth: HeldGrowth | None) -> bool:
+    """Test whether holds allow the verdict that nothing leaks: as healthy ones or, without these, no leak is shown."""
+    if growth is not None:
+        return growth.low <= 1.0
+    return all(set(hold.causes) <= {COOLING} for hold in holds)
+
+
+def describe_holds(holds: Sequence[HoldResult], growth: HeldGrowth | None = None) -> str:
+    """Describe a recording of a held load by the results of its holds, and by its `growth` over healthy ones."""
     texts = [hold.reason if hold.result is None else f"{hold.result} ({hold.limit}): {hold.reason}" for hold in holds]
+    if growth is not None:
+        ratio = format_estimate(growth.ratio, growth.low, growth.high)
+        texts.append(f"the leak is {ratio} times that of {growth.n_healthy} healthy holds")
     return "a load held by shut valves (`sealscope hold`): " + "; ".join(texts)
 
 
@@ -27,3 +94,48 @@ def held_leakage(holds: Sequence[HoldResult]) -> TotalLeakage | None:
     if longest.leak_lpm is None or longest.pressure_bar is None:
         return None
     return TotalLeakage(longest.leak_lpm, longest.leak_interval_lpm, abs(longest.pressure_bar) * BAR)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _StoredHold:
+    """Entries of a JSON line of `sealscope hold` that a trend reads; other entries are ignored."""
+
+    file: str
+    start: str | None
+    start_s: float | None
+    end_s: float | None
+    leak_lpm: float | None
+    leak_interval_lpm: tuple[float, float] | None
+    pressure_bar: float | None
+    areas_mm2: tuple[float, ...]
+
+
+def is_hold_results(path: Path) -> bool:
+    """Test whether a file begins as the JSON lines of `sealscope hold`."""
+    try:
+        with path.open("rb") as content:
+            head = content.read(400).lstrip()
+    except OSError:
+        return False  # the error is reported when the file is read
+    return head.startswith(b"{") and b'"creep_mm_per_min"' in head
+
+
+def read_hold_results(path: Path) -> list[HoldResult]:
+    """Read results of hold tests from the JSON lines of `sealscope hold`, without what a trend does not need.
+
+    Raises UnreadableFile if the file cannot be read, InputError for a line that is no result.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, UnicodeError) as error:
+        raise UnreadableFile(f"cannot read {path}: {error}") from None
+    results = []
+    for number, line in enumerate(lines, start=1):
+        if line.strip():
+            try:
+                results.append(HoldResult(**vars(convert_type(_StoredHold, parse_json(line)))))
+            except ValueError as error:
+                raise InputError(
+                    f"a line must be a result of a hold test, got {error} ({path}, line {number})"
+                ) from None
+    return results

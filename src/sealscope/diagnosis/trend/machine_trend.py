@@ -14,6 +14,7 @@ from sealscope.calls import checked_call
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.hold.recorded_holds import SEPARATE_LEAKS
+from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -23,6 +24,7 @@ from sealscope.diagnosis.trend.reading import (
     TrendPoint,
     build_timeline,
     estimate_reading,
+    hold_reading,
     list_findings,
     scatter_prior,
 )
@@ -244,7 +246,7 @@ class Trend:
 
 @checked_call
 def trend(
-    recordings: Iterable[Recording | LeakReading],
+    recordings: Iterable[Recording | LeakReading | HoldResult],
     *,
     rig: Rig | str | os.PathLike[str] | None = None,
     healthy: int = 1,
@@ -257,7 +259,8 @@ def trend(
     Parameters
     ----------
     recordings : iterable of Recording
-        Recordings of the machine in any order, or readings of them (`estimate_reading`); copies count once.
+        Recordings of the machine in any order, or readings of them (`estimate_reading`), or
+        results of hold tests; copies count once.
     rig : Rig, str or path-like, optional
         Sizes of the machine, as for `diagnose`; without it levels are relative, unless the recordings state the
         machine.
@@ -297,7 +300,14 @@ def trend(
         raise InputError(f"machine-years to a false alarm must be 0.1 to 1000, got {years!r}")
     if every is not None and not (math.isfinite(every) and every > 0.0):
         raise InputError(f"every must be > 0 s, got {every!r}")
-    readings = [item if isinstance(item, LeakReading) else estimate_reading(item, rig) for item in recordings]
+    readings = [
+        item
+        if isinstance(item, LeakReading)
+        else hold_reading(item)
+        if isinstance(item, HoldResult)
+        else estimate_reading(item, rig)
+        for item in recordings
+    ]
     points, differences = build_timeline(readings, every)
     rows = tuple(k for k, point in enumerate(points) if point.group >= 0)  # -1: the recording is left out
     compared = [points[k] for k in rows]

@@ -18,6 +18,7 @@ from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import held_leakage
+from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.onset import WITHIN_95
@@ -36,6 +37,7 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig
 from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.formats.times.timebase import parse_epoch
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
@@ -151,7 +153,14 @@ def _hold_fields(recording: Recording, machine: AssumedMachine) -> dict[str, Any
     is relative, as those of other methods.
     """
     areas = machine.areas if machine.areas is not None else (machine.area,)
-    holds = judge_held_recording(recording, areas)
+    fields = _held_level(judge_held_recording(recording, areas))
+    if fields is None:
+        return None
+    return {**fields, "states_flow": machine.area_stated, "area": areas[0] if machine.area_stated else None}
+
+
+def _held_level(holds: Sequence[HoldResult]) -> dict[str, Any] | None:
+    """Collect method, level, its error and pressure of the longest hold; None if its flow or pressure is unknown."""
     leakage = held_leakage(holds) if holds else None
     if leakage is None or leakage.lpm is None or leakage.interval_lpm is None or not leakage.pressure > 0.0:
         return None
@@ -161,10 +170,28 @@ def _hold_fields(recording: Recording, machine: AssumedMachine) -> dict[str, Any
         "basis": "hold test",
         "level": leakage.lpm * scale,
         "error": (high - low) * scale / (2.0 * WITHIN_95),
-        "states_flow": machine.area_stated,
-        "area": areas[0] if machine.area_stated else None,
         "pressure": leakage.pressure,
     }
+
+
+def hold_reading(result: HoldResult) -> LeakReading:
+    """Convert the result of a hold test to a reading of a trend; `problem` says why it states no level, if so."""
+    start_s = result.start_s or 0.0
+    date = None if result.start is None else parse_epoch(result.start)
+    fields = _held_level([result])
+    if fields is None:
+        fields = {"problem": "the hold test states no leak in L/min with its pressure (--area, a chamber's pressure)"}
+    return LeakReading(
+        **{"pressure": math.nan, **fields},
+        file=result.file,
+        start=None if date is None else date + start_s,
+        duration=(result.end_s or start_s) - start_s,
+        states_flow=True,
+        area=1e-6 * result.areas_mm2[0] if result.areas_mm2 else None,
+        temperature=None,
+        machine=None,
+        digest=f"{result.start} {result.start_s} {result.leak_lpm} {result.pressure_bar}",
+    )
 
 
 def _balance_fields(solution: RecordedBalance, machine: AssumedMachine) -> dict[str, Any]:
