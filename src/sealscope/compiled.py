@@ -242,11 +242,14 @@ def copy_to_stack(context: Any, record: Any) -> Any:
     """Copy a record to the stack of a kernel, in compiled code only; numba passes `context`.
 
     No write to an array can then change the record, so that LLVM reads its fields and inverts divisors once, before a
-    loop, instead of in each round.
+    loop, instead of in each round. A tuple is returned as it is: it is a value, which no write changes.
     """
 
     def emit_copy(target: Any, builder: Any, signature: Any, values: Any) -> Any:
         """Emit LLVM instructions that load the record at the address `values[0]` and store it on the stack."""
+        if not isinstance(record, types.Record):
+            target.nrt.incref(builder, record, values[0])  # the arrays of a tuple have one more owner
+            return values[0]
         copy = cgutils.alloca_once(builder, values[0].type.pointee)
         cgutils.raw_memcpy(builder, copy, values[0], target.get_constant(types.intp, record.size), 1)
         return copy

@@ -26,8 +26,6 @@ EXTENSION_NAMES = {
     "numba.core.typeconv": ("Conversion",),
     "numba.core.typing.templates": ("AbstractTemplate", "infer_global", "signature"),
     "numba.core.untyped_passes": ("RewriteSemanticConstants",),
-    "numba.cpython.unsafe.tuple": ("tuple_setitem",),
-    "numba.np.unsafe.ndarray": ("to_fixed_tuple",),
 }
 #: Attributes of numba that `numba_private` overrides, calls or sets.
 ATTRIBUTES = {
