@@ -514,7 +514,9 @@ class HeldLoad:
         alternatives = [self._settling(readings, sizes), self._cooling(readings)]
         columns = [*base, *self._thermal_columns(readings.t)]
         fit = self._fit_laws(regression, columns, alternatives, self._clocks(readings))
-        return fit._replace(rate=fit.rate.add_error(self.rounding))
+        # oil that cools unlogged follows an exponential but for a share, which is as straight as a leak
+        misfit = HOLD.cooling.misfit * float(np.ptp(fit.last)) / (self.duration / 60.0)
+        return fit._replace(rate=fit.rate.add_error(math.hypot(self.rounding, misfit)))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
         """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""

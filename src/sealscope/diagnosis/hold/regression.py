@@ -94,6 +94,7 @@ class RateFit(NamedTuple):
     rate: Mixture
     fit: Array  # (m,) readings of the most probable alternative
     band: Array  # (m,) standard deviation of the fit
+    last: Array  # (m,) part of the fit that is due to the last optional term
     noise: Noise  # of the most probable alternative
     s: float  # standard deviation of its white part
     log_evidence: float
@@ -174,28 +175,32 @@ class RateRegression:
         best = int(weights.argmax())
         noise, s = self.noises[rows[best] // n_choices]
         usual = weights > LEAST_WEIGHT
-        fit, band = self._draw_fit(gram, values, choices, precision, mean, int(rows[best]), float(grid[best]))
+        n_last = max(len(option.columns) for option in alternatives[-1])
+        design, coefficients, band = self._solve_best(
+            gram, values, choices, precision, mean, int(rows[best]), float(grid[best])
+        )
         return RateFit(
             Mixture(weights[usual] / weights[usual].sum(), solution[usual, 1], solution[usual, 2]),
-            fit,
+            design @ coefficients,
             band,
+            design[:, len(coefficients) - n_last :] @ coefficients[len(coefficients) - n_last :],
             noise,
             s * float(np.sqrt(grid[best])),
             float(logs.max() + np.log(weights.sum())),
         )
 
-    def _draw_fit(
+    def _solve_best(
         self, gram: Array, values: Array, choices: NDArray[np.intp], precision: Array, mean: Array, row: int,
         variance: float,
-    ) -> tuple[Array, Array]:  # fmt: skip
-        """Compute the fitted readings (m,) of one combination, and their standard deviation (m,)."""
+    ) -> tuple[Array, Array, Array]:  # fmt: skip
+        """Fit one combination: its columns (m, p), coefficients (p,), and the standard deviation of the fit (m,)."""
         n, c = divmod(row, len(choices))
         used = choices[c] % (values.shape[1] - 1) + 1
         matrix = gram[n][np.ix_(used, used)] / variance + np.diag(precision[c])
         right = gram[n][used, 0] / variance + precision[c] * mean[c]
         design, covariance = values[:, used], np.linalg.inv(matrix)
         band = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", design, covariance, design), 0.0))
-        return design @ (covariance @ right), band
+        return design, covariance @ right, band
 
 
 @kernel
