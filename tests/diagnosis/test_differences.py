@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from sealscope.diagnosis.inference.differences import (
-    PriorScatter,
-    compare_estimates,
-    compare_with_healthy,
-    excess_error,
-)
+from sealscope.diagnosis.estimate.population import ScatterPrior, excess_error
+from sealscope.diagnosis.inference.observable import compare_estimates, compare_with_healthy
 from sealscope.diagnosis.inference.onset import Estimate
 
 from ..representatives import SLOW, few
@@ -46,7 +42,7 @@ def test_a_value_that_no_possible_change_explains_is_no_evidence_of_one() -> Non
 
 
 def estimates_chance(value: float, healthy: list[Estimate], error: float = 0.05, scatter: float = 0.1) -> float:
-    observable = compare_estimates("a", "b", Estimate(value, error), healthy, PriorScatter(scatter, 3.0))
+    observable = compare_estimates("a", "b", Estimate(value, error), healthy, ScatterPrior(scatter, 3.0))
     assert observable is not None
     return observable.chance
 
@@ -75,8 +71,8 @@ def test_a_day_with_a_large_error_hides_no_change() -> None:
     assert estimates_chance(2.0, [*healthy, Estimate(3.0, 2.0)]) < 3.0 * expected
     assert estimates_chance(2.0, [*healthy, Estimate(3.0, 0.05)]) > 0.05
     assert estimates_chance(2.0, healthy, error=1.0) > 0.1
-    assert compare_estimates("a", "b", Estimate(1.0, 0.1), healthy[:2], PriorScatter(0.1, 3.0)) is None
-    assert compare_estimates("a", "b", Estimate(np.nan, 0.1), healthy, PriorScatter(0.1, 3.0)) is None
+    assert compare_estimates("a", "b", Estimate(1.0, 0.1), healthy[:2], ScatterPrior(0.1, 3.0)) is None
+    assert compare_estimates("a", "b", Estimate(np.nan, 0.1), healthy, ScatterPrior(0.1, 3.0)) is None
 
 
 def test_a_vague_value_shows_less_than_a_precise_one() -> None:
@@ -89,7 +85,7 @@ def test_a_vague_value_shows_less_than_a_precise_one() -> None:
 def test_days_that_differ_by_more_than_their_errors_make_an_imprecise_day_unremarkable() -> None:
     """Errors ten times too small: a day of few strokes, whose error is five times the others', differs by five."""
     healthy = [Estimate(10.0 * value, 1.0) for value in HEALTHY]
-    judged, prior = Estimate(60.0, 5.0), PriorScatter(1.0, 1.0)
+    judged, prior = Estimate(60.0, 5.0), ScatterPrior(1.0, 1.0)
     believed = compare_estimates("a", "b", judged, healthy, prior)
     doubted = compare_estimates("a", "b", judged, healthy, prior._replace(inflation=30.0))
     precise = compare_estimates("a", "b", Estimate(60.0, 1.0), healthy, prior._replace(inflation=30.0))
@@ -102,7 +98,7 @@ def test_errors_that_healthy_recordings_show_to_be_too_large_hide_no_change() ->
     """Healthy values agree to a fiftieth of their errors: the errors contain what all recordings have in common."""
     healthy = [Estimate(value, 5.0) for value in (*HEALTHY, 1.02, 0.98)]
     believed, doubted = (
-        compare_estimates("a", "b", Estimate(2.0, 5.0), healthy, PriorScatter(0.05, 1.0, deflation=deflation))
+        compare_estimates("a", "b", Estimate(2.0, 5.0), healthy, ScatterPrior(0.05, 1.0, deflation=deflation))
         for deflation in (1.0, 100.0)
     )
     assert believed is not None and doubted is not None
@@ -118,7 +114,7 @@ def test_chances_hold_for_errors_that_may_be_too_large(excess: float) -> None:
         values = random.normal(0.0, errors / excess)
         healthy = [Estimate(*pair) for pair in zip(values[1:], errors[1:], strict=True)]
         observable = compare_estimates(
-            "a", "b", Estimate(values[0], errors[0]), healthy, PriorScatter(0.005, 1.0, deflation=20.0)
+            "a", "b", Estimate(values[0], errors[0]), healthy, ScatterPrior(0.005, 1.0, deflation=20.0)
         )
         assert observable is not None
         chances.append(observable.chance)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom, kstest, norm
 
+from sealscope.diagnosis.estimate.population import Mixture, Population, ScatterPrior
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.excess import (
@@ -17,9 +18,8 @@ from sealscope.diagnosis.inference.comparison.excess import (
     motion_change,
 )
 from sealscope.diagnosis.inference.comparison.levels import rise
-from sealscope.diagnosis.inference.comparison.population import Population
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
-from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
+from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.volume_detector import compare_motion
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -344,7 +344,9 @@ def test_what_others_let_expect_is_that_of_dense_algebra(seed: int) -> None:
         logs[-1] -= 0.5 * freedom * (np.log(variance) + usual**2 / variance)
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    result = Population(covariance[None], np.zeros(1)).rise(values[None, n], values[None, :n], usual, freedom)
+    population = Population(covariance[None], np.zeros(1))
+    predicted = population.predict_with_prior(values[None, :n], ScatterPrior(usual, freedom))
+    result = rise_of_mixture(predicted, values[None, n])
     expected = weights @ norm.cdf((values[n] - result.value - np.array(centres)) / deviations)
     assert expected == pytest.approx(0.5, abs=0.02)
     chance = weights @ norm.sf((values[n] - np.array(centres)) / deviations)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.compiled import law
-from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 
 #: Most means that a hold test keeps; as many are left when pairs of them are joined, each of twice the length.
 N_MEANS = 32

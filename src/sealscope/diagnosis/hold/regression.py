@@ -23,8 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel
+from sealscope.diagnosis.estimate.population import LEAST_WEIGHT, Mixture, pool_mixtures
 from sealscope.diagnosis.hold.readings import Readings
-from sealscope.diagnosis.inference.comparison.rise import LEAST_WEIGHT, Mixture, pool_mixtures
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.recordings.recording import Array
 

@@ -14,9 +14,11 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior, estimate_variance, predict_estimate
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.onset import Estimate, Interval, StepTest
 from sealscope.diagnosis.verdict.evidence import Cause, LeakCourse, RelativeLeak, TotalLeakage
+from sealscope.signals.smoothing import TINY
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -277,3 +279,89 @@ class Observed:
     judged_until: float = 1.0
     has_failed: bool = False
     refusal: str = ""
+
+
+def compare_with_healthy(
+    name: str,
+    data: str,
+    value: float,
+    healthy: Sequence[float],
+    error: float = 0.0,
+    *,
+    above: bool = False,
+    prior_change: float = np.inf,
+) -> Observable | None:
+    """Test a value by Student's t for a difference from the values of healthy recordings.
+
+    The n healthy values are normal about an unknown mean with an unknown standard deviation (Jeffreys prior). With
+    their mean and variance s^2 (`population.estimate_variance`), the value y then follows Student's t with n - 1
+    degrees of freedom, to which the standard error e of a single value is added, since values may agree by chance:
+
+        t = (y - mean) / sqrt((s^2 + e^2) (1 + 1/n)).
+
+    - `name`, `data`: name of the quantity and its kind of data, for the result (`Observable`);
+    - `error`: standard error e of a single value;
+    - `above`: count only a value above the healthy ones;
+    - `prior_change`: standard deviation of a true change, infinite if unknown. With the Bayes factor B of such a change
+      to no change, the p-value is at least 1/B, and 1 if B < 1: a true change then explains the value no better than
+      scatter does.
+
+    The observable's size is the difference from the healthy mean, its score the square of t (with `above`, 0 for a
+    value below the mean), and its chance the p-value. Return None for fewer than `MIN_HEALTHY` healthy recordings, or
+    if a number is not finite.
+    """
+    from scipy.special import stdtr
+
+    values, count = np.asarray(healthy, dtype=float), len(healthy)
+    if count < MIN_HEALTHY or not np.isfinite([value, error, *values]).all():
+        return None
+    change = value - float(values.mean())
+    variance, freedom = estimate_variance(count * float(values.var()), count)
+    variance = (variance + error**2) * (1.0 + 1.0 / count)
+    t = change / max(math.sqrt(variance), TINY)
+    chance = float(stdtr(freedom, -t if above else -abs(t))) * (1.0 if above else 2.0)
+    score = t * t if t > 0.0 or not above else 0.0
+    if not math.isfinite(score):
+        return None
+    if math.isfinite(prior_change):
+        # Bayes factor of a true change: ratio of two densities of Student's t at the value, with the variance of such a
+        # change added, and without it
+        variance_ratio = 1.0 + prior_change**2 / max(variance, TINY)
+        log_factor = 0.5 * (freedom + 1.0) * np.log1p(t * t / freedom)
+        log_factor -= 0.5 * (freedom + 1.0) * np.log1p(t * t / variance_ratio / freedom) + 0.5 * np.log(variance_ratio)
+        chance = max(chance, float(np.exp(-max(log_factor, 0.0))))
+    return Observable(name=name, data=data, score=score, chance=min(1.0, chance), size=change)
+
+
+def compare_estimates(
+    name: str,
+    data: str,
+    judged: Estimate,
+    healthy: Sequence[Estimate],
+    prior: ScatterPrior,
+    *,
+    above: bool = False,
+    further_deviation: float = 0.0,
+) -> Observable | None:
+    """Test an estimate for a difference from the estimates of healthy recordings, each with a known standard error.
+
+    The prediction is that of `population.predict_estimate`.
+
+    - `name`, `data`: name of the quantity and its kind of data, for the result;
+    - `prior`: prior on the scatter between recordings;
+    - `above`: count only an estimate above the healthy ones;
+    - `further_deviation`: standard deviation of the judged estimate from further causes, such as an unusual load.
+
+    The observable's size is the difference from the predicted mean, its score the square of this difference over its
+    variance (with `above`, 0 for a negative one), and its chance the p-value. Return None for fewer than `MIN_HEALTHY`
+    healthy recordings, or if a number is not finite.
+    """
+    if len(healthy) < MIN_HEALTHY or not np.isfinite([judged, *healthy]).all():
+        return None
+    values, errors = np.array(healthy, dtype=float).T
+    predicted = predict_estimate(values, errors, judged.deviation, prior, further_deviation)
+    chance = predicted.chance_above(judged.value) if above else predicted.chance_beyond(judged.value)
+    change = judged.value - float(predicted.weights @ predicted.centres)
+    variance = float(predicted.weights @ predicted.deviations**2)
+    score = change**2 / max(variance, TINY) if change > 0.0 or not above else 0.0
+    return Observable(name=name, data=data, score=score, chance=min(1.0, chance), size=change)

@@ -45,12 +45,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
-#: Probability with which a stated upper bound, or a stated interval, contains the true value.
-BOUND_PROBABILITY = 0.95
-#: Quantiles of the standard normal distribution for such an interval and such an upper bound: 1.96 and 1.645.
+#: Quantiles of the standard normal distribution for a stated interval and a stated upper bound: 1.96 and 1.645.
 WITHIN_95 = round(NormalDist().inv_cdf(0.5 + 0.5 * BOUND_PROBABILITY), 2)
 UPPER_95 = round(NormalDist().inv_cdf(BOUND_PROBABILITY), 3)
 #: Minimum number of blocks, for a level, a slope, a step and its standard error.

@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.diagnosis.inference.comparison.population import Population, number_sessions
-from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.estimate.population import Population, ScatterPrior, number_sessions
+from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.rms_blocks import DUTY, RmsBlocks, column_names
@@ -115,5 +115,6 @@ def estimate_rises(
     rises = []
     for judged_g, healthy_g, w in zip(y[0] / weight, y[1:].T / weight[:, None], weight, strict=True):
         scatter = float(np.hypot(prior.scatter, prior.error / w))  # g = y / w has the error of y over w
-        rises.append(population.rise(judged_g[None], healthy_g[None], scatter, prior.freedom))
+        predicted = population.predict_with_prior(healthy_g[None], ScatterPrior(scatter, prior.freedom))
+        rises.append(rise_of_mixture(predicted, judged_g[None]))
     return rises, weight

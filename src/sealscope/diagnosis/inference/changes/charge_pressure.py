@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.motion_fit import (
     GROUPS,
@@ -34,9 +35,8 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     solve_weighted,
     stack_equations,
 )
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.equations.signals import find_rests
-from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
@@ -241,7 +241,7 @@ def compare_low_drifts(
     or 1 if too few healthy recordings have both.
     """
     prior = CHANGES.charge
-    scatter = PriorScatter(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
+    scatter = ScatterPrior(deviation=prior.scatter, recordings=prior.recordings, deflation=prior.deflation)
     known = {side: [other[side] for other in healthy if side in other] for side in judged}
     drifts = {side: drift for side, drift in judged.items() if len(known[side]) >= MIN_HEALTHY}
     if not drifts:

@@ -8,8 +8,8 @@
   compared while a valve connects the chambers (`connected`).
 - A filter of one sensor changes the ratio and the phase of the spectra of both pressures (`pressure_bands`).
 
-A number is tested against its scatter between healthy recordings (`differences`). Called for recordings with both
-chamber pressures.
+A number is tested against its scatter between healthy recordings (`observable.compare_estimates`). Called for
+recordings with both chamber pressures.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
@@ -37,8 +38,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
 from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
-from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
-from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -144,7 +144,7 @@ def _compare_friction(judged: Summary, healthy: Sequence[Summary]) -> Observable
     judged_log = log_friction(judged)
     if judged_log is None:
         return None
-    scatter = PriorScatter(deviation=prior.friction_scatter, recordings=prior.recordings)
+    scatter = ScatterPrior(deviation=prior.friction_scatter, recordings=prior.recordings)
     return compare_estimates(FRICTION, FRICTION, judged_log, healthy_logs, scatter, above=True)
 
 
@@ -165,7 +165,7 @@ def _compare_drifts(judged: Summary, healthy: Sequence[Summary], duration: float
         return
     healthy_drifts = [drifts for summary in healthy if len(drifts := _read_drifts(summary, MOTION)) > 1]
     prior = CHANGES.healthy
-    scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
+    scatter = ScatterPrior(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
     drift_A, drift_B = (
         compare_estimates(name, DRIFT, judged_drifts[side], [drifts[side] for drifts in healthy_drifts], scatter)
         for side, name in zip("AB", DRIFTS[:2], strict=True)
@@ -192,7 +192,7 @@ def _compare_zeros(judged: Summary, healthy: Sequence[Summary]) -> Observable | 
         if set(ZERO_KEYS) <= set(summary)
     )
     prior = CHANGES.healthy
-    scatter = PriorScatter(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
+    scatter = ScatterPrior(prior.drift, recordings=prior.drift_recordings, inflation=prior.drift_inflation)
     return compare_estimates(ZEROS, DRIFT, judged_zero, healthy_zeros, scatter)
 
 

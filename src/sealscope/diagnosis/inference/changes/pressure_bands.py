@@ -31,7 +31,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY
+from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior, estimate_variance
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
@@ -265,11 +265,10 @@ def _ratio_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     prior = CHANGES.octaves
     ratios = np.array([octaves.log_A - octaves.log_B for octaves in healthy])
     count, octave = len(ratios), np.arange(ratios.shape[1])
-    freedom = prior.recordings + count - 1.0
     mean = ratios.mean(axis=0)
     squares = ((ratios - mean) ** 2).sum(axis=0)
-    # the prior counts as `prior.recordings` further recordings with the variance scatter^2
-    deviations = np.sqrt((prior.recordings * prior.scatter**2 + squares) / freedom)
+    variances, freedom = estimate_variance(squares, count, ScatterPrior(prior.scatter, prior.recordings))
+    deviations = np.sqrt(variances)
     correlations = np.exp(-np.abs(np.subtract.outer(octave, octave)) / prior.neighbours)
     # scatter of a new recording about the mean, correlated between octaves, and an independent error of each ratio
     scale = np.outer(deviations, deviations) * correlations * (1.0 + 1.0 / count) + prior.error**2 * np.eye(len(mean))
@@ -292,8 +291,7 @@ def _phase_log_likelihoods(judged: Octaves, healthy: Sequence[Octaves], filters:
     precisions = 1.0 / (prior.scatter**2 + np.array([octaves.phase_variance for octaves in healthy]))
     mean = np.angle((precisions * directions).sum(axis=0))
     squares = (np.angle(directions * np.exp(-1j * mean)) ** 2).sum(axis=0)
-    # the prior counts as `prior.recordings` further recordings with the variance scatter^2
-    variances = (prior.recordings * prior.scatter**2 + squares) / (prior.recordings + count - 1.0)
+    variances, _ = estimate_variance(squares, count, ScatterPrior(prior.scatter, prior.recordings))
     variances = variances * (1.0 + 1.0 / count) + judged.phase_variance
     residuals = judged.phase - mean - filters.phase
     is_filtered = np.any(filters.phase != 0.0, axis=1)[:, None]

@@ -34,6 +34,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import NODES, Mixture, Population, number_sessions
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.excess import (
@@ -43,9 +44,8 @@ from sealscope.diagnosis.inference.comparison.excess import (
     estimate_leak_excess,
 )
 from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
-from sealscope.diagnosis.inference.comparison.population import Population, number_sessions
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.comparison.rise import NODES, Mixture, Rise, rise_of_mixture
+from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

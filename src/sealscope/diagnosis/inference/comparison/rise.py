@@ -2,140 +2,21 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.compiled import kernel
-from sealscope.diagnosis.inference.onset import BOUND_PROBABILITY, Interval
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, NODES, Mixture
+from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
 
 #: `Observable.data` of the leakage against healthy recordings.
 RISE = "rise"
-#: Number of points of each grid, of standard deviations or of rises.
-NODES = 32
 #: Reach of a grid of rises [standard deviations].
 MAX_LOG = 4.0
 #: Parts of a mixture are omitted if their log weight is lower than the largest by more than this.
 NEGLIGIBLE = 16.0
-#: Number of parts of a large mixture that give the first estimate of a quantile; maximum number of steps to it; and
-#: distance [standard deviations] beyond which a normal distribution has no probability of the order of rounding.
-SAMPLED, MAX_STEPS, NEGLIGIBLE_TAIL = 128, 200, 9.0
-#: Number of factors into which an uncertain one is divided, and least weight of a part of a pooled mixture, over the
-#: largest.
-N_FACTORS, LEAST_WEIGHT = 15, 1e-5
-ROOT_HALF, ROOT_PI = math.sqrt(0.5), math.sqrt(math.pi)
-
-
-class Mixture(NamedTuple):
-    """Mixture of k normal distributions: their `weights`, of sum 1, standard `deviations` and `centres`, (k,) each.
-
-    A mixture that `Population.predict` returns has log weights and more axes; `rise_of_mixture` converts it.
-    """
-
-    weights: Array
-    deviations: Array
-    centres: Array
-
-    @property
-    def mean(self) -> float:
-        """Mean of the mixture."""
-        return float(self.weights @ self.centres)
-
-    @property
-    def deviation(self) -> float:
-        """Standard deviation of the mixture."""
-        return float(np.sqrt(self.weights @ (self.deviations**2 + (self.centres - self.mean) ** 2)))
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % interval (low, high)."""
-        return self.quantile(0.5 - 0.5 * BOUND_PROBABILITY), self.quantile(0.5 + 0.5 * BOUND_PROBABILITY)
-
-    def scale(self, factor: float, deviation: float = 0.0) -> Mixture:
-        """Multiply the quantity by `factor`, whose logarithm has a standard `deviation`, in quantiles."""
-        if deviation == 0.0:
-            return Mixture(self.weights, abs(factor) * self.deviations, factor * self.centres)
-        normal = NormalDist()
-        factors = [factor * math.exp(deviation * normal.inv_cdf((k + 0.5) / N_FACTORS)) for k in range(N_FACTORS)]
-        return pool_mixtures([self.scale(number) for number in factors], np.full(N_FACTORS, 1.0 / N_FACTORS))
-
-    def add_error(self, deviation: float) -> Mixture:
-        """Add an independent normal error to the quantity."""
-        return self._replace(deviations=np.hypot(self.deviations, deviation))
-
-    def below(self, value: float) -> float:
-        """Compute the probability of values below `value`."""
-        from scipy.special import ndtr
-
-        return float(self.weights @ ndtr((value - self.centres) / self.deviations))
-
-    def quantile(self, probability: float) -> float:
-        """Compute the value below which the mixture lies with the given probability."""
-        from scipy.special import ndtri
-
-        # scale by the mean deviation (each counts up to 1000 times the smallest): the quantile is then of order one
-        scale = max(float(self.weights @ np.minimum(self.deviations, 1e3 * self.deviations.min())), TINY)
-        centres, deviations = self.centres / scale, self.deviations / scale
-        return scale * float(_find_quantile(self.weights, deviations, centres, probability, float(ndtri(probability))))
-
-
-@kernel
-def _find_quantile(weights: Array, deviations: Array, centres: Array, probability: float, z: float) -> float:
-    """Find the quantile of a `Mixture` at a `probability` by Newton's method between bounds, to 12 digits.
-
-    `z`: the quantile of the standard normal distribution. That of the mixture lies between those of its parts. A search
-    among a sample of the parts gives the first estimate.
-    """
-    n = weights.size
-    lowest, highest, value = np.inf, -np.inf, 0.0
-    for k in range(n):
-        part = centres[k] + z * deviations[k]
-        lowest, highest, value = min(lowest, part), max(highest, part), value + weights[k] * part
-    if not math.isfinite(highest - lowest):
-        return lowest
-    for sample in range(2):
-        stride = 1 if sample else max(1, n // SAMPLED)
-        if not sample and stride == 1:
-            continue
-        low, high, total = lowest, highest, 0.0
-        for k in range(0, n, stride):
-            total += weights[k]
-        for _ in range(MAX_STEPS):
-            excess, density = -probability * total, 0.0
-            for k in range(0, n, stride):
-                u = (value - centres[k]) / deviations[k]
-                if u > NEGLIGIBLE_TAIL:
-                    excess += weights[k]
-                elif u > -NEGLIGIBLE_TAIL:
-                    excess += weights[k] * 0.5 * math.erfc(-u * ROOT_HALF)
-                    density += weights[k] / deviations[k] * math.exp(-0.5 * u * u)
-            if excess == 0.0:
-                break
-            low, high = (value, high) if excess < 0.0 else (low, value)
-            step = -excess / (density * ROOT_HALF / ROOT_PI) if density > 0.0 else np.inf
-            is_newton = low < value + step < high
-            if not is_newton:  # Newton's step leaves the bounds
-                step = 0.5 * (low + high) - value
-            value += step
-            # the error after a step of Newton's method is about its square
-            if abs(step) <= (1e-6 if is_newton else 1e-13) * max(1.0, abs(value)):
-                break
-    return value
-
-
-def pool_mixtures(mixtures: Sequence[Mixture], weights: Array) -> Mixture:
-    """Pool mixtures (k,) with `weights` (k,) of sum 1, without parts of a negligible weight."""
-    pairs = zip(mixtures, weights, strict=True)
-    parts = [mixture._replace(weights=weight * mixture.weights) for mixture, weight in pairs]
-    pooled = Mixture(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
-    is_counted = pooled.weights > LEAST_WEIGHT * pooled.weights.max()
-    counted, deviations, centres = (values[is_counted] for values in pooled)
-    return Mixture(counted / counted.sum(), deviations, centres)
 
 
 class Rise(NamedTuple):

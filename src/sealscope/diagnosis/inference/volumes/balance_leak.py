@@ -7,17 +7,17 @@ from functools import cached_property
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.laws import compare_laws
 from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.comparison.rise import Mixture, Rise
+from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.onset import (
-    BOUND_PROBABILITY,
     UPPER_95,
     WITHIN_95,
     Estimate,

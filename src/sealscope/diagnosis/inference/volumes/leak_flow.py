@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.leak_law import (
     EXPONENTS,
@@ -27,7 +28,6 @@ from sealscope.diagnosis.inference.leak_law import (
     mixture_flow,
 )
 from sealscope.diagnosis.inference.onset import (
-    BOUND_PROBABILITY,
     Estimate,
     Information,
     StepTest,

@@ -3,8 +3,8 @@
 Such faults are an external leak, wear of the pump, and free air. Each has a term in the volume balance. The change of
 its coefficient is fitted to the residual of a recording under the healthy coefficients, with priors on the changes of
 all other coefficients (`priors.toml`). The scatter of the coefficient among the healthy recordings shows which change
-is normal (`differences`). An external leak and a leak past the piston look nearly alike: the likelihood ratio of the
-two is stated with the observable.
+is normal (`observable.compare_with_healthy`). An external leak and a leak past the piston look nearly alike: the
+likelihood ratio of the two is stated with the observable.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from sealscope.diagnosis.estimate.linear import Gaussian
+from sealscope.diagnosis.estimate.population import MIN_HEALTHY, excess_error
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.excess import coefficient_level, marginal_difference
@@ -23,9 +24,8 @@ from sealscope.diagnosis.inference.comparison.levels import held_pump_rise, rise
 from sealscope.diagnosis.inference.comparison.oil import oil_hypotheses
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import RISE
-from sealscope.diagnosis.inference.differences import MIN_HEALTHY, compare_with_healthy, excess_error
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, SPEED_LOSS, TURNING
-from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.observable import Observable, compare_with_healthy
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

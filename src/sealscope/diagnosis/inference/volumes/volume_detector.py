@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.balance import (
     READ,
@@ -24,11 +25,10 @@ from sealscope.diagnosis.inference.comparison.excess import motion_change
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.differences import PriorScatter, compare_estimates
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
-from sealscope.diagnosis.inference.observable import Observable, Observed
+from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
 from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
@@ -368,7 +368,7 @@ def compare_motion(
         data="motion",
         judged=judged,
         healthy=healthy_estimates,
-        prior=PriorScatter(prior.scatter, prior.recordings, prior.inflation),
+        prior=ScatterPrior(prior.scatter, prior.recordings, prior.inflation),
         further_deviation=INFERENCE.conditions.motion * excess,
     )
     if observable is not None:
