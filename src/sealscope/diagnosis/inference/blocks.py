@@ -720,6 +720,8 @@ def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: 
         gram, polynomials, places, columns, deviations.ravel(), offset_deviation, n_rows, sums, fitted
     )
     normal = sums.normal_equations(gram, roles.left)
+    if not 0.0 < normal.nuisance.square < np.inf:  # no row, or an overflow: nothing is known
+        offset, variance, fitted = np.nan, np.nan, np.full_like(fitted, np.nan)
     coefficients, prior_precision, prior_moment = fitted
     return _EquationFit(nuisance, polynomials, normal, offset, coefficients, prior_precision, prior_moment, variance)
 
