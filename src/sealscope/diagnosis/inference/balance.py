@@ -480,7 +480,7 @@ class SignEvidence(SavedAttributes):
         ):
             log_odds = _sign_log_odds(_leak_z_score(gram, roles, int(count)), other_cause=INFERENCE.sense.leak)
             work_z = [_work_z_score(sums) for sums in loads]
-            log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.work) for z in work_z]))
+            log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.driving_load) for z in work_z]))
             motion_z = _z_score(*motions[0]) if roles.piston else 0.0
             if motion_z > 0.0:  # else either x or the flow may be reversed
                 log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
@@ -489,9 +489,9 @@ class SignEvidence(SavedAttributes):
 
     @property
     def shows_motion(self) -> bool:
-        """True if flow and motion correlate by `sense.moves` (`priors.toml`) standard errors, in either sense."""
+        """True if flow and motion correlate by `sense.motion_score` (`priors.toml`) standard errors, either way."""
         z_scores = [abs(_z_score(*sums)) for motions in self._motions for sums in motions]
-        return not z_scores or max(z_scores) > INFERENCE.sense.moves
+        return not z_scores or max(z_scores) > INFERENCE.sense.motion_score
 
 
 #: Number of the sums of `_load_sums`.
@@ -966,7 +966,7 @@ def find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equatio
 
     - A balance with terms of its own at rest (`is_separate_at_rest`) needs the stops of the piston only. The flow never
       counts as resting (`NEVER`), so that a stop of the piston is `holding`. The piston's limit is the fraction
-      `rest.moves` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
+      `rest.motion_fraction` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
     - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
       valves are taken as shut, and a piston that still moves creeps by a leak: it never counts as resting.
 
@@ -974,10 +974,10 @@ def find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equatio
     """
     signals = Signals(samples, rate)
     if is_separate_at_rest(balance):
-        max_speed = max_rest_rate(signals.step("x"), rate, fraction=INFERENCE.rest.moves)
+        max_speed = max_rest_rate(signals.step("x"), rate, fraction=INFERENCE.rest.motion_fraction)
         return RestLimits(pump=NEVER, piston=max_speed, shortest=AVERAGING_TIME)
     if flow_source(samples) == "q_pump":  # no angle or speed of the pump is recorded
-        max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.moves)
+        max_flow = max_rest_rate(balance.left(signals), rate, fraction=INFERENCE.rest.motion_fraction)
         return RestLimits(pump=max_flow, piston=NEVER)
     return RestLimits(pump=max_rest_rate(balance.left(signals), rate), piston=max_rest_rate(signals.step("x"), rate))
 

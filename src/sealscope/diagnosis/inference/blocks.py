@@ -117,9 +117,10 @@ class Blocks:
     def is_moving(self) -> NDArray[np.bool_]:
         """Flags (K,) of the blocks in which the pump moves the piston; all are flagged if all flows are 0.
 
-        Their flow is at least `rest.moves` (`priors.toml`) times `moving_flow`; a pump that holds a load has less.
+        Their flow is at least `rest.motion_fraction` (`priors.toml`) times `moving_flow`; that of a pump that
+        holds a load is less.
         """
-        return np.asarray(self.flow >= INFERENCE.rest.moves * self.moving_flow)
+        return np.asarray(self.flow >= INFERENCE.rest.motion_fraction * self.moving_flow)
 
     @property
     def pressure_weights(self) -> Array:

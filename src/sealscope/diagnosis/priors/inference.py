@@ -169,10 +169,10 @@ class SensePriors(PriorTable):
     """Probabilities of causes by which the sign of a recorded flow looks wrong, or has become wrong."""
 
     # the sign looks wrong for another reason:
-    work: float  # the load gives back more work than it takes
+    driving_load: float  # the load gives back more work than it takes
     leak: float  # offsets of sensors, compressed oil or losses of the pump look like a negative leak
     sides: float  # the sides A and B are exchanged in the log
-    moves: float  # standard errors by which flow and motion correlate, in either sense, while the piston moves
+    motion_score: float  # standard errors by which flow and motion correlate, in either sense, while the piston moves
     rewired: float  # the sign is wrong, as the sensor was reversed since the healthy recordings
 
 
@@ -191,10 +191,10 @@ class HeldOilPriors(PriorTable):
     sides_deviation: float
     sides_told: float  # probability that the pressures tell which side carries the load, despite offsets of the sensors
     unlike: float  # largest plausible ratio of the two piston areas
-    right: float  # probability that the holds state the right flow of a leak if the whole recording states another
+    weight_of_holds: float  # probability that holds state a leak's flow right if the whole recording states another
     scatter: float  # relative standard deviation of a leak's flow in holds, beyond the errors of its fit
     agrees: float  # ratio of the conductances from holds and whole recording, the standard deviation of its logarithm
-    rare: float  # p-value below which a rise of the leakage in the holds counts for the flow of the leak
+    significance: float  # p-value below which a rise of the leakage in the holds counts for the flow of the leak
     settles: float  # [s] time in which valves shut
     before: float  # [s] time before a hold in which the flow shows the leakage of the pump
     pump_session: float  # relative standard deviation of this leakage between sessions with the same oil
@@ -272,7 +272,7 @@ class RestPriors(PriorTable):
     lasting: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
     holding: float  # mean flow of a pump that holds a load
     # smallest mean flow of a block in motion; also the largest flow of a meter, or speed over the mean speed, at rest
-    moves: float
+    motion_fraction: float
     lowers: float  # smallest speed at the mean load, over the mean speed, of a piston that passes a resting pump
     shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
     open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation

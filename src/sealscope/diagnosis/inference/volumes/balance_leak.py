@@ -61,14 +61,17 @@ class BalanceLeak(LeakMeasure):
         assumes shut valves at every rest or the rise is too high for a healthy machine. Behind a servo valve or a flow
         meter, too, the pump's leakage is not measured.
         """
-        balance, rare = self.balance, INFERENCE.held_oil.rare
+        balance, prior = self.balance, INFERENCE.held_oil
         if balance.is_creep:
             return "piston or external leak"
         hold_rise, chambers = self._rises.get(True), balance.chambers
-        is_in_holds = hold_rise is not None and hold_rise is self.rise and (balance.shut or hold_rise.chance < rare)
+        is_in_holds = (
+            hold_rise is not None and hold_rise is self.rise and (balance.shut or hold_rise.chance < prior.significance)
+        )
         if is_in_holds and chambers is not None:
             # with one chamber open to the tank, the other loses oil alike by a leak past the piston or to the outside
-            return "piston leak" if chambers.piston_leak.probability >= 1.0 - rare else "piston or external leak"
+            is_certain = chambers.piston_leak.probability >= 1.0 - prior.significance
+            return "piston leak" if is_certain else "piston or external leak"
         has_servo_valve = len(balance.columns) > 1  # one balance for each chamber
         is_behind_pump = has_servo_valve or flow_source(balance.recording.channels) in METERS
         return "piston leak" if is_behind_pump else "piston or pump leak"
@@ -147,7 +150,7 @@ class BalanceLeak(LeakMeasure):
         if hold_rise is None:
             return None
         is_precise = hold_rise.deviation < max(motion_rise.deviation, motion_rise.value)
-        return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.rare else None
+        return hold_rise if is_precise or hold_rise.chance < INFERENCE.held_oil.significance else None
 
     @cached_property
     def rise_flow(self) -> Estimate:
@@ -186,14 +189,14 @@ class BalanceLeak(LeakMeasure):
     def _mix_with_holds(self, flow: Estimate) -> Estimate:
         """Combine the flow of a leak since its onset with its flow during holds, if the holds show a leak.
 
-        The weight of the estimate from holds, `held_oil.right` of `priors.toml`, is the probability that it is right if
-        the two disagree.
+        The weight of the estimate from holds, `held_oil.weight_of_holds` of `priors.toml`, is the probability that it
+        is right if the two disagree.
         """
         hold_rise, prior = self._hold_rise, INFERENCE.held_oil
-        if hold_rise is None or not hold_rise.chance < prior.rare:
+        if hold_rise is None or not hold_rise.chance < prior.significance:
             return flow
         flows, deviations = np.array([flow, self._hold_flow(hold_rise)]).T  # first of the recording, then of the holds
-        return mixture_flow(np.array([1.0 - prior.right, prior.right]), flows, deviations)
+        return mixture_flow(np.array([1.0 - prior.weight_of_holds, prior.weight_of_holds]), flows, deviations)
 
     @property
     def rise_onset(self) -> Interval | None:
@@ -202,7 +205,7 @@ class BalanceLeak(LeakMeasure):
         None if these holds do not clearly show the leakage, or if the leak may have begun before them.
         """
         hold_rise, chambers = self._hold_rise, self.balance.chambers
-        if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.rare:
+        if hold_rise is None or chambers is None or not hold_rise.chance < INFERENCE.held_oil.significance:
             return None
         return chambers.piston_onset
 
@@ -333,7 +336,7 @@ class BalanceLeak(LeakMeasure):
         # mean flow per conductance of a leak past the piston, increased where its law makes the flow less certain
         unit = pressure * max(relative_deviation, 1.0)
         # the holds show the leak if they are right about it and it did not begin after them
-        hold_probability = INFERENCE.held_oil.right * (1.0 - chambers.probability_after_holds)
+        hold_probability = INFERENCE.held_oil.weight_of_holds * (1.0 - chambers.probability_after_holds)
         # `hold_rise.value` contains the piston's leak times its probability; here the leak is either whole or absent.
         # The error of `hold_rise` excludes the oil's uncertain properties, so a whole leak adds them
         by_motion = _flow_mixture(motion_rise, motion_rise.value, unit=pressure, weight=1.0 - hold_probability)
