@@ -22,14 +22,14 @@ from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import text_of
 from sealscope.diagnosis.detectors.observation import healthy_null, limit_threads, observe_rivals, run_detector
 from sealscope.diagnosis.detectors.registry import detectors
-from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
+from sealscope.diagnosis.healthy import Healthy, SummarisedRecording, Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import (
     HOLD_SUMMARY,
     describe_holds,
     estimate_growth,
+    find_shown_leak,
     held_leakage,
-    may_be_healthy,
     summarise_hold,
 )
 from sealscope.diagnosis.inference.observable import Observed
@@ -37,7 +37,7 @@ from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
-from sealscope.diagnosis.verdict.evidence import LEAK, NO_LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
+from sealscope.diagnosis.verdict.evidence import LEAK, RMS_CHANGE, VOLUME_BALANCE, Evidence
 from sealscope.diagnosis.verdict.severity import RepairLimit
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
@@ -156,6 +156,17 @@ class Examination:
 
 @checked_call
 @np.errstate(all="ignore")  # an overflow becomes a finding, not a warning
+def _summarise_holds(healthy: Sequence[Healthy], areas: Sequence[float] | None) -> list[Summary]:
+    """Summarise the longest hold of each healthy recording of a held load (`summarise_hold`); `areas` [m^2]."""
+    summaries = (
+        entry.summaries.get(HOLD_SUMMARY)
+        if isinstance(entry, SummarisedRecording)
+        else summarise_hold(judge_held_recording(entry, areas))
+        for entry in healthy
+    )
+    return [summary for summary in summaries if summary is not None]
+
+
 def diagnose(
     recording: Recording,
     baseline: Recording | Sequence[Healthy] = (),
@@ -171,7 +182,7 @@ def diagnose(
     change of RMS. The first one that the channels allow, and that reaches a decision, gives the verdict; the change of
     RMS gives it only if the channels allow neither of the first two. The results of plug-ins and of the change of RMS
     are always stated in addition. If a load is held nearly all the time, a hold test states the total leakage and the
-    reason; the verdict, on the piston alone, stays that of the methods.
+    reason, and the verdict is not `no leak` where it shows a leak that the healthy holds do not have.
 
     Parameters
     ----------
@@ -216,35 +227,26 @@ def diagnose(
     healthy = _list_baseline(recording, baseline)
     check_probability(false_alarm_probability)
     used_rig, machine = assumed_rig(rig, recording)
+    stated_areas = machine.areas if machine.area_stated else None
     with limit_threads():
         inspection = inspect_recording(recording)
         comparable = select_comparable(inspection, healthy)
+        holds = judge_held_recording(recording, stated_areas, limit)
+        growth = estimate_growth(summarise_hold(holds), _summarise_holds(healthy, stated_areas)) if holds else None
         examination = Examination(
             comparable.judged,
             comparable.parts,
             false_alarm_probability=false_alarm_probability,
             rig=used_rig,
             distrust=inspection.distrust,
-            refusal=comparable.refusal,
+            refusal=comparable.refusal or find_shown_leak(holds, growth),
             share=inspection.share,
             judged_from=inspection.judged_from,
             judged_until=inspection.judged_until,
         )
         evidence = examination.decide_by_all()
-        stated_areas = machine.areas if machine.area_stated else None
-        holds = judge_held_recording(recording, stated_areas, limit)
     if holds:
-        summaries = [
-            entry.summaries.get(HOLD_SUMMARY)
-            if isinstance(entry, SummarisedRecording)
-            else summarise_hold(judge_held_recording(entry, stated_areas))
-            for entry in healthy
-        ]
-        growth = estimate_growth(summarise_hold(holds), [summary for summary in summaries if summary is not None])
-        reason = describe_holds(holds, growth)
-        if evidence.verdict == NO_LEAK and not may_be_healthy(holds, growth):
-            evidence = decide(Observed(evidence.detector, lack=reason), (), HealthyNull(), false_alarm_probability=0.0)
-        evidence = replace(evidence, reason=reason, total_leakage=held_leakage(holds))
+        evidence = replace(evidence, reason=describe_holds(holds, growth), total_leakage=held_leakage(holds))
     missing = [str(finding.channel) for finding in comparable.findings if finding.code == MISSING_CHANNEL]
     if missing and evidence.verdict != LEAK:
         doubt = text_of("remark", "channels missing", names=join_names(missing))

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import ScatterPrior, estimate_variance
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.judgement import COOLING, format_estimate
 from sealscope.diagnosis.hold.result import HoldResult
@@ -61,22 +62,23 @@ def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGro
     halves = np.array([entry["half_lpm"] / entry["bar"] for entry in healthy])
     from scipy.special import stdtrit
 
-    n, usual, prior = len(levels), float(levels.mean()), TREND.between
+    n, usual, between = len(levels), float(levels.mean()), TREND.between
     if not usual > float(np.sqrt((halves**2).sum())) / n:
         return None  # a ratio to nothing has no value
-    freedom = prior.freedom + n - 1.0
-    squares = prior.freedom * (prior.volume_balance * usual) ** 2 + float(((levels - usual) ** 2).sum())
-    scatter = math.sqrt(squares / freedom * (1.0 + 1.0 / n))
+    prior = ScatterPrior(between.volume_balance * usual, between.freedom)
+    variance, freedom = estimate_variance(float(((levels - usual) ** 2).sum()), n, prior)
+    scatter = math.sqrt(variance * (1.0 + 1.0 / n))
     half = math.hypot(float(stdtrit(freedom, 0.975)) * scatter, hold["half_lpm"] / hold["bar"])
     level = hold["lpm"] / hold["bar"]
     return HeldGrowth(level / usual, (level - half) / usual, (level + half) / usual, n)
 
 
-def may_be_healthy(holds: Sequence[HoldResult], growth: HeldGrowth | None) -> bool:
-    """Test whether holds allow the verdict that nothing leaks: as healthy ones or, without these, no leak is shown."""
-    if growth is not None:
-        return growth.low <= 1.0
-    return all(set(hold.causes) <= {COOLING} for hold in holds)
+def find_shown_leak(holds: Sequence[HoldResult], growth: HeldGrowth | None) -> str | None:
+    """Find the reason why holds do not allow `no leak`: a leak above the healthy ones or, without these, any leak."""
+    if growth is None:
+        is_shown = any(set(hold.causes) - {COOLING} for hold in holds)
+        return "the holds show a leak" if is_shown else None
+    return "the holds leak more than the healthy ones" if growth.low > 1.0 else None
 
 
 def describe_holds(holds: Sequence[HoldResult], growth: HeldGrowth | None = None) -> str:
