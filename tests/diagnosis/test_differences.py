@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.stats import binom
 
-from sealscope.diagnosis.estimate.population import ScatterPrior, excess_error
+from sealscope.diagnosis.estimate.population import Population, ScatterPrior, estimate_variance, excess_error
 from sealscope.diagnosis.inference.observable import compare_estimates, compare_with_healthy
 from sealscope.diagnosis.inference.onset import Estimate
 
@@ -120,3 +121,17 @@ def test_chances_hold_for_errors_that_may_be_too_large(excess: float) -> None:
         chances.append(observable.chance)
     for level in (0.1, 0.01):
         assert np.sum(np.array(chances) < level) <= 2.0 * binom.ppf(0.999, len(chances), level)
+
+
+@pytest.mark.parametrize("count", [3, 8])
+def test_a_population_without_errors_is_students_t_with_the_estimated_variance(count: int) -> None:
+    """The mixture over the scatter and the closed form give the same chances of the next value."""
+    random = np.random.default_rng(count)
+    values, prior = random.normal(5.0, 0.3, count), ScatterPrior(0.2, 4.0)
+    predicted = Population(np.zeros((1, count + 1, count + 1)), np.zeros(1)).predict(
+        values[None], np.geomspace(1e-3, 1e2, 2000)[None], prior.log_density(np.geomspace(1e-3, 1e2, 2000)[None])
+    )
+    variance, freedom = estimate_variance(((values - values.mean()) ** 2).sum(), count, prior)
+    expected = stats.t(freedom, values.mean(), np.sqrt(variance * (1.0 + 1.0 / count)))
+    for value in values.mean() + random.normal(0.0, 0.6, 5):
+        assert predicted.normalise().chance_above(value) == pytest.approx(expected.sf(value), rel=1e-6)
