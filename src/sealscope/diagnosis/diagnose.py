@@ -154,8 +154,6 @@ class Examination:
         return replace(evidence, share=self.share * evidence.share, judged_until=judged_until)
 
 
-@checked_call
-@np.errstate(all="ignore")  # an overflow becomes a finding, not a warning
 def _summarise_holds(healthy: Sequence[Healthy], areas: Sequence[float] | None) -> list[Summary]:
     """Summarise the longest hold of each healthy recording of a held load (`summarise_hold`); `areas` [m^2]."""
     summaries = (
@@ -167,6 +165,8 @@ def _summarise_holds(healthy: Sequence[Healthy], areas: Sequence[float] | None) 
     return [summary for summary in summaries if summary is not None]
 
 
+@checked_call
+@np.errstate(all="ignore")  # an overflow becomes a finding, not a warning
 def diagnose(
     recording: Recording,
     baseline: Recording | Sequence[Healthy] = (),
