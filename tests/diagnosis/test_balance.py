@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
+from sealscope.diagnosis.estimate.change import StepTest, step_test
 from sealscope.diagnosis.inference.balance import BlockStream, recorded_blocks
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_offset, information
 from sealscope.diagnosis.inference.equations.balances import equations
-from sealscope.diagnosis.inference.onset import StepTest, step_test
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.delays import DelayChange, SampleClock, shift_back
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

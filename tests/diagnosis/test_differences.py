@@ -7,9 +7,9 @@ import pytest
 from scipy import stats
 from scipy.stats import binom
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import Population, ScatterPrior, estimate_variance, excess_error
 from sealscope.diagnosis.inference.observable import compare_estimates, compare_with_healthy
-from sealscope.diagnosis.inference.onset import Estimate
 
 from ..representatives import SLOW, few
 

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.estimate.change import Information, step_test
 from sealscope.diagnosis.inference.balance import flag_lowering, largest_before
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.feed import HoldCounts, flag_circulation
 from sealscope.diagnosis.inference.equations.signals import LoweringLimits, RestLimits, Signals
-from sealscope.diagnosis.inference.onset import Information, step_test
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.parameters import load_rig
 

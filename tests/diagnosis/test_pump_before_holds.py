@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import find_locked_holds
 from sealscope.diagnosis.inference.comparison.levels import held_pump_rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Recording

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.inference.onset import WITHIN_95, Information
+from sealscope.diagnosis.estimate.change import Information
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.inference.pressures.fit import Priors
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse
 from sealscope.diagnosis.inference.pressures.reduced_rig import (

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.estimate.change import Information
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE
 from sealscope.diagnosis.inference.leak_law import find_leak_step
-from sealscope.diagnosis.inference.onset import Estimate, Information
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, fit_rise
 from sealscope.recordings.recording import Array
 

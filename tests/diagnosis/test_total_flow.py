@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, TURNING
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, estimate_total_flow
 from sealscope.parameters import load_rig
 

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 import sealscope as ss
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.live.estimates import BlockEstimate, WatchBaseline, find_level_rise
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.errors import InputError

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.live.estimates import HealthyLevel, WatchBaseline, find_level_rise
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.recordings.recording import Recording

@@ -16,6 +16,7 @@ import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.observation import limit_threads
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.balance import (
     CLIPPED_DIFFERENCE,
@@ -27,7 +28,6 @@ from sealscope.diagnosis.inference.balance import (
 )
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LOCKED, START
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig

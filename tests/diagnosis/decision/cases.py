@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import Information, StepTest, step_test
+from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable
-from sealscope.diagnosis.inference.onset import Estimate, Information, Interval, StepTest, step_test
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
 
 #: Flow of the pump, and of a step of one [m^3/s]; L/min of 1 m^3/s.

@@ -13,9 +13,9 @@ import pytest
 from sealscope.diagnosis.decision.case import AGAINST, LEVEL, WITHIN, Case
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.verdict.evidence import Evidence
 
 from .cases import DRIVING, LITRES, measured_leak, observable, step

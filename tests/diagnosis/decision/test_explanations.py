@@ -19,9 +19,9 @@ from sealscope.diagnosis.decision.explanations import (
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.observable import LeakRise, Observable, Observed
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.states import state_of
 

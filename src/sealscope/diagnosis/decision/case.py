@@ -22,9 +22,9 @@ from sealscope.diagnosis.decision.explanations import (
     probability_of,
 )
 from sealscope.diagnosis.decision.null import HealthyNull, null_key
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observable, Observed
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.verdict.evidence import AGAINST, WITHIN
 from sealscope.diagnosis.verdict.states import joint_causes
@@ -274,7 +274,7 @@ def _leak_tests(case: Case, leak: LeakMeasure) -> tuple[LeakTest, ...]:
     WITHIN if the other test is AGAINST, or to LEVEL if the other test is WITHIN. The rest goes to the other test.
 
     The p-value (`chance`) of each test is compared with the test's part of the probability. The p-value of a step is
-    `StepTest.chance` (`inference/onset.py`). In the volume balance it was divided by the prior probability of the
+    `StepTest.chance` (`estimate/change.py`). In the volume balance it was divided by the prior probability of the
     leak's law (`find_leak_step` of `inference/leak_law.py`). It is calibrated (`null.py`) by the p-values that the same
     test gave in healthy recordings (`healthy_null` of `detectors/observation.py`). The p-value of a rise is
     `Rise.chance`, which rests on healthy recordings already; that of a level follows from the normal distribution.

@@ -34,8 +34,8 @@ from sealscope.diagnosis.decision.case import Case, LeakTest, step_key
 from sealscope.diagnosis.decision.explanations import probability_of
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.decision.reasons import leak_text, no_leak_text, text_of
+from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.inference.observable import LeakMeasure, Observed
-from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.verdict.evidence import (

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Recording
 
 if TYPE_CHECKING:

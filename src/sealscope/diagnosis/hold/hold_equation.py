@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import Mixture
 from sealscope.diagnosis.hold.readings import (
     N_PARTS,
@@ -43,7 +44,6 @@ from sealscope.diagnosis.hold.set_up import SetUp
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import relative_compression
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_hold_offsets, small_difference_factor
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.chambers import chambers_of

@@ -8,13 +8,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import Mixture, pool_mixtures
 from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
 from sealscope.diagnosis.hold.plan import predict_rate_error
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.paragraphs import join_names
 from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE

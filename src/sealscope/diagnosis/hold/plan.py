@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.hold.regression import Column, Noise, predict_deviation
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS
 from sealscope.diagnosis.estimate.linear import RIDGE, Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
 from sealscope.diagnosis.inference.delays import (
@@ -46,7 +47,6 @@ from sealscope.diagnosis.inference.equations.signals import (
     find_rests,
 )
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS
 from sealscope.diagnosis.inference.pressure_offset import (
     area_mismatch,
     fit_pressure_offset,

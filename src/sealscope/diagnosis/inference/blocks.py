@@ -25,9 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.compiled import kernel, large_law, law
+from sealscope.diagnosis.estimate.change import History, Information
 from sealscope.diagnosis.estimate.linear import MAX_PRIOR, RIDGE, Gaussian, solve, solve_in_place
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
-from sealscope.diagnosis.inference.onset import History, Information
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
     SUPPORT,

@@ -24,10 +24,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, StepTest, step_sizes, step_test
+from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Interval, StepTest, step_sizes, step_test
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

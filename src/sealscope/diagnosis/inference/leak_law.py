@@ -15,9 +15,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import Information, StepTest, step_test
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
-from sealscope.diagnosis.inference.onset import Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

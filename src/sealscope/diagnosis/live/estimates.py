@@ -10,9 +10,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
+from sealscope.diagnosis.estimate.interval import Interval as EstimatedInterval
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.onset import WITHIN_95, Estimate
-from sealscope.diagnosis.inference.onset import Interval as EstimatedInterval
 from sealscope.diagnosis.live.live_rise import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE

@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import LEAK_EVENTS, explain, probability_of
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.estimate.interval import Interval
 
 #: Names of the tests: for a step within the stream, and for a level above that of the healthy machine.
 STEP, LEVEL = "step", "level"

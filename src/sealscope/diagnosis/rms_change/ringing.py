@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import Information
 from sealscope.diagnosis.estimate.population import Population, ScatterPrior, number_sessions
 from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
-from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.rms_blocks import DUTY, RmsBlocks, column_names
 from sealscope.recordings.recording import Array

@@ -2,7 +2,7 @@
 
 The thesis compares the RMS of d1 to d4 and of d3*d4 before and after (its ch. 5 and Appendix C). It states a leak if
 the RMS has decreased (p_A) or increased (p_B). Here d2 to d4 of all chambers are tested for a step of either sign
-within the recording (`inference.onset`), or for a rise or fall against leak-free recordings (`inference.comparison`).
+within the recording (`estimate.change`), or for a rise or fall against leak-free recordings (`inference.comparison`).
 """
 
 from __future__ import annotations
@@ -12,9 +12,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import StepTest, step_tests
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing
-from sealscope.diagnosis.inference.onset import Interval, StepTest, step_tests
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
 from sealscope.diagnosis.rms_change.ringing import change_information, estimate_rises

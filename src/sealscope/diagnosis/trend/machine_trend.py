@@ -13,10 +13,10 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.estimate.interval import WITHIN_95, Interval
 from sealscope.diagnosis.hold.recorded_holds import SEPARATE_LEAKS
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.observable import Observed
-from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.trend.reading import (
     Basis,

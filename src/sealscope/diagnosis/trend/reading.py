@@ -15,13 +15,13 @@ import numpy as np
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
 from sealscope.diagnosis.hold.recorded_holds import held_leakage
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance

@@ -16,11 +16,11 @@ import numpy as np
 
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
+from sealscope.diagnosis.estimate.interval import WITHIN_95, Interval
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
-from sealscope.diagnosis.inference.onset import WITHIN_95, Interval
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.rms_change.rms_detector import DETAILS, compare_summaries, has_same_rate
 from sealscope.diagnosis.trend.reading import TrendPoint

@@ -36,8 +36,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray

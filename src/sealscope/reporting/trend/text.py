@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import Interval
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.trend.machine_trend import Trend
 from sealscope.diagnosis.trend.wear import Wear

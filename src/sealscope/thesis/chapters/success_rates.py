@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import UPPER_95, WITHIN_95
+from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95
 from sealscope.evaluation.binomial import clopper_pearson, holm, sign_test
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.engine.context import Context

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from sealscope.diagnosis.inference.onset import WITHIN_95
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.evaluation.roc import auc

@@ -24,6 +24,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.motion_fit import (
@@ -37,7 +38,6 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 )
 from sealscope.diagnosis.inference.equations.signals import find_rests
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording, compute_once

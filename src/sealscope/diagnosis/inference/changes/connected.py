@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.balance import flag_lowering, max_rest_rate
 from sealscope.diagnosis.inference.equations.signals import MIN_REST, Signals
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.recording import Array, Recording
 

@@ -19,10 +19,11 @@ from functools import lru_cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, motion_speed, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Estimate, Information, StepTest, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording

@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.charge_pressure import (
@@ -39,7 +40,6 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
 from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS

@@ -34,9 +34,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, Information, step_test
+from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, RANK_TOLERANCE, Estimate, Information, Interval, step_test
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording

@@ -24,11 +24,11 @@ from scipy.linalg import qr
 from scipy.linalg.lapack import dpotrf, dpotrs
 
 from sealscope.compiled import kernel
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.level_changes import find_motion_channel
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, MIN_REST
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once

@@ -12,6 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import Information, StepTest, fit_history, step_test
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
@@ -38,7 +40,6 @@ from sealscope.diagnosis.inference.equations.terms import (
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import Estimate, Information, StepTest, fit_history, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 

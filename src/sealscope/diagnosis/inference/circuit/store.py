@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.inference.balance import samples_without_holes
 from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.cycle import estimate_period, fundamental_frequency
 from sealscope.recordings.recording import Array, Recording

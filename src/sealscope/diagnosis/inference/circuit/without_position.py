@@ -24,13 +24,14 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, StepTest
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.inference.balance import MAX_BLOCK_TIME, READ, derive_drive_signals, samples_without_holes
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, oil_loss_tests
 from sealscope.diagnosis.inference.equations.balances import circulation, locked
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LEAK, LOCKED, ORIFICE, Equation
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS, WITHIN_95, StepTest
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.weak_form import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, NODES, Mixture
-from sealscope.diagnosis.inference.onset import Interval
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
 

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
-from sealscope.diagnosis.inference.onset import Information
+from sealscope.diagnosis.estimate.change import Information
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.recordings.recording import Array
 

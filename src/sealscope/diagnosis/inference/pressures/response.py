@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from sealscope.diagnosis.estimate.change import Information
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
-from sealscope.diagnosis.inference.onset import Information
 from sealscope.diagnosis.inference.pressures.fit import (
     Block,
     Joint,

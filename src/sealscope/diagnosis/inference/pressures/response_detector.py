@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import Information, step_tests
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.observable import Observable, Observed
-from sealscope.diagnosis.inference.onset import Information, step_tests
 from sealscope.diagnosis.inference.pressures.leak import HealthyResponse, ResponseLeak
 from sealscope.diagnosis.inference.pressures.response import measure_leak
 from sealscope.diagnosis.inference.pressures.samples import find_unmet_requirement

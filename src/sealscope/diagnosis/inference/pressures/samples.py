@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.diagnosis.inference.onset import MIN_BLOCKS
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.recordings.quality import is_mostly_clipped

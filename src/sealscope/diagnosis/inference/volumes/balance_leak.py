@@ -7,6 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import StepTest, bound_steps, fit_history
+from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
@@ -17,15 +19,6 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
-from sealscope.diagnosis.inference.onset import (
-    UPPER_95,
-    WITHIN_95,
-    Estimate,
-    Interval,
-    StepTest,
-    bound_steps,
-    fit_history,
-)
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE

@@ -16,10 +16,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.changes.motion_fit import fit_robustly
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import LockedHold
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import average_over

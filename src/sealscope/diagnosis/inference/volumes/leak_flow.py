@@ -18,6 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.change import Information, StepTest, bound_steps, step_shapes, step_sizes
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.leak_law import (
@@ -26,14 +28,6 @@ from sealscope.diagnosis.inference.leak_law import (
     growth_priors,
     law_flows,
     mixture_flow,
-)
-from sealscope.diagnosis.inference.onset import (
-    Estimate,
-    Information,
-    StepTest,
-    bound_steps,
-    step_shapes,
-    step_sizes,
 )
 from sealscope.diagnosis.inference.regimes import normal_log_density
 from sealscope.diagnosis.priors.inference import INFERENCE

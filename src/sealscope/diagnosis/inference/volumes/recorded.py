@@ -9,6 +9,15 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.change import (
+    MIN_BLOCKS,
+    History,
+    Information,
+    StepTest,
+    fit_history,
+    step_test,
+)
+from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.balance import (
     RegimeBlocks,
@@ -50,17 +59,6 @@ from sealscope.diagnosis.inference.equations.signals import (
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, LOCKED, Equation
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.onset import (
-    MIN_BLOCKS,
-    WITHIN_95,
-    Estimate,
-    History,
-    Information,
-    Interval,
-    StepTest,
-    fit_history,
-    step_test,
-)
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage

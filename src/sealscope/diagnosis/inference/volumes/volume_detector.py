@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.balance import (
@@ -29,7 +30,6 @@ from sealscope.diagnosis.inference.equations.balances import circulation, equati
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
 from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance

@@ -32,11 +32,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sealscope.compiled import large_law, law, record_dtype
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.equations.expressions import build_increments, channels_of
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE
-from sealscope.diagnosis.inference.onset import WITHIN_95
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
     SUPPORT,

@@ -36,6 +36,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.inference.blocks import offset_cost
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import (
     CylinderSides,
@@ -72,7 +73,6 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     small_difference_factor,
 )
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
-from sealscope.diagnosis.inference.onset import Estimate, Interval
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over

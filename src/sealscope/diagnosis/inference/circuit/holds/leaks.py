@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.leak_law import mixture_flow
-from sealscope.diagnosis.inference.onset import Estimate
 from sealscope.recordings.recording import Array
 
 #: Standard deviation of a leak without information.

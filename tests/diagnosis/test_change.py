@@ -9,15 +9,15 @@ import pytest
 from scipy.optimize import minimize_scalar
 from scipy.stats import binom, truncnorm
 
-from sealscope.diagnosis.inference.onset import (
+from sealscope.diagnosis.estimate.change import (
     MIN_BLOCKS,
-    Estimate,
     Information,
     NullLaw,
     StepTest,
     fit_history,
     step_test,
 )
+from sealscope.diagnosis.estimate.interval import Estimate
 
 from ..representatives import few
 
