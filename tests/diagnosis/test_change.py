@@ -14,10 +14,14 @@ from sealscope.diagnosis.estimate.change import (
     Information,
     NullLaw,
     StepTest,
+    filter_changes,
     fit_history,
     step_test,
+    whitened_step_test,
 )
 from sealscope.diagnosis.estimate.interval import Estimate
+from sealscope.diagnosis.live.kernel import step as stream
+from sealscope.diagnosis.live.sequential import StepDetector
 
 from ..representatives import few
 
@@ -353,3 +357,90 @@ def test_a_prior_on_the_level_does_not_make_the_blocks_uninformed() -> None:
     tests = [judged(made._replace(level=level)) for level in (1e2, 1e-4, 1e-8)]
     assert len({test.law.dimensions for test in tests}) == 1
     assert max(test.chance for test in tests) < 1e-3
+
+
+def kalman_sums(values: np.ndarray, variances: np.ndarray, walk: float, begin: int) -> tuple[float, float, np.ndarray]:
+    """Energy and moment of a step that begins with the block `begin`, and the squares of all innovations, by the Kalman
+    filter of a random walk, whose level is the first value."""
+    level, level_variance, response, energy, moment, squares = values[0], variances[0], 0.0, 0.0, 0.0, []
+    for k in range(1, len(values)):
+        predicted = level_variance + walk
+        innovation, variance = values[k] - level, predicted + variances[k]
+        shown = (k >= begin) - response  # of a unit step, by the prediction error
+        energy += shown**2 / variance
+        moment += shown * innovation / variance
+        squares.append(innovation**2 / variance)
+        gain = predicted / variance
+        response += gain * shown
+        level, level_variance = level + gain * innovation, (1.0 - gain) * predicted
+    return energy, moment, np.array(squares)
+
+
+def drawn_stream(seed: int, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Values of blocks with a walk and a step, and the variances of their errors."""
+    random = np.random.default_rng([7, seed])
+    variances = np.exp(0.4 * random.standard_normal(count))
+    walk = np.cumsum(random.choice([0.0, 0.3, 1.5]) * random.standard_normal(count))
+    change = 3.0 * (np.arange(count) >= random.integers(3, count - 3))
+    return walk + change + np.sqrt(variances) * random.standard_normal(count), variances
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_file_smooths_the_model_that_a_stream_and_a_folder_filter(seed: int) -> None:
+    """Size and error of a step at each onset are the same by the smoother of a file, by a Kalman filter, and by the
+    innovations of the covariance of all values, as for the recordings of a folder."""
+    count = 12 + seed
+    values, variances = drawn_stream(seed, count)
+    information = Information(np.arange(count) + 0.5, np.diag(1.0 / variances), values / variances, slope=0.0)
+    smoothed = step_test(information)
+    assert smoothed is not None
+    walk, index = smoothed.walk[0], np.arange(count)
+    wide = 1e6
+    factor = np.linalg.cholesky(wide + walk * np.minimum.outer(index, index) + np.diag(variances))
+    steps = (index[:, None] >= index).astype(float)
+    z, effects = np.linalg.solve(factor, values[:, None]), np.linalg.solve(factor, steps)
+    filtered = filter_changes(z, effects, z)
+    for begin in range(2, count - 1):
+        energy, moment, squares = kalman_sums(values, variances, walk, begin)
+        place = int(np.argmin(np.abs(smoothed.positions - begin)))
+        error = np.sqrt((squares.sum() - moment**2 / energy) / len(squares) / energy)
+        assert smoothed.size[place] == pytest.approx(moment / energy, rel=1e-6, abs=1e-9)
+        assert smoothed.deviation[place] == pytest.approx(error, rel=1e-6)
+        for last in (begin, count - 1):  # also while the stream is running
+            energy, moment, _ = kalman_sums(values[: last + 1], variances[: last + 1], walk, begin)
+            assert filtered.energy[last, begin] == pytest.approx(energy, rel=1e-4)
+            assert filtered.moment[last, begin] == pytest.approx(moment, rel=1e-4, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_record_of_a_stream_holds_the_sums_of_the_kalman_filter(seed: int) -> None:
+    """For each walk, and each onset at the beginning of a block, while all blocks are kept."""
+    count = 12 + seed
+    values, variances = drawn_stream(seed, count)
+    variances /= variances[0]
+    detector = StepDetector()
+    for k, (value, variance) in enumerate(zip(values, variances, strict=True)):
+        detector.take(float(k), k + 1.0, value, float(np.sqrt(variance)))
+    record = detector._memory.view(np.recarray)[0]
+    assert record.n_old == 0
+    for place in range(int(record.n_stored)):
+        begin = int(record.blocks[place, stream.BLOCK]) - 1
+        for q, walk in enumerate(stream.WALKS):
+            energy, moment, _ = kalman_sums(values, variances, walk, begin)
+            assert stream._step_sums(record, q, place, 1.0) == pytest.approx((moment, energy), rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_whitened_values_are_tested_as_blocks_are(seed: int) -> None:
+    """The likelihood of a step is that of its residual in the covariance of noise and walk; it has no other course."""
+    random = np.random.default_rng([11, seed])
+    count, n = 7, 12
+    effects, values = random.standard_normal((n, count)), random.standard_normal(n) + 1.5 * random.standard_normal()
+    values += 2.0 * effects[:, 3]
+    test = whitened_step_test(effects, values, np.array([0.1 * (seed + 1)]))
+    inverse = np.linalg.inv(np.eye(n) + 0.1 * (seed + 1) * n / np.trace(effects @ effects.T) * effects @ effects.T)
+    energies, moments = np.diag(effects.T @ inverse @ effects), effects.T @ inverse @ values
+    squares = values @ inverse @ values - np.maximum(moments, 0.0) ** 2 / energies
+    expected = 0.5 * np.linalg.slogdet(inverse)[1] - 0.5 * n * np.log(squares / n)
+    np.testing.assert_allclose(test.likelihood, expected, rtol=1e-9)
+    assert test.best == int(np.argmax(expected))

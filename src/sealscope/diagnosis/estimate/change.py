@@ -1,16 +1,33 @@
-"""Test for a step of a coefficient within a recording: likelihood ratio over all onsets, against a random walk.
+"""Test whether a quantity changes at an unknown time: one model, for a file, a folder of recordings and a stream.
 
-A step is a sudden, lasting change, as by a leak that begins within the recording. The likelihood of one coefficient g
-in K blocks of time is `Information`(Lambda, eta). In a healthy machine g has a level and a slope, F a, and a random
-walk w. With a leak it also has a step of size delta, whose shape s is 0 before the onset and 1 after it. z are the
-whitened estimates:
+In a healthy machine the quantity g has a level, perhaps a slope, F a, and a random walk w. With a leak it also has a
+change of size delta, whose shape s is 0 before its onset, and 1 after it (a step) or growing. A step within a block is
+a part of it there. Readings of g have the variance kappa V. Divided by their standard deviations, readings without
+drift become z, and the change's effects on them G. Each test is by energy = sum G^2, moment = sum G z and square =
+sum z^2, over all onsets: the likelihood ratio of a change to none is exp(moment delta - energy delta^2 / 2).
+
+- A *stream* and a *folder* filter: z are the prediction errors of each reading by the earlier ones (`filter_changes`;
+  in bounded memory the Kalman filter of `live.sequential`). A *file* smooths: all readings are whitened together
+  (`step_test`). After the last reading both have the same sums; a test checks it.
+- The size has a half-normal prior in folders, a normal one in streams (`ChangeSums.log_mean_ratio`); in a file it is
+  the most likely one, since the scale of its noise is fitted, too.
+
+The threshold has one of three meanings:
+
+- *fixed length*, a file: the probability that healthy blocks score as high (`NullLaw`, derived below);
+- *mean time*, a folder: the statistic R_n = sum_(j <= n) w_j LR_j(n), over changes j with the likelihood ratios LR_j
+  after n readings, and weights w_j whose sum is the time so far. Without a change R_n minus that time is a martingale,
+  so that R exceeds A after a mean time of at least A (`score_in_time`);
+- *any time*, a stream: an e-detector, which exceeds 1/alpha once in 1/alpha blocks at most (`live.sequential`).
+
+In a file the likelihood of a coefficient g in K blocks of time is `Information`(Lambda, eta), and the model
 
     g = F a + w + delta s(onset),    z = Lambda^(-1/2) eta ~ N(Lambda^(1/2) g, kappa I),    cov w = kappa q min(k, l),
 
 where kappa is the inflation of the noise by the correlation of the rows, and kappa q the variance of the walk in a
 block. F is projected out, and so is a further change of known shape, if a healthy machine may show one. (q, kappa) are
 estimated with the step and without it; one eigenproblem serves all onsets and all q. The score is twice the logarithm
-of the likelihood ratio, for steps > 0. If the onset lies within a block, that block shows a fraction of the step.
+of the likelihood ratio, for steps > 0.
 
 The probability of the score in a healthy machine follows from geometry. For a known q the whitened z is uniform on a
 sphere in n = K - 2 dimensions, and steps over all onsets form a curve of length L on it. The angle between z and the
@@ -29,7 +46,9 @@ for each of 5 to 120 blocks, and for walks of 0 to 100 times the variance of the
 
 Sources: H. Hotelling, Amer. J. Math. 61 (1939) 440; M. Knowles and D. Siegmund, Int. Statist. Rev. 57 (1989) 205
 (tubes); R. B. Davies, Biometrika 74 (1987) 33 (a parameter present under the alternative only); R. L. Berger and
-D. D. Boos, J. Am. Statist. Assoc. 89 (1994) 1012 (supremum over a confidence set).
+D. D. Boos, J. Am. Statist. Assoc. 89 (1994) 1012 (supremum over a confidence set); M. Pollak, Annals of Statistics 13
+(1985) 206, doi 10.1214/aos/1176346587 (Shiryaev-Roberts and its mean time); J. Shin, A. Ramdas, A. Rinaldo, New England
+Journal of Statistics in Data Science 2 (2024) 229, doi 10.51387/23-NEJSDS51 (mixtures over sizes).
 """
 
 from __future__ import annotations
@@ -39,7 +58,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from statistics import NormalDist
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -185,6 +204,74 @@ class StepTest:
         return find_root(lambda score: self.law.chance(score) - chance, 0.0, max_score)
 
 
+class ChangeSums(NamedTuple):
+    """Sums over readings, by which a change of an unknown size delta is tested; arrays of one shape for many changes.
+
+    With readings z of independent errors of variance 1, which a change of size 1 alters by G, `energy` is the sum of
+    G^2 and `moment` that of G z. The likelihood ratio of the change to none is exp(moment delta - energy delta^2 / 2).
+    """
+
+    energy: Array
+    moment: Array
+
+    def select(self, index: Any) -> ChangeSums:
+        """Return the sums at an index of their arrays."""
+        return ChangeSums(self.energy[index], self.moment[index])
+
+    def size(self, scale: Array) -> tuple[Array, Array]:
+        """Compute mean and variance of the size, whose prior is normal about 0 with the standard deviation `scale`."""
+        variance = 1.0 / (self.energy + scale**-2)
+        return self.moment * variance, variance
+
+    def log_mean_ratio(self, scale: Array, *, signed: bool = False) -> Array:
+        """Compute the log of the mean likelihood ratio over sizes, whose prior is half-normal, or normal if `signed`.
+
+        With the `scale` k of the prior, and mean m and variance v by `size`, it is -log(1 + energy k^2)/2 + m^2/(2 v).
+        A half-normal prior adds log(2 Phi(m / sqrt(v))), with the normal distribution function Phi.
+        """
+        from scipy.special import log_ndtr
+
+        mean, variance = self.size(scale)
+        log_ratio = 0.5 * (self.moment * mean - np.log1p(self.energy * scale**2))
+        return np.asarray(log_ratio if signed else log_ratio + math.log(2.0) + log_ndtr(mean / np.sqrt(variance)))
+
+
+def filter_changes(values: Array, effects: Array, last_values: Array) -> ChangeSums:
+    """Compute the sums of m changes after each of n readings, from the earlier readings alone.
+
+    `values` (n, 1), `effects` (n, m): innovations of the readings, and of the changes, over their standard deviations,
+    as by the Cholesky factor L of their covariance: L^-1 y. `last_values` (n, 1): those of the readings while each is
+    the last one, if its value counts otherwise then.
+    """
+    moment = np.cumsum(effects * values, axis=0) - effects * (values - last_values)
+    return ChangeSums(np.cumsum(effects**2, axis=0), moment)
+
+
+class ChangeScores(NamedTuple):
+    """Result of a sequential test for a change after each of n readings."""
+
+    log_R: Array  # (n,): logarithm of the test statistic R, in the unit of the mean time to a false alarm
+    begin: NDArray[np.int64]  # (n,): index of the first reading after the most probable change
+
+    def find_alarm(self, time: float) -> int | None:
+        """Return the index of the first reading with R > `time`, the mean time to a false alarm; None if none has."""
+        alarms = np.flatnonzero(self.log_R > math.log(time))
+        return int(alarms[0]) if alarms.size else None
+
+
+def score_in_time(log_ratios: Array, log_weights: Array, begin: NDArray[np.int64]) -> ChangeScores:
+    """Compute Shiryaev's and Roberts's statistic of changes after each of n readings.
+
+    `log_ratios` (n, c): log likelihood ratio of each of c changes to none, by the readings so far; `log_weights`,
+    `begin` (c,): logarithm of each change's weight w, a time, and index of the first reading after it. See the module.
+    """
+    n = len(log_ratios)
+    if not begin.size:  # no change can begin: R = 0
+        return ChangeScores(np.full(n, -np.inf), np.zeros(n, dtype=np.int64))
+    log_terms = np.where(np.arange(n)[:, None] < begin, -np.inf, log_ratios + log_weights)
+    return ChangeScores(np.logaddexp.reduce(log_terms, axis=1), begin[np.argmax(log_terms, axis=1)])
+
+
 def bound_steps(weights: Array, size: Array, deviation: Array, probability: float) -> float:
     """Compute the upper bound of a step: the quantile of its size at `probability`, given that the size is > 0.
 
@@ -296,10 +383,35 @@ def step_tests(information: Information, signs: Sequence[float], shape: Array | 
         return []
     whitening, z, onsets = whitened
     steps = whitening.unit_steps if shape is None else _Steps(whitening, shape)
-    weighted = whitening.weight * z
-    total = np.maximum(weighted @ z, np.finfo(float).tiny)
-    moments = weighted @ steps.whole
-    return [_test_step(whitening, onsets, steps, moments, total, sign) for sign in signs]
+    return [_test_step(whitening, onsets, steps, z, sign) for sign in signs]
+
+
+def whitened_step_test(effects: Array, values: Array, walks: Array = WALKS) -> StepTest:
+    """Test whitened values (n,) for a step up of a quantity, by the `effects` (n, K) of a unit step from each block on.
+
+    The values have independent noise of one variance, and a random walk of the quantity changes them as steps in all
+    blocks do: with S the `effects`, their covariance is kappa (I + q S S'). `walks`: variances q that are tried, in
+    units of the one for which walk and noise have the same mean variance; the result states them in this unit, too, and
+    its onsets are counted in blocks.
+    """
+    eigen, vectors = np.linalg.eigh(effects.T @ effects)
+    is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), TINY)
+    eigen, vectors = eigen[is_informative], vectors[:, is_informative]
+    roots = np.sqrt(eigen)
+    z = (effects.T @ values) @ vectors / roots
+    rest = max(float(values @ values - z @ z), 0.0)  # squares of what no step changes
+    blocks = np.arange(effects.shape[1])
+    whitening = _Whitening(
+        increments=roots[:, None] * vectors.T,
+        eigen=len(values) / max(float(eigen.sum()), TINY) * eigen,
+        unit=1.0,
+        positions=blocks.astype(float),
+        block=blocks,
+        after=np.zeros(len(blocks)),
+        walks=walks,
+        walk_log_priors=np.zeros(len(walks)),
+    )
+    return _test_step(whitening, whitening.positions, whitening.unit_steps, z, 1.0, rest, len(values))
 
 
 def step_sizes(
@@ -357,27 +469,26 @@ class _Whitening:
     R = V diag(eigen) V', z = eigen^(-1/2) V' L' eta, and a unit increment in block k changes z by eigen^(1/2) V'[:, k].
 
     - `increments` (n, K): change of z by a unit increment in each block;
-    - `to_z` (n, K): matrix from the `vector` of `Information` to z;
     - `eigen` (n,): variances of z by a random walk, whose steps have the variance `unit`;
     - `unit`: variance of the walk's steps at which it adds on average as much to z as the noise;
     - `positions` (o,): possible onsets, counted in blocks; `block`, `after` (o,): index of the block in which each
       lies, and fraction of the block before it;
-    - `walk_log_priors` (w,): log prior of each variance in `WALKS`.
+    - `walks`, `walk_log_priors` (w,): variances of the walk, in units of `unit`, and log prior of each.
     """
 
     increments: Array
-    to_z: Array
     eigen: Array
     unit: float
     positions: Array
     block: NDArray[np.int64]
     after: Array
+    walks: Array
     walk_log_priors: Array
 
     @cached_property
     def weight(self) -> Array:
         """Variance of the noise over that of each whitened value, for each walk, (w, n)."""
-        return np.asarray(1.0 / (1.0 + WALKS[:, None] * self.eigen))
+        return np.asarray(1.0 / (1.0 + self.walks[:, None] * self.eigen))
 
     @cached_property
     def log_factor(self) -> Array:
@@ -462,22 +573,23 @@ def _whiten_blocks(information: Information) -> tuple[_Whitening, Array, Array] 
         precision, shape = with_prior, None if shape is None else np.append(0.0, shape)
     if len(time) < MIN_BLOCKS:
         return None
-    whitening = _find_whitening(
+    matrices = _find_whitening(
         precision.tobytes(), len(time), n_prior, slope, walk, None if shape is None else shape.tobytes(), disturbance
     )
-    if whitening is None:
+    if matrices is None:
         return None
+    whitening, to_z = matrices
     # edges of the blocks: half way between their middles, extrapolated at both ends
     first_edge, last_edge = 1.5 * time[0] - 0.5 * time[1], 1.5 * time[-1] - 0.5 * time[-2]
     edges = np.concatenate([[first_edge], 0.5 * (time[1:] + time[:-1]), [last_edge]])
     onsets = np.interp(whitening.positions, np.arange(len(edges)), edges)
-    return whitening, whitening.to_z @ vector, onsets
+    return whitening, to_z @ vector, onsets
 
 
 @lru_cache(maxsize=64)
 def _find_whitening(
     precision: bytes, count: int, n_prior: int, slope: float, walk: float, shape: bytes | None, disturbance: float
-) -> _Whitening | None:
+) -> tuple[_Whitening, Array] | None:
     """Build the matrices of `_build_whitening`, once for the tests of all laws, growths and shapes of a coefficient.
 
     `precision`, `shape`: bytes of the arrays of doubles, `precision` with `count` rows.
@@ -489,14 +601,14 @@ def _find_whitening(
 
 def _build_whitening(
     precision: Array, n_prior: int, slope: float, walk: float, shape: Array | None, disturbance: float
-) -> _Whitening | None:
+) -> tuple[_Whitening, Array] | None:
     """Build the matrices that turn the estimates of a coefficient in K blocks into independent values.
 
     The values do not depend on level and slope of the coefficient, nor on a multiple of `shape` (K,), if it is given.
     `precision` (K, K): inverse covariance of the estimates, of which the first `n_prior` are a prior's; `slope`,
     `walk`, `disturbance`: scales of the priors on the slope, on the random walk over all blocks, and on the multiple
-    (`Information`). A block counts by its information beside that of other blocks, not beside a prior's. Return None if
-    too few blocks have information.
+    (`Information`). A block counts by its information beside that of other blocks, not beside a prior's. Returns them,
+    and the matrix (n, K) from the `vector` of `Information` to z; None if too few blocks have information.
     """
     count = len(precision)
     if not np.isfinite(precision).all():
@@ -526,17 +638,18 @@ def _build_whitening(
     energies = (increments**2).sum(axis=0)
     energies = energies[block] + (positions - block) * energies[block + 1]
     positions, block = (values[energies > RANK_TOLERANCE * energies.max()] for values in (positions, block))
-    return _Whitening(
+    whitening = _Whitening(
         increments=increments,
-        to_z=to_z,
         eigen=unit * eigen,
         unit=unit,
         positions=positions,
         block=block,
         after=positions - block,
+        walks=WALKS,
         # half-Cauchy prior on the standard deviation of the walk over all blocks, whose scale is `walk`
         walk_log_priors=-np.log1p(WALKS * unit * count / walk**2),
     )
+    return whitening, to_z
 
 
 @kernel
@@ -580,7 +693,7 @@ def _project_out(precision: Array, changes: Array, priors: Array, floor: float, 
 def _transform_blocks(
     eigen: Array, vectors: Array, changes: Array, gains: Array, increments: Array, to_z: Array
 ) -> None:
-    """Write `increments` and `to_z` (n, K) of `_Whitening`.
+    """Write `increments` (n, K) of `_Whitening`, and `to_z` (n, K) of `_build_whitening`.
 
     `eigen` (n,): largest eigenvalues of the increments' precision; `vectors` (K, K): its eigenvectors as columns, those
     of `eigen` last; `changes`, `gains` (m, K): as in `_project_out`.
@@ -602,23 +715,26 @@ def _transform_blocks(
 
 
 def _test_step(
-    whitening: _Whitening, onsets: Array, steps: _Steps, moments: Array, total: Array, sign: float
+    whitening: _Whitening, onsets: Array, steps: _Steps, z: Array, sign: float, rest: float = 0.0, count: int = 0
 ) -> StepTest:
-    """Test whitened values of a coefficient for a step at any of o `onsets` [s], by the likelihood ratio to no step.
+    """Test whitened values z (n,) of a coefficient for a step at any of o `onsets` [s], by the likelihood ratio.
 
-    `moments` (w, K + 1): weighted sums of products of the `steps.whole` with the values, for each walk; `total` (w,):
-    those of the values' squares; `sign`: 1 for a step up, -1 for a step down.
+    `sign`: 1 for a step up, -1 for a step down; `rest`: sum of squares of further values, whose noise has the same
+    variance; `count`: number of all values, 0 if there are no others.
     """
-    n, unit = whitening.weight.shape[1], whitening.unit
+    n, unit = count or len(z), whitening.unit
+    weighted = whitening.weight * z
+    total = np.maximum(weighted @ z + rest, TINY)  # weighted sum of the values' squares, for each walk
     courses, numbers = np.empty((3, len(onsets))), np.empty(9)
     _score_step(
         whitening.log_factor,
+        whitening.walks,
         whitening.walk_log_priors,
         whitening.block,
         whitening.after,
         steps.inverse_energies,
         steps.lengths,
-        moments,
+        weighted @ steps.whole,
         total,
         sign,
         n,
@@ -645,6 +761,7 @@ def _test_step(
 @kernel
 def _score_step(
     log_factor: Array,
+    walks: Array,
     walk_log_priors: Array,
     block: NDArray[np.int64],
     after: Array,
@@ -659,11 +776,12 @@ def _score_step(
 ) -> None:
     """Maximise the likelihoods of a step and of no step over the variances of walk and noise, for `_test_step`.
 
-    A step down is a step up of the values with the opposite sign. Writes to `courses` (3, o) the log likelihood of a
-    step at each onset, and its size, up or down, with its error for the likeliest walk without a step; to `numbers`
-    (9,) score, index of the best onset, size and error of the step there, variances of the noise and of the walk
-    (`WALKS`), each without a step and with the best one, and the largest length of the curve of the steps over the
-    walks that the data allow.
+    A step down is a step up of the values with the opposite sign. `moments` (w, K + 1): weighted products of the
+    `_Steps.whole` with the values, for each walk; `total` (w,): those of the values with themselves. Writes to
+    `courses` (3, o) the log likelihood of a step at each onset, and its size, up or down, with its error for the
+    likeliest walk without a step; to `numbers` (9,) score, index of the best onset, size and error of the step there,
+    variances of the noise and of the walk (one of `walks`), each without a step and with the best one, and the largest
+    length of the curve of the steps over the walks that the data allow.
     """
     n_walks, n_onsets = inverse_energies.shape
     half = 0.5 * n
@@ -720,4 +838,4 @@ def _score_step(
     numbers[0], numbers[1] = 2.0 * (likelihood[best] - without_likelihoods[without]), best
     numbers[2], numbers[3] = sign * moment * inverse, math.sqrt(noise * inverse)
     numbers[4], numbers[5] = total[without] / n, noise
-    numbers[6], numbers[7], numbers[8] = WALKS[without], WALKS[best_walk], length
+    numbers[6], numbers[7], numbers[8] = walks[without], walks[best_walk], length

@@ -32,7 +32,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, WALKS
+from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, WALKS, whitened_step_test
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_leak_and_bias, offset_cost, sum_blocks
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
@@ -112,7 +112,7 @@ def _find_relative_offset(
     """
     usual, far = INFERENCE.zero.pressure, INFERENCE.zero.far  # standard deviations of the prior [Pa]
     # no walk larger than the best one without an offset: otherwise an offset could explain changes that no leak causes
-    walks = WALKS[: int(_walk_likelihoods(leak_steps, residuals, WALKS).argmax()) + 1]
+    walks = WALKS[whitened_step_test(leak_steps, residuals).walk[1] >= WALKS]
 
     # the residual of the balance repeats from cycle to cycle, so not all residuals are independent
     independent_fraction = min(1.0, INFERENCE.size.readings / len(residuals))
@@ -120,7 +120,7 @@ def _find_relative_offset(
     def log_likelihood(position: float) -> float:
         """Compute the log likelihood at asinh(offset) = `position`, scaled to the number of independent residuals."""
         steps = leak_steps - np.sinh(position) * flow_offset_steps
-        return independent_fraction * float(_walk_likelihoods(steps, residuals, walks).max())
+        return independent_fraction * float(whitened_step_test(steps, residuals, walks).likelihood.max())
 
     def cost(position: float) -> float:
         """Compute minus the log posterior density at asinh(offset) = `position`, up to a constant."""
@@ -203,31 +203,3 @@ def _whiten_steps(blocks: Blocks, roles: ColumnRoles) -> tuple[Array, Array, Arr
     flow_offset = complement @ whitening[:, count:]
     leak = complement @ whitening[:, :count] + flow_offset * pressure
     return leak @ unit_steps, flow_offset @ unit_steps, residuals
-
-
-def _walk_likelihoods(steps: Array, residuals: Array, walks: Array) -> Array:
-    """Compute the log likelihood (w,) of whitened `residuals` (n,) for each of w variances q of the leak's random walk.
-
-    The model is that of `_find_relative_offset`. For each q the likelihood is maximised over the block k in which the
-    leak begins, its size and the variance kappa. Only sizes > 0 count, as a leak does not heal. `steps` (n, K): matrix
-    S; `walks` (w,): variances q relative to the one for which walk and noise have the same mean variance over the
-    residuals.
-    """
-    # I + q S S' is diagonal in the basis of S times the eigenvectors of S' S
-    eigen, basis = np.linalg.eigh(steps.T @ steps)
-    is_informative = eigen > RANK_TOLERANCE * max(float(eigen[-1]), np.finfo(float).tiny)
-    eigen, basis = eigen[is_informative], basis[:, is_informative]
-    n = len(residuals)
-    # now factors of S S', whose mean diagonal element is the sum of its eigenvalues over n
-    walks = walks * n / max(float(eigen.sum()), np.finfo(float).tiny)
-    variances = 1.0 + walks[:, None] * eigen  # variance of the residuals along each eigenvector, over kappa
-    directions = steps @ (basis / np.sqrt(eigen))  # orthonormal
-    in_span = directions.T @ residuals
-    off_span = residuals - directions @ in_span
-    total = float(off_span @ off_span) + (in_span**2 / variances).sum(axis=1)
-    # products (w, K) of each column of S with the residuals and with itself, weighted by the inverse covariance
-    moments = (np.sqrt(eigen) * in_span / variances) @ basis.T
-    energies = np.maximum((eigen / variances) @ (basis**2).T, np.finfo(float).tiny)
-    # maximum(moments, 0): steps up only; 1e-9: the difference may be 0 by rounding errors
-    residual_squares = np.maximum(total - (np.maximum(moments, 0.0) ** 2 / energies).max(axis=1), 1e-9 * total)
-    return np.asarray(-0.5 * np.log(variances).sum(axis=1) - 0.5 * n * np.log(residual_squares))

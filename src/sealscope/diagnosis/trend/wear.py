@@ -10,21 +10,12 @@ recording's own error with the stated standard deviation s_i. The change g is a 
 this variance is correlated over time, half of it for an hour and half for a week, so that the covariance of d is
 ``tau^2 ((1 - r) [i = k] + r/2 sum_T exp(-|t_i - t_k|/T))``. tau has a scaled inverse chi-square prior (`ScatterPrior`),
 r is uniform on a few values, and both are summed on a grid. mu has a wide prior; delta has half-normal priors of
-several scales in units of tau. With L L' = cov(y), the rows of z = L^-1 y up to n depend on the first n recordings
-alone, so that one factorisation serves all n. With G = L^-1 g, a = sum G^2 and b = sum G z, a change of size delta has
-the likelihood ratio exp(b delta - a delta^2/2).
+several scales in units of tau. The test is that of `estimate.change` by the mean time to a false alarm, which holds for
+machines whose tau the prior describes: a change after recording j - 1 has the weight w_j = min(t_j - t_(j-1), longest
+wait).
 
-The test is by Shiryaev and Roberts. With the likelihood ratio LR_j(n) of a change after recording j - 1 against none,
-
-    R_n = sum_(j <= n) w_j LR_j(n),   w_j = min(t_j - t_(j-1), longest wait),   alarm where R_n > A.
-
-Without a change R_n - sum_(j <= n) w_j is a martingale for any number of recordings. The mean time to a false alarm
-is therefore at least A: the threshold is that time itself. This holds for machines whose tau the prior describes.
-
-Sources: M. Pollak, Annals of Statistics 13 (1985) 206-227, doi 10.1214/aos/1176346587 (Shiryaev-Roberts and its mean
-time); J. Shin, A. Ramdas, A. Rinaldo, New England Journal of Statistics in Data Science 2 (2024) 229-260, doi
-10.51387/23-NEJSDS51 (mixtures and unknown parameters); Gelman et al., Bayesian Data Analysis, 3rd ed. (2013),
-sections 5.4 and 14.8 (grid of tau, regression with known covariance).
+Source: Gelman et al., Bayesian Data Analysis, 3rd ed. (2013), sections 5.4 and 14.8 (grid of tau, regression with known
+covariance).
 """
 
 from __future__ import annotations
@@ -36,6 +27,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sealscope.diagnosis.estimate.change import ChangeScores, ChangeSums, filter_changes, score_in_time
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.priors.trend import TREND
@@ -194,9 +186,7 @@ class _Node(NamedTuple):
 
     tau: float  # standard deviation between recordings
     log_null: Array  # (n,): logarithm of prior times likelihood without a change, after each recording
-    # (n, m): terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta
-    a: Array
-    b: Array
+    sums: ChangeSums  # (n, m): of each change, after each recording
     # mean level of the last group of comparable recordings without a change, and its variance
     mean: float
     variance: float
@@ -246,41 +236,14 @@ def _evaluate_grid(levels: Levels, profiles: Array, *, may_grow: bool = False) -
             z, u, G = np.split(solve_triangular(L, right_sides, lower=True, check_finite=False), [1, 2], axis=1)
             # while a recording is the last one, more of its level may be outlying, which changes only its own row of z
             z_as_last = z - ((outlying_as_last - outlying) / L.diagonal())[:, None]
-            # sum of z^2 up to each recording, with the last term of each sum from `z_as_last`; the same for b
+            # sum of z^2 up to each recording, with the last term of each sum from `z_as_last`
             square = np.cumsum(z**2) - (z**2 - z_as_last**2)[:, 0]
             log_null = log_prior - np.cumsum(np.log(L.diagonal())) - 0.5 * square
-            a, b = np.cumsum(G**2, axis=0), np.cumsum(G * z, axis=0) - G * (z - z_as_last)
             # mean level of the last group and its variance, given all levels, if nothing has changed
             level = float(levels.value[0] + u[:-1, 0] @ z[:-1, 0] + u[-1, 0] * z_as_last[-1, 0])
             variance = wide_variance - float(u[:, 0] @ u[:, 0])
-            nodes.append(_Node(float(tau), log_null, a, b, level, variance, G.T @ u[:, 0]))
+            nodes.append(_Node(float(tau), log_null, filter_changes(z, G, z_as_last), level, variance, G.T @ u[:, 0]))
     return nodes
-
-
-def _log_mean_ratio(a: Array, b: Array, scale: Array) -> Array:
-    """Compute the log of the mean likelihood ratio of a change whose size delta has a half-normal prior.
-
-    A change has the likelihood ratio exp(b delta - a delta^2/2). For a prior with the `scale` k, the mean over
-    delta > 0 is ``2 (1 + a k^2)^(-1/2) exp(b^2 v/2) Phi(b sqrt(v))`` with ``v = 1/(a + 1/k^2)`` and the normal
-    distribution function Phi.
-    """
-    from scipy.special import log_ndtr
-
-    v = 1.0 / (a + scale**-2)
-    log_factor = math.log(2.0) - 0.5 * np.log1p(a * scale**2) + log_ndtr(b * np.sqrt(v))
-    return np.asarray(log_factor + 0.5 * b * b * v, dtype=float)
-
-
-class ChangeScores(NamedTuple):
-    """Result of the sequential test for a change of the leakage level, after each of n recordings."""
-
-    log_R: Array  # (n,): logarithm of the test statistic R [days]
-    begin: IntArray  # (n,): index of the first recording after the most probable change
-
-    def find_alarm(self, days: float) -> int | None:
-        """Return the index of the first recording with R > `days`, the mean time to a false alarm [days]; else None."""
-        alarms = np.flatnonzero(self.log_R > math.log(days))
-        return int(alarms[0]) if alarms.size else None
 
 
 def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, may_grow: bool = False) -> ChangeScores:
@@ -294,17 +257,11 @@ def score_changes(levels: Levels, n_healthy: int = 1, *, falls: bool = False, ma
     n, changes = len(levels), _Changes.enumerate(levels, n_healthy, steps_only=falls)
     # logarithms of prior times likelihood with each change, and without one, summed over the grid of tau and r
     log_terms, log_null = np.full((n, changes.begin.size), -np.inf), np.full(n, -np.inf)
-    if not changes.begin.size:  # no change can begin: R = 0
-        return ChangeScores(log_null, np.zeros(n, dtype=np.int64))
-    for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow):
+    for node in _evaluate_grid(levels, changes.profiles, may_grow=may_grow) if changes.begin.size else []:
         log_null = np.logaddexp(log_null, node.log_null)
-        # terms of the likelihood ratio exp(b delta - a delta^2/2) of a change of size delta
-        a, b = node.a[:, changes.profile_index], node.b[:, changes.profile_index]
-        log_terms = np.logaddexp(log_terms, node.log_null[:, None] + _log_mean_ratio(a, b, changes.scale * node.tau))
-    # weighted likelihood ratio w_j LR_j(n) of each change; changes that begin after recording n do not count yet
-    log_terms += changes.log_weight - log_null[:, None]
-    log_terms[np.arange(n)[:, None] < changes.begin] = -np.inf
-    return ChangeScores(np.logaddexp.reduce(log_terms, axis=1), changes.begin[np.argmax(log_terms, axis=1)])
+        log_ratio = node.sums.select((slice(None), changes.profile_index)).log_mean_ratio(changes.scale * node.tau)
+        log_terms = np.logaddexp(log_terms, node.log_null[:, None] + log_ratio)
+    return score_in_time(log_terms - log_null[:, None], changes.log_weight, changes.begin)
 
 
 class _Draws(NamedTuple):
@@ -325,26 +282,25 @@ class _Draws(NamedTuple):
 
         random = np.random.default_rng(20)  # a fixed seed, so that results repeat
         nodes = _evaluate_grid(levels, changes.profiles)
-        # [-1]: given all recordings, up to the last one
-        a, b = (np.stack([getattr(node, name)[-1][changes.profile_index] for node in nodes]) for name in ("a", "b"))
+        # given all recordings, up to the last one
+        sums = ChangeSums(*np.stack([node.sums.select((-1, changes.profile_index)) for node in nodes], axis=1))
         scale = changes.scale * np.array([[node.tau] for node in nodes])
-        v = 1.0 / (a + scale**-2)  # variance of the size, before any truncation to > 0; its mean is b v
-        normal_log_ratio = 0.5 * (np.log(v) + b * b * v) - np.log(scale)  # log mean ratio for a normal prior
-        log_ratio = normal_log_ratio if signed else _log_mean_ratio(a, b, scale)
+        mean, variance = sums.size(scale)
+        log_ratio = sums.log_mean_ratio(scale, signed=signed)
         log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
         weight = np.exp(log_weight - log_weight.max())
         # draw a point of the grid and a change together
         flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel() / weight.sum())
         node_number, change = np.unravel_index(flat_index, weight.shape)
-        mean, sd = (b * v)[node_number, change], np.sqrt(v)[node_number, change]
+        mean, sd = mean[node_number, change], np.sqrt(variance[node_number, change])
         # by the inverse distribution function, of random probabilities; without `signed`, only numbers above 0
         p_negative = np.zeros(len(mean)) if signed else ndtr(-mean / sd)
         p = np.clip(p_negative + (1.0 - p_negative) * random.random(len(mean)), 1e-300, 1.0 - 1e-16)  # finite ndtri
         amplitude = np.asarray(mean + sd * ndtri(p))
-        tau, level, variance = np.array([(node.tau, node.mean, node.variance) for node in nodes])[node_number].T
+        tau, level, level_variance = np.array([(node.tau, node.mean, node.variance) for node in nodes])[node_number].T
         # a change lowers the mean before it, by `slope` per unit of its size
         slope = np.stack([node.mean_slope[changes.profile_index] for node in nodes])[node_number, change]
-        error = np.sqrt(np.maximum(variance, 0.0)) * random.standard_normal(_N_DRAWS)
+        error = np.sqrt(np.maximum(level_variance, 0.0)) * random.standard_normal(_N_DRAWS)
         return cls(tau, change, amplitude, level - slope * amplitude + error)
 
     def last_rises(self, changes: _Changes) -> Array:
