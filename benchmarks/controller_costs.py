@@ -39,7 +39,19 @@ PROCESSORS = {
     "m4f": ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16"),
 }
 PARTS = (
-    *("IDLE", "PRODUCTS", "REDUCE", "NORMAL", "REWEIGH", "BLOCK", "FIT_ADD", "FIT", "FIT_PRECISION", "FIT_APPEND"),
+    *(
+        "IDLE",
+        "PRODUCTS",
+        "REDUCE",
+        "NORMAL",
+        "REWEIGH",
+        "BLOCK",
+        "FIT_SIGN",
+        "FIT_ADD",
+        "FIT",
+        "FIT_PRECISION",
+        "FIT_APPEND",
+    ),
     *("TAKE", "WEIGH", "DECIDE", "BOUND", "FINISH"),
 )
 #: Functions of `DRIVER` that the emulator runs.

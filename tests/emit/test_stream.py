@@ -121,6 +121,33 @@ def test_a_watch_and_a_controller_state_the_same_bits(rig, flow, rate):
     assert n >= 30 and max(scores.values()) > 5.0
 
 
+@pytest.mark.parametrize("wired", [1.0, -1.0])
+def test_a_start_that_misleads_of_the_flows_sign_mixes_no_signs(wired):
+    """At first a load creeps against the pump, so that the wrong sign seems right; then motion shows it."""
+    random = np.random.default_rng(5)
+    recording = machine(4, duration=130.0, rate=16.0)
+    samples, n = samples_of(recording), 16 * 40
+    rest = np.repeat(samples[:1], n, axis=0)
+    creep = np.sin(0.3 * np.arange(n) / 16.0)
+    rest[:, 2] += 1e-3 * np.ptp(samples[:, 2]) * creep
+    rest[:, 3] += 1e-6 * random.standard_normal(n)
+    rest[:, 0] -= 1e5 * np.tanh(9.0 * np.gradient(creep) * 16.0)
+    samples = np.concatenate([rest, samples + rest[-1] - samples[0]])
+    samples[:, 2] *= wired
+    unit = unit_at(16.0)
+    stream = c_stream(unit)
+    blocks = dict(iter_blocks(stream, samples))
+    assert stream.state.angle_sign == wired
+    live = LiveBalance(RIG, unit.settings.channels)
+    channels = dict(zip(unit.settings.channels, samples.T, strict=True))
+    parts = live.take(SampleRun(np.arange(len(samples)) / 16.0, channels, 16.0, follows=False))
+    results = [block for part in parts if not isinstance(part, NotJudged) for block in part]
+    assert len(results) > 20
+    length = unit.settings.counts[0] * unit.settings.counts[1]
+    for block in results:
+        assert (block.total, block.sd) == tuple(blocks[round(block.begin * 16.0 / length)])
+
+
 @pytest.mark.slow
 def test_recordings_that_a_controller_would_misread_are_refused(tmp_path):
     """A load that is lowered past the resting pump, and a speed without a sign."""
@@ -128,8 +155,8 @@ def test_recordings_that_a_controller_would_misread_are_refused(tmp_path):
     damped, two_way = lowered_loads.flight(2), machine(1, duration=120.0, rate=100.0)
     speed = np.abs(np.gradient(two_way["theta"], 0.01))
     unsigned = Recording(two_way.t, {**two_way.channels, "omega": speed}, {**two_way.units, "omega": "rad/s"}, 100.0)
-    for machine_rig, recording in ((rig, damped), (RIG, unsigned)):
-        with pytest.raises(InputError, match="blocks that differ in number 1: its load is lowered"):
+    for machine_rig, recording, reason in ((rig, damped, "its load is lowered"), (RIG, unsigned, "omega has no sign")):
+        with pytest.raises(InputError, match=f"blocks that differ in number 1: .*{reason}"):
             ss.export_controller(
                 tmp_path, rig=machine_rig, rate=recording.rate, flow="omega", learn=[recording],
                 false_alarms_per_1000_h=1e-3,

@@ -45,7 +45,7 @@ def templates() -> jinja2.Environment:
 def most_parts() -> int:
     """Compute the most parts of the work at the end of a block."""
     weighting = (MAX_ITERATIONS + 1) * (2 * SUPPORT + 2)
-    using = SUPPORT + 4 * LEARNED + 2
+    using = SUPPORT + 4 * LEARNED + 3
     testing = math.ceil(MAX_ONSETS / WEIGHED_A_CALL) + math.ceil(MAX_ONSETS / ADDED_A_CALL) * (HALVINGS + 1)
     return weighting + using + testing + 3
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -12,8 +12,8 @@ import numpy as np
 
 from sealscope.calls import checked_call
 from sealscope.diagnosis.live.joining import SampleRun
-from sealscope.diagnosis.live.kernel.stream import StreamSettings
-from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
+from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
+from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, NotJudged
 from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
@@ -22,7 +22,6 @@ from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.recordings.channels import flow_source
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.atomic import atomic_write
 
@@ -31,6 +30,8 @@ Language = Literal["c", "st"]
 _PREFIX = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 #: Longest test vectors [s].
 _VECTOR_SECONDS = 90.0
+#: Channels that give a controller the pump's flow, the best first.
+_FLOWS = ("theta", "omega", "q_pump")
 
 
 class Export(NamedTuple):
@@ -121,7 +122,7 @@ def export_controller(
     if rate is None:
         rate = float(round(learn[0].rate, 3)) if learn else 100.0
     if flow is None:
-        flow = (flow_source(learn[0].channels) if learn else None) or "theta"
+        flow = (_flow_source(learn[0].channels) if learn else None) or "theta"
     unit = stream_program(StreamSettings.from_rig(machine, float(rate), flow, false_alarms_per_1000_h))
     words: dict[str, Any] = {
         "prefix": prefix,
@@ -157,14 +158,22 @@ def export_controller(
     return Export(files, unit.settings.rate, unit.state_bytes, parts_a_sample(unit.settings), blocks, error)
 
 
+def _flow_source(channels: Container[str]) -> str | None:
+    """Choose the best of the channels that give a controller the pump's flow; None if all are absent."""
+    return next((name for name in _FLOWS if name in channels), None)
+
+
 def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
     """Return the samples (n, 4) of a recording in the order of the program; raise InputError if one is missing."""
     settings = unit.settings
     lacking = [name for name in settings.channels if name not in recording]
     if lacking:
-        source = flow_source(recording.channels)
-        hint = f"; its flow is {source}: state it as the flow" if source and lacking == [settings.channels[2]] else ""
-        raise InputError(f"a recording to learn from must have {', '.join(lacking)}{hint}")
+        source, rule = _flow_source(recording.channels), f"must have {', '.join(lacking)}"
+        if source is None:
+            rule = f"must have the pump's angle, speed or flow ({', '.join(_FLOWS)})"
+        elif lacking == [settings.channels[2]]:
+            rule += f"; its flow is {source}: state it as the flow"
+        raise InputError(f"a recording to learn from {rule}, got {', '.join(recording.channels)}")
     if abs(recording.rate / settings.rate - 1.0) > 1e-3:
         raise InputError(f"a recording to learn from must have the rate {settings.rate:g} Hz, got {recording.rate:g}")
     return np.stack([recording[name] for name in settings.channels], axis=1)
@@ -173,18 +182,25 @@ def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
 def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]) -> tuple[CompiledStream, int]:
     """Run the program on healthy recordings; return it, and how many blocks it estimated.
 
-    Raises InputError if no block could be estimated, or a recording raises an alarm.
+    The recordings are fed twice, as at first the program knows nothing of the machine. Raises InputError if no block
+    could be estimated, or if the program, when it knows the machine, raises an alarm.
     """
     stream = CompiledStream(unit, render_c(unit, **words), str(words["prefix"]))
-    blocks = 0
-    for k, samples in enumerate(recordings):
-        if k:
-            stream.resume()
-        for _ in stream.feed(samples, parts_a_sample(unit.settings)):
-            pass
-        if stream.state.alarm:
-            raise InputError(f"a recording to learn from must be healthy, got an alarm in number {k + 1}")
-        blocks += int(stream.state.n_estimated)
+    blocks, threshold = 0, RESULTS.index("threshold")
+    for is_known in (False, True):
+        for k, samples in enumerate(recordings):
+            if k or is_known:
+                stream.resume()
+            for results in stream.feed(samples, parts_a_sample(unit.settings)):
+                if is_known and stream.state.alarm:
+                    limit, seconds = results[threshold], results[RESULTS.index("since")]
+                    raise InputError(
+                        f"a controller must raise no alarm on a healthy recording, got one in number {k + 1}: its "
+                        f"leakage rises {stream.state.n_ended * BLOCK_SECONDS - seconds:.0f} s after its beginning "
+                        f"with a score over {limit:.1f}"
+                    )
+            stream.acknowledge()
+            blocks += 0 if is_known else int(stream.state.n_estimated)
     if not blocks:
         raise InputError("recordings to learn from must have a minute of motion or more, got none that was estimated")
     return stream, blocks
@@ -193,8 +209,8 @@ def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str,
 def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], rig: Rig) -> None:
     """Raise InputError unless the live balance estimates the same conductances from each recording.
 
-    Both run the same kernels, but a controller knows no loads that are lowered past the resting pump, restores no sign
-    of a flow, and tells a reversed one by fewer symptoms.
+    Both run the same laws, but a controller knows no loads that are lowered past the resting pump, and restores no sign
+    of a flow.
     """
     settings = stream.unit.settings
     n_block = settings.counts[0] * settings.counts[1]
@@ -203,7 +219,8 @@ def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], ri
         stated = {int(number): estimate for number, estimate in iter_blocks(stream, samples)}
         channels = dict(zip(settings.channels, samples.T, strict=True))
         run = SampleRun(np.arange(len(samples)) / settings.rate, channels, settings.rate, follows=False)
-        parts = LiveBalance(rig, settings.channels).take(run)
+        balance = LiveBalance(rig, settings.channels)
+        parts = balance.take(run)
         results = [blocks for blocks in parts if not isinstance(blocks, NotJudged)]
         watched = {round(b.begin * settings.rate / n_block): (b.total, b.sd) for blocks in results for b in blocks}
         last = max(watched, default=-1)  # the live balance waits for what follows a block
@@ -216,11 +233,20 @@ def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], ri
             or not np.abs(np.subtract(stated[number], watched[number])).max() <= MOST_ERROR * watched[number][1]
         ]
         if differing:
+            got = f"{len(differing)} of {len(numbers)} blocks that differ in number {k}"
             raise InputError(
-                f"a recording to learn from must show a controller what it shows the monitor, got {len(differing)} of "
-                f"{len(numbers)} blocks that differ in number {k}: its load is lowered past the resting pump, or its "
-                "flow has no sign or the wrong one"
+                f"a controller must estimate from a recording what the monitor does, got {got}{_reason(balance)}"
             )
+
+
+def _reason(balance: LiveBalance) -> str:
+    """Format the reason why a controller estimates otherwise than a live balance; "" if none is known."""
+    if balance.is_unsigned:
+        name = _flow_source(balance.names)
+        return f": its {name} has no sign, which a controller cannot restore (below zero never, but x moves both ways)"
+    if balance.has_lowered:
+        return ": its load is lowered past the resting pump, which a controller does not tell from a leak"
+    return ""
 
 
 def _prove_single(

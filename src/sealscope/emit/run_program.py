@@ -76,6 +76,10 @@ class CompiledStream:
         saved = self.saved()
         self._call("restore", (ctypes.c_double * len(saved))(*saved))
 
+    def acknowledge(self) -> None:
+        """Withdraw an alarm."""
+        self._call("acknowledge")
+
     def saved(self) -> list[float]:
         """Return the numbers that outlast a power cut."""
         numbers = (ctypes.c_double * (self.unit.n_learned + 2))()

@@ -27,7 +27,16 @@ from sealscope.emit.specialise import specialise
 ENTRIES = ("start", "add_sample", "advance", "results", "acknowledge", "resume")
 #: Fields of the state that hold what was learned: they are saved before a power cut, and after learning.
 LEARNED_FIELDS = (
-    *("angle_sign", "usual_precision", "n_weighted", "slow_sums", "model_sums", "model_values", "model_leak_products"),
+    *(
+        "angle_sign",
+        "has_sign",
+        "usual_precision",
+        "n_weighted",
+        "slow_sums",
+        "model_sums",
+        "model_values",
+        "model_leak_products",
+    ),
     *("model_numbers", "steps_unit", "steps_count", "steps_level", "steps_level_variance", "steps_squares"),
     *("steps_log_variances", "steps_log_weights", "leak_size", "leak_deviation", "alarm"),
 )

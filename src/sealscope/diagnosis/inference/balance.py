@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS
-from sealscope.diagnosis.estimate.linear import RIDGE, Gaussian
+from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
 from sealscope.diagnosis.inference.delays import (
     DelayChange,
@@ -53,10 +53,10 @@ from sealscope.diagnosis.inference.pressure_offset import (
     remove_pressure_offset,
 )
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
+from sealscope.diagnosis.inference.rows import flow_sign
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.row_weights import SD_PER_MEDIAN, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
-    OVERLAP,
     SPAN,
     stride_samples,
     strides_in,
@@ -113,7 +113,8 @@ class BlockStream(SavedAttributes):
     - `n_first`: number of first blocks whose rows are weighted together; None for all blocks of the first `push`.
     - `start`: time of the first sample [s]; `offset`: sensor offset [Pa] that is subtracted from p_A - p_B.
     - `left_signs`: factor on the left side of each balance, -1 if the recorded flow has the wrong sign, else 1; empty
-      to estimate the factors from the first blocks or, of a stream, from all up to the first that surely move.
+      to estimate the factors. The left sides of a stream (`n_first` not None) stay as recorded: the factors are then
+      those of all blocks up to the first that surely move, after which `has_signs` is true.
     - `on_samples`: called with the start time [s] and the samples of each block.
     - `flow_channel`: channel of the pump's flow if the samples come as recorded: a flow without a sign gets one
       (`corrections.unsigned`), and is left out while the piston moves past the resting pump (`flag_lowering`).
@@ -123,8 +124,16 @@ class BlockStream(SavedAttributes):
     """
 
     SAVED = (
-        *("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "_rest_limits"),
-        *("_weighting", "_sign_evidence", "_feed_sums", "_flow_range", "n_meanings", "_lowering_limits"),
+        *("_begin", "_first", "_n_closed", "_absolute_offsets", "left_signs", "has_signs"),
+        *(
+            "_rest_limits",
+            "_weighting",
+            "_sign_evidence",
+            "_feed_sums",
+            "_flow_range",
+            "n_meanings",
+            "_lowering_limits",
+        ),
     )
     SAVED_TYPES: ClassVar = {
         "_absolute_offsets": dict[str, float],
@@ -164,9 +173,10 @@ class BlockStream(SavedAttributes):
         if self._drops_rests:  # rows within the length of a test function from motion count
             self._margin += SPAN * self._stride
         self._n_first, self.n_meanings = n_first, 0
+        self.has_lowered = False  # True once the piston has moved past the resting pump
         self.sign_log_odds: tuple[float, ...] = ()  # log odds that recorded signs are right, from the first blocks
         self.forget()
-        self.left_signs = left_signs  # sign of each balance's left side, known after the first motion
+        self.left_signs, self.has_signs = left_signs, bool(left_signs)
         self.restart(start)
 
     def forget(self) -> None:
@@ -175,7 +185,8 @@ class BlockStream(SavedAttributes):
         self._rest_limits: RestLimits | None = None  # known after the first motion
         self._lowering_limits: LoweringLimits | None = None  # of all blocks so far
         self._sign_evidence = SignEvidence(self._balances, self.columns)
-        self._feed_sums, self.left_signs = FeedSums(), ()
+        self._feed_sums = FeedSums()
+        self.left_signs, self.has_signs = tuple[float, ...](), False
         self._flow_range = (0.0, 0.0)  # lowest and highest value of the flow's channel
         self._weighting = Weighting(self.columns)
         self._absolute_offsets: dict[str, float] | None = None  # absolute minus gauge pressure [Pa] by channel
@@ -278,7 +289,7 @@ class BlockStream(SavedAttributes):
         if self.is_unsigned != was_unsigned:
             # what earlier blocks told of the sign is of no use
             self._feed_sums = self._feed_sums._replace(work=abs(self._feed_sums.work))
-            self._sign_evidence, self.left_signs = SignEvidence(self._balances, self.columns), ()
+            self._sign_evidence, self.has_signs = SignEvidence(self._balances, self.columns), False
         feed = self._feed_sums.find_feed(balance.area_ratio)
         if self._feeds_one_chamber:
             self._used_balances = (feed_one_chamber(balance, feed),)
@@ -319,7 +330,7 @@ class BlockStream(SavedAttributes):
         if self._absolute_offsets is None:
             self._absolute_offsets = {name: absolute_offset(group[name]) for name in ("p_A", "p_B") if name in group}
             self._learn_limits(group)
-        elif not self.left_signs:
+        elif not self.has_signs:
             self._learn_limits(group)
         piece = None
         if self._flow_channel:
@@ -339,16 +350,15 @@ class BlockStream(SavedAttributes):
         weights, is_counted, flow, pressures = (np.concatenate(parts) for parts in block_parts)
         root_weights = np.sqrt(weights[is_counted])[:, None]  # roots, since sums are over products of two entries
         rows = [np.concatenate(parts)[is_counted] * root_weights for parts in zip(*row_parts, strict=True)]
-        left_signs = self.left_signs
-        if not left_signs:
+        if not self.has_signs:
             self._sign_evidence.add(rows)
             self.sign_log_odds = self._sign_evidence.log_odds
-            left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
+            self.left_signs = tuple(-1.0 if log_odds < 0.0 else 1.0 for log_odds in self.sign_log_odds)
             # a stream may begin at rest, which tells no sign
-            if self._n_first is None or self._sign_evidence.shows_motion:
-                self.left_signs = left_signs
-        for equation_rows, columns, sign in zip(rows, self.columns, left_signs, strict=True):
-            equation_rows[:, columns.left] *= sign
+            self.has_signs = self._n_first is None or self._sign_evidence.shows_motion
+        if self._n_first is None:
+            for equation_rows, columns, sign in zip(rows, self.columns, self.left_signs, strict=True):
+                equation_rows[:, columns.left] *= sign
         # index past the last counted row of each block
         block_ends = np.cumsum(is_counted.reshape(-1, self._strides_per_block).sum(axis=1))
         stride = self._stride / self._rate  # distance of two rows [s]
@@ -374,7 +384,9 @@ class BlockStream(SavedAttributes):
         selected = slice(begin - self._first, stop + self._margin - self._first)
         piece = self._restore_sign({name: values[selected] for name, values in samples.items()})
         if self._flow_channel:
-            piece = _without_lowering(piece, self._rate, self._balances[0], self._lowering_limits)
+            lowered = _without_lowering(piece, self._rate, self._balances[0], self._lowering_limits)
+            self.has_lowered |= any(lowered[name] is not values for name, values in piece.items())
+            piece = lowered
         return piece, begin
 
     def _compute_rows(
@@ -437,15 +449,8 @@ class BlockStream(SavedAttributes):
 class SignEvidence(SavedAttributes):
     """Evidence on the sign of the recorded flow of each volume balance, from sums over the rows of all blocks so far.
 
-    The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1). Three
-    symptoms of correct wiring are tested, and their log odds (`_sign_log_odds`) are added:
-
-    - Oil leaks from high to low pressure: the leak's coefficient is positive with either `flow_sign`.
-    - The force of the pressures on the piston correlates with the flow into A, since friction dissipates energy. The
-      mean force, weighted by abs(flow), is subtracted first, since a constant load also correlates with a motion in one
-      direction. The same test is made with p_A - p_B instead of the force, and the two log odds are averaged: a load
-      disturbs p_A - p_B less than the force, throttling on the rod side disturbs it more.
-    - The position x grows with the flow into A. A negative correlation does not count, since x may be reversed.
+    The flow is the left side of the balance, in a valve's chamber the volume -A dx (`Equation.flow_sign` -1). The
+    symptoms are those of `rows.flow_sign`; in a valve's chamber the position is no evidence.
     """
 
     SAVED = ("_grams", "_counts", "_motions", "_loads")
@@ -453,23 +458,23 @@ class SignEvidence(SavedAttributes):
     def __init__(self, balances: Sequence[Equation], columns: Sequence[ColumnRoles]) -> None:
         self._balances, self._columns = balances, columns
         # for each balance: Gram matrix and number of the rows; sums of the products of flow and motion, and of their
-        # squares, by the columns of `_motion_columns`; sums of `_load_sums` by p_A - p_B and the force
+        # squares, by the columns of `_motion_columns`; sums of `flow_sign.add_load` by p_A - p_B and the force
         self._grams = [np.zeros((roles.left + 1, roles.left + 1)) for roles in columns]
         self._counts = np.zeros(len(balances))
-        self._motions = [np.zeros((len(_motion_columns(roles)), 2)) for roles in columns]
-        self._loads = np.zeros((len(balances), 2, _N_LOAD_SUMS))
+        self._motions = [np.zeros((len(_motion_columns(roles)), flow_sign.N_MOTION_SUMS)) for roles in columns]
+        self._loads = np.zeros((len(balances), 2, flow_sign.N_LOAD_SUMS))
 
     def add(self, rows: Sequence[Array]) -> None:
         """Add the rows (r, m) of the regression of each balance."""
         for e, (balance, roles, values) in enumerate(zip(self._balances, self._columns, rows, strict=True)):
-            left = balance.flow_sign * values[:, roles.left]  # flow into A
             self._grams[e] += values.T @ values
             self._counts[e] += len(values)
-            for k, indices in enumerate(_motion_columns(roles)):
-                products = values[:, indices].sum(axis=1) * left
-                self._motions[e][k] += products.sum(), products @ products
-            for k, area_ratio in enumerate((1.0, balance.area_ratio)):
-                self._loads[e, k] += _load_sums(_load_pressure(values, roles, area_ratio), left)
+            motions = [values[:, indices].sum(axis=1) for indices in _motion_columns(roles)]
+            loads = [_load_pressure(values, roles, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
+            flow = balance.flow_sign * values[:, roles.left]  # into A
+            flow_sign.add_rows(
+                self._motions[e], self._loads[e], np.reshape(motions, (-1, len(flow))), np.array(loads), flow
+            )
 
     @property
     def log_odds(self) -> tuple[float, ...]:
@@ -478,61 +483,21 @@ class SignEvidence(SavedAttributes):
         for roles, gram, count, motions, loads in zip(
             self._columns, self._grams, self._counts, self._motions, self._loads, strict=True
         ):
-            log_odds = _sign_log_odds(_leak_z_score(gram, roles, int(count)), other_cause=INFERENCE.sense.leak)
-            work_z = [_work_z_score(sums) for sums in loads]
-            log_odds += float(np.mean([_sign_log_odds(z, other_cause=INFERENCE.sense.driving_load) for z in work_z]))
-            motion_z = _z_score(*motions[0]) if roles.piston else 0.0
-            if motion_z > 0.0:  # else either x or the flow may be reversed
-                log_odds += _sign_log_odds(motion_z, other_cause=INFERENCE.sense.sides)
-            odds_by_balance.append(log_odds)
+            motion_z = flow_sign.compute_z_score(*motions[0]) if roles.piston else 0.0
+            leak_z = _leak_z_score(gram, roles, int(count))
+            odds_by_balance.append(float(flow_sign.compute_log_odds(leak_z, loads, motion_z)))
         return tuple(odds_by_balance)
 
     @property
     def shows_motion(self) -> bool:
         """True if flow and motion correlate by `sense.motion_score` (`priors.toml`) standard errors, either way."""
-        z_scores = [abs(_z_score(*sums)) for motions in self._motions for sums in motions]
-        return not z_scores or max(z_scores) > INFERENCE.sense.motion_score
-
-
-#: Number of the sums of `_load_sums`.
-_N_LOAD_SUMS = 7
+        z_scores = [abs(flow_sign.compute_z_score(*sums)) for motions in self._motions for sums in motions]
+        return not z_scores or max(z_scores) > flow_sign.MOTION_SCORE
 
 
 def _motion_columns(roles: ColumnRoles) -> list[list[int]]:
     """List the groups of columns whose sums are the piston's motion or, in a valve's chamber, the flow of an edge."""
     return [list(roles.piston)] if roles.piston else [[k] for k in roles.motion]
-
-
-def _z_score(total: float, square: float) -> float:
-    """Compute the z score of a sum of products, each of the flow and another quantity in one row.
-
-    `total`, `square`: sums of the products, and of their squares.
-    """
-    standard_deviation = float(np.sqrt(max(square, 0.0) * OVERLAP))  # of overlapping rows
-    return float(total) / max(standard_deviation, float(np.finfo(float).tiny))
-
-
-def _load_sums(load: Array, left: Array) -> Array:
-    """Sum l, |l|, l^2, p l, p |l|, p l^2 and p^2 l^2 over rows with the loads p = `load` and the flows l = `left`."""
-    flow = np.abs(left)
-    return np.array(
-        [
-            *(left.sum(), flow.sum(), left @ left),
-            *(load @ left, load @ flow, load @ left**2, (load * left) @ (load * left)),
-        ]
-    )
-
-
-def _work_z_score(sums: Array) -> float:
-    """Compute the z score of the products (p - c) l of load and flow, with the mean load c weighted by the flow.
-
-    `sums` (7,): those of `_load_sums`.
-    """
-    flow, magnitude, square, work, magnitude_work, load_square, work_square = sums.tolist()
-    if not magnitude > 0.0:
-        return 0.0
-    mean = magnitude_work / magnitude
-    return _z_score(work - mean * flow, work_square - 2.0 * mean * load_square + mean**2 * square)
 
 
 def _raise_limits(limits: RestLimits, earlier: RestLimits | None) -> RestLimits:
@@ -557,31 +522,17 @@ def _load_pressure(rows: Array, columns: ColumnRoles, area_ratio: float) -> Arra
     return np.asarray(p_A + area_ratio * negative_p_B)
 
 
-def _sign_log_odds(z: float, other_cause: float) -> float:
-    """Compute the log odds that a flow has the correct sign, from the z score `z` of one symptom of correct wiring.
-
-    c = `other_cause` is the probability that something else causes the score; both signs are then equally probable.
-    With the standard normal distribution Phi, log odds = log((Phi(z) + c/2) / (Phi(-z) + c/2)).
-    """
-    from scipy.special import ndtr
-
-    return float(np.log((ndtr(z) + 0.5 * other_cause) / (ndtr(-z) + 0.5 * other_cause)))
-
-
 def _leak_z_score(gram: Array, roles: ColumnRoles, n_rows: int) -> float:
-    """Compute the z score of the leak's coefficient by least squares: positive for oil from high to low pressure.
-
-    `gram` (m, m): Gram matrix of the `n_rows` rows of the regression. The result is 0 if the rows do not determine the
-    coefficient.
-    """
+    """Compute the z score of the leak's coefficient (`flow_sign.leak_score`); `gram` (m, m): of the `n_rows` rows."""
     nuisance = [k for k in roles.nuisance if k != roles.leak]
     leak = Gaussian.from_gram(gram).marginal([roles.leak], nuisance)
-    energy, moment, left_square = float(leak.precision[0, 0]), float(leak.moment[0]), leak.square
-    freedom = n_rows - len(nuisance) - 1  # degrees of freedom of the residual
-    if not energy > RIDGE * float(gram[roles.leak, roles.leak]) or freedom <= 0:
-        return 0.0
-    variance = OVERLAP * max(left_square - moment * moment / energy, 0.0) / freedom
-    return moment / max(float(np.sqrt(variance * energy)), np.finfo(float).tiny)
+    energy, moment, whole_energy = (
+        float(leak.precision[0, 0]),
+        float(leak.moment[0]),
+        float(gram[roles.leak, roles.leak]),
+    )
+    freedom = float(n_rows - len(nuisance) - 1)
+    return float(flow_sign.compute_leak_score(energy, moment, leak.square, whole_energy, freedom))
 
 
 def max_rest_rate(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:

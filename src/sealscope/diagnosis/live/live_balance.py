@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -163,7 +164,8 @@ class LiveBalance(SavedAttributes):
 
     data = VOLUMES
     block_seconds = BLOCK_SECONDS
-    SAVED = ("_judged", "_waiting", "_n_meanings", "_rate", "_signals")
+    SAVED = ("_judged", "_waiting", "_n_meanings", "_rate", "_signals", "_signs")
+    SAVED_TYPES: ClassVar = {"_signs": tuple[float, ...]}
 
     def __init__(self, rig: Rig, names: Sequence[str]) -> None:
         self._balances = live_equations(rig, names, with_tested_terms=True)
@@ -187,6 +189,8 @@ class LiveBalance(SavedAttributes):
             self._column_orders.append(np.array([*nuisance, roles.leak, roles.left]))
             self._models.append(Coefficients(*map(np.zeros, coefficient_shapes(len(nuisance)))))
         self._judged = np.zeros(1, _JUDGED)
+        # factor on the left side of each balance (`BlockStream.left_signs`), as of the first fit
+        self._signs = (1.0,) * len(self._balances)
         self._stored: Blocks | None = None  # the last blocks, packed
         self._waiting = 0  # number of stored blocks that await the first fit of the coefficients
         self._circuit, self._n_meanings, self._is_unsigned = rig.circuit, 0, False
@@ -295,7 +299,12 @@ class LiveBalance(SavedAttributes):
         return self._estimate_first_blocks(first_blocks) or NotJudged.with_count(end, "at standstill")
 
     def _estimate_first_blocks(self, blocks: Blocks) -> list[BlockConductance]:
-        """Fit the balances to the first blocks together, then estimate the conductance in each that is not at rest."""
+        """Fit the balances to the first blocks together, then estimate the conductance in each that is not at rest.
+
+        The sign of the flow is that which all blocks so far show: it holds until the next first fit.
+        """
+        assert self._stream is not None
+        self._signs = self._stream.left_signs
         grams_of_blocks = [self._fitted_grams(block) for block in _split(blocks)]
         grams_of_balances = zip(*grams_of_blocks, strict=True)
         for model, column_order, grams in zip(self._models, self._column_orders, grams_of_balances, strict=True):
@@ -322,6 +331,16 @@ class LiveBalance(SavedAttributes):
         return relative_motion(_volume_square(block), float(block.rows[0]), self._models[0].numbers)
 
     @property
+    def is_unsigned(self) -> bool:
+        """True if the recorded flow has no sign, which was restored."""
+        return self._stream is not None and self._stream.is_unsigned
+
+    @property
+    def has_lowered(self) -> bool:
+        """True once a load has been lowered past the resting pump."""
+        return self._stream is not None and self._stream.has_lowered
+
+    @property
     def cause(self) -> Cause:
         """Cause of a leak, as precise as the conductance shows it."""
         shows_pump = self._circuit.pump_moves_piston and not self._has_own_leakage
@@ -333,12 +352,14 @@ class LiveBalance(SavedAttributes):
         return any(self._pump_columns) and not self._is_unsigned
 
     def _fitted_grams(self, block: Blocks) -> list[Array]:
-        """Return the products of each balance's columns in a block, after elimination of the pump's own leakage."""
-        if not self._has_own_leakage:
-            return list(block.gram[0])
+        """Compute the products of each balance's columns in a block, with the sign of the flow.
+
+        The pump's own leakage is eliminated, if it is free in each block.
+        """
         grams = []
-        for gram, columns in zip(block.gram[0], self._pump_columns, strict=True):
-            grams.append(Gaussian.from_gram(gram).drop(columns).gram)
+        for gram, columns, sign in zip(block.gram[0], self._pump_columns, self._signs, strict=True):
+            signed = _with_sign(gram, sign)
+            grams.append(Gaussian.from_gram(signed).drop(columns).gram if self._has_own_leakage else signed)
         return grams
 
     def _solve_block(self, block: Blocks, updates_model: bool = True) -> tuple[float, ...]:
@@ -420,6 +441,8 @@ class LiveBalance(SavedAttributes):
         blocks = stored[stored.start >= since - self._half_stride].unpack(self._n_columns)
         if len(blocks) < MIN_BLOCKS:
             return ()
+        grams = [_with_sign(blocks.gram[:, e], sign) for e, sign in enumerate(self._signs)]
+        blocks = replace(blocks, gram=np.stack(grams, axis=1))
         centred = remove_pressure_offset(blocks, self._roles)
         volumes = volume_observables(  # few blocks, so without an orifice; a loss of oil is not estimated
             centred, blocks, self._balances, self._roles, oil_loss={}, with_orifice=False
@@ -460,6 +483,15 @@ _MODEL, _BLOCK = ("sums", "values", "leak_products", "numbers"), tuple(Blocks.__
 def _split(blocks: Blocks) -> list[Blocks]:
     """Split several blocks of samples into a list of single blocks."""
     return [blocks[k : k + 1] for k in range(len(blocks))]
+
+
+def _with_sign(gram: Array, sign: float) -> Array:
+    """Multiply the left side, the last column of Gram matrices (..., m, m), by its `sign`, 1 or -1."""
+    if sign > 0.0:
+        return gram
+    factors = np.ones(gram.shape[-1])
+    factors[-1] = sign
+    return np.asarray(gram * factors * factors[:, None])
 
 
 def _volume_square(block: Blocks) -> float:

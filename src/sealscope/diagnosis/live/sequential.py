@@ -34,7 +34,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import Interval
-from sealscope.diagnosis.live.kernel.special import LOG_ZERO
+from sealscope.diagnosis.estimate.special import LOG_ZERO
 from sealscope.diagnosis.live.kernel.step import (
     ARRAYS,
     LAYOUT,

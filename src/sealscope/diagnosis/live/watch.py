@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 #: Name of the watch as a detector (`Evidence.detector`).
 WATCH = "watch"
 #: Version of the format of the saved state.
-STATE_VERSION = 27
+STATE_VERSION = 28
 _PRIORS, _EXPLANATION = LIVE.watch, LIVE.explanation
 #: Type of a stored block, with the fields of `BlockConductance`.
 _BLOCK = np.dtype([(name, float) for name in BlockConductance._fields])

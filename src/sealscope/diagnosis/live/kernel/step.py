@@ -21,7 +21,7 @@ import numpy as np
 
 from sealscope.compiled import kernel, large_law, law
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
-from sealscope.diagnosis.live.kernel.special import LOG_ZERO, add_logs, log_gamma, normal_probability
+from sealscope.diagnosis.estimate.special import LOG_ZERO, add_logs, log_gamma, normal_probability
 from sealscope.diagnosis.priors.live import LIVE
 
 _PRIORS = LIVE.step

@@ -37,11 +37,13 @@ from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.equations.expressions import build_increments, channels_of
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE
+from sealscope.diagnosis.inference.rows import flow_sign
 from sealscope.diagnosis.inference.rows.row_weights import (
     MAX_ITERATIONS,
     SUPPORT,
     Workspace,
     add_reduced,
+    eliminate,
     eliminate_fast,
     fit_blocks,
     median,
@@ -100,9 +102,9 @@ WEIGHED_A_CALL, ADDED_A_CALL, HALVINGS = 2, 12, 20
 _MOST_BLOCKS, _SHIFTED_BLOCKS = 1 << 19, 1 << 18
 #: Parts of the work at the end of a block: `phase` of the record.
 (
-    IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, TAKE, WEIGH, DECIDE,
-    BOUND, FINISH,
-) = range(15)  # fmt: skip
+    IDLE, PRODUCTS, REDUCE, NORMAL, REWEIGH, BLOCK, FIT_SIGN, FIT_ADD, FIT, FIT_PRECISION, FIT_APPEND, TAKE, WEIGH,
+    DECIDE, BOUND, FINISH,
+) = range(16)  # fmt: skip
 #: Columns of `history`, the results of the last blocks: conductance G estimated with the present coefficients [m^3/(s
 #: Pa)], a conductance g that can be compared between blocks, its variance, the systematic variance of G, the mean of
 #: abs(p_A - p_B) [Pa], and the block's number.
@@ -159,7 +161,7 @@ _WHOLE_NUMBERS = (
     ),
     # rows: of open blocks, and of those that are worked on; part of the work, the block or onset it is at, iterations
     *("n_rows", "n_closed_rows", "phase", "place", "iteration", "has_converged", "is_fitting", "halvings"),
-    *("alarm", "reason", "first_closed", "first_number"),
+    *("has_sign", "alarm", "reason", "first_closed", "first_number"),
 )
 
 
@@ -195,6 +197,8 @@ class StreamSettings(NamedTuple):
     # indices into `expressions`: first the `n_fast` terms fitted to each block, then the others, last the left side
     column_order: tuple[int, ...]
     n_fast: int
+    piston: tuple[int, ...]  # indices of the piston's motion in `expressions`
+    area_ratio: float  # area of the piston on side B over that on side A
     displacement: float  # of the pump [m^3/rad], 1 if a meter gives the flow
     size_error: float  # relative standard error of the leakage due to the machine's displacement and piston area
     log_threshold: float  # of the score
@@ -234,10 +238,18 @@ class StreamSettings(NamedTuple):
             bias=int(columns.bias or 0),
             column_order=(*fast, *columns.slow, columns.left),
             n_fast=len(fast),
+            piston=columns.piston,
+            area_ratio=balance.area_ratio,
             displacement=rig.pump.q_b / (2.0 * math.pi) if flow in ("theta", "omega") else 1.0,
             size_error=size_error(rig),
             log_threshold=-math.log(probability),
         )
+
+    @property
+    def increments(self) -> tuple[str, ...]:
+        """Expressions that a stream integrates: those of a row and, if the areas differ, the force over area A."""
+        force = f"(mean(p_A) - {self.area_ratio!r} * mean(p_B)) * dt"
+        return self.expressions if self.area_ratio == 1.0 else (*self.expressions, force)
 
     @property
     def row_width(self) -> int:
@@ -265,7 +277,7 @@ def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
     onsets are weighed, no rows are; and no row is weighted while a block's leakage is estimated.
     """
     _, block_strides, half = settings.counts
-    n_columns = len(settings.expressions)
+    n_columns, n_increments = len(settings.expressions), len(settings.increments)
     n_slow = len(settings.column_order) - settings.n_fast - 1  # - 1: the left side
     support_rows = SUPPORT * block_strides
     width = settings.row_width
@@ -303,8 +315,11 @@ def stream_layout(settings: StreamSettings) -> np.dtype[Any]:
     further = record_dtype(
         *_REAL_NUMBERS,
         ring=(len(settings.channels), 2 * half + 2),  # last samples, those that the increments need
-        increments=(n_columns,),  # of each term of the balance over the last sampling interval
-        unfinished=(SPAN, n_columns),  # the rows to which the present sample adds
+        increments=(n_increments,),  # of each term of the balance over the last sampling interval
+        unfinished=(SPAN, n_increments),  # the rows to which the present sample adds
+        # sums over rows, until the flow's sign is known (`flow_sign`); loads: p_A - p_B and, if it differs, the force
+        sign_motion=(flow_sign.N_MOTION_SUMS,),
+        sign_loads=(n_increments - n_columns + 1, flow_sign.N_LOAD_SUMS),
         ends=(SUPPORT,),  # index past the last row of each open block
         closed_ends=(SUPPORT,),  # the same of the blocks that are worked on
         # sum of abs(p_A - p_B), and number of samples; + 1: the last rows of a block end when the next has begun
@@ -382,8 +397,17 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     constant, combination, prediction, leak_scale, left_scale = basis or ((), (), (), 1.0, 1.0)
     unit = 1.0 if basis is None else basis.conductance_unit
     limits = {"MAX_READING": MAX_READING, "BEYOND": BEYOND}
-    increments = build_increments(settings.expressions, {name: k for k, name in enumerate(channels)}, limits)
+    n_increments, n_nuisances = len(settings.increments), n_columns - 2  # all columns but the leak and the left side
+    piston = settings.piston
+    increments = build_increments(settings.increments, {name: k for k, name in enumerate(channels)}, limits)
     compute_increments = large_law(increments)
+
+    @law
+    def forget_sign(m: Any) -> None:
+        """Forget the sign of the pump's recorded flow, and begin its evidence anew."""
+        m.has_sign = 0
+        m.sign_motion[:] = 0.0
+        m.sign_loads[:, :] = 0.0
 
     @law
     def start(m: Any) -> None:
@@ -396,6 +420,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         m.iteration = 0
         m.has_converged = m.is_fitting = m.halvings = m.alarm = m.first_closed = m.first_number = 0
         m.reason = _LEARNING
+        forget_sign(m)
         m.slow_sums[:, :] = 0.0
         m.model.sums[:, :] = 0.0
         m.model.values[:] = 0.0
@@ -439,6 +464,17 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
 
     store_row = copy_row if basis is None else transform_row
 
+    @large_law
+    def add_sign_evidence(m: Any, slot: int) -> None:
+        """Add the row that is finished in `slot` to the evidence on the sign of the pump's recorded flow."""
+        motion, flow = 0.0, m.unfinished[slot, response]
+        for j in piston:
+            motion += m.unfinished[slot, j]
+        flow_sign.add_motion(m.sign_motion, motion, flow)
+        flow_sign.add_load(m.sign_loads[0], m.unfinished[slot, leak], flow)
+        for j in range(n_columns, n_increments):
+            flow_sign.add_load(m.sign_loads[1], m.unfinished[slot, j], flow)
+
     @law
     def add_sample(m: Any, p_A: float, p_B: float, flow: float, x: float) -> None:
         """Add a sample to the state; after the last row of a block, begin the work at its end."""
@@ -470,6 +506,8 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
                 is_finite = is_finite and abs(m.rows[place, j]) < MAX_READING
             if is_finite:  # a row with a missing measurement is overwritten by the next
                 m.n_rows = place + 1
+                if m.has_sign == 0:
+                    add_sign_evidence(m, row % SPAN)
         if row % block_strides == block_strides - 1:
             end_block(m, (row // block_strides) % (SUPPORT + 1))
 
@@ -545,22 +583,29 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         m.place += 1
         m.phase = PRODUCTS if m.place < m.n_closed else NORMAL
 
-    @law
+    @large_law
     def find_flow_sign(m: Any) -> None:
-        """Find the sign of the pump's recorded flow: `m.angle_sign`, 1 or -1.
+        """Find the sign of the pump's recorded flow, `m.angle_sign`, 1 or -1, by the symptoms of `flow_sign`.
 
-        It is the sign of the covariance between p_A - p_B and the pump's flow in the blocks that wait for the first
-        fit: with the right sign, the flow rises with p_A - p_B. Blocks at standstill do not tell the sign.
+        The leak is that of the blocks that wait for the first fit. The sign is final once the piston has surely moved.
         """
-        # sums over the rows; the bias has the same value in each row
-        weight = leak_sum = response_sum = product = 0.0
+        block, n_rows = m.model.block, 0.0
+        for i in range(n_columns):
+            for j in range(i + 1):
+                total = 0.0
+                for k in range(LEARNED):
+                    total += m.waiting_grams[k, packed_index(i, j)]
+                block[i, j] = block[j, i] = total
         for k in range(LEARNED):
-            gram = m.waiting_grams[LEARNED - 1 - k]
-            weight += gram[packed_index(bias, bias)]
-            leak_sum += gram[packed_index(max(bias, leak), min(bias, leak))]
-            response_sum += gram[packed_index(volume, bias)]
-            product += gram[packed_index(volume, leak)]
-        m.angle_sign = -1.0 if product < leak_sum * response_sum / weight else 1.0
+            n_rows += m.waiting_sizes[k, _BLOCK_ROWS]
+        whole_energy = block[leak, leak]
+        eliminate(block, n_nuisances)
+        energy, moment, square = block[leak, leak], block[leak, response], block[response, response]
+        leak_z = flow_sign.leak_score(energy, moment, square, whole_energy, n_rows - n_nuisances - 1.0)
+        motion_z = flow_sign.z_score(m.sign_motion[0], m.sign_motion[1])
+        log_odds = flow_sign.sum_log_odds(leak_z, m.sign_loads[0], m.sign_loads[n_increments - n_columns], motion_z)
+        m.angle_sign = -1.0 if log_odds < 0.0 else 1.0
+        m.has_sign = 1 if abs(motion_z) > flow_sign.MOTION_SCORE else 0
 
     @law
     def correct_sign(m: Any) -> None:
@@ -656,6 +701,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         """Discard all that was learned, and count it."""
         forget_coefficients(m)
         step.start_detector(m.steps)
+        forget_sign(m)
         m.n_weighted = 0
         m.n_relearned += 1
         m.reason = _RELEARNING
@@ -698,12 +744,16 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
                 m.waiting_grams[LEARNED - 1 - k, packed_index(i, j)] = m.gram[i, j]
         m.n_waiting = k + 1
         if k + 1 == LEARNED:
-            find_flow_sign(m)
             m.is_fitting = 1
 
     @large_law
     def fit_part(m: Any) -> None:
         """Do a part of the first fit: of the balance to the first `LEARNED` blocks, and of the leakage in each."""
+        if m.phase == FIT_SIGN:
+            if m.has_sign == 0:
+                find_flow_sign(m)
+            m.phase = FIT_ADD
+            return
         k, model = int(m.n_waiting) - LEARNED, m.model  # `n_waiting` counts on from `LEARNED` in each part
         if m.phase == FIT:
             fit_coefficients(model)
@@ -784,7 +834,7 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
         elif m.phase == BLOCK:
             use_block(m)
             if m.is_fitting == 1:
-                m.n_waiting, m.phase = LEARNED, FIT_ADD
+                m.n_waiting, m.phase = LEARNED, FIT_SIGN
             else:
                 m.phase = TAKE
         elif m.phase <= FIT_APPEND:
