@@ -10,6 +10,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.commissioned.watched import load_watched
+from sealscope.diagnosis.hold.readings import read_channel
 from sealscope.diagnosis.hold.recorded_holds import is_hold_results, read_hold_results
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.errors import InputError, SealscopeError
@@ -94,6 +95,29 @@ def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
         low, high = result.leak_interval_lpm
         assert low <= true_lpm <= high
         assert result.causes == causes
+
+
+def test_the_load_is_on_the_side_of_the_greater_force():
+    (result,) = ss.hold_test(record_hold(0.5, p_B=lambda t: 9e6 + 0.0 * t), area=AREAS)
+    assert result.creep_mm_per_min == pytest.approx(0.5, rel=0.05)
+
+
+def test_a_side_at_vacuum_is_read_by_its_means():
+    for seed, low in enumerate((-1e5, -0.8e5, 0.0)):
+        random = np.random.default_rng(seed)
+        t = np.arange(0.0, 600.0, random.uniform(0.2, 6.0))
+        p = np.maximum(25e5 - 2e4 * t + random.uniform(1.0, 1e4) * random.standard_normal(t.size), low)
+        assert len(read_channel(t, p, 1e5).t) <= 140
+        (result,) = ss.hold_test(record_hold(1.0, rate=0.5, p_B=lambda s: np.interp(s, t, p)), area=AREAS)  # noqa: B023
+        assert result.leak_lpm > 0.0
+
+
+def test_cooling_of_a_tight_cylinder_fails_no_small_limit():
+    results = [
+        ss.hold_test(record_hold(0.0, cooling=cooling, seed=seed), area=AREAS, limit="0.001 mL/min")[0].result
+        for seed, cooling in enumerate(np.random.default_rng(8).uniform(1.0, 12.0, 8))
+    ]
+    assert "fail" not in results
 
 
 def test_the_other_side_tells_the_piston_where_it_shows_it():

@@ -100,6 +100,16 @@ class Mixture(NamedTuple):
         """Add an independent normal error to the quantity."""
         return self._replace(deviations=np.hypot(self.deviations, deviation))
 
+    def multiply(self, prior: Mixture) -> Mixture:
+        """Compute the posterior from this mixture, under a flat prior, and another `prior`."""
+        variances, totals = self.deviations[:, None] ** 2, np.hypot(self.deviations[:, None], prior.deviations)
+        differences = self.centres[:, None] - prior.centres
+        weights = self.weights[:, None] * prior.weights / totals * np.exp(-0.5 * (differences / totals) ** 2)
+        usual = weights > LEAST_WEIGHT * weights.max()
+        centres = self.centres[:, None] - differences * variances / totals**2
+        deviations = self.deviations[:, None] * prior.deviations / totals
+        return Mixture(weights[usual] / weights[usual].sum(), deviations[usual], centres[usual])
+
     def below(self, value: float) -> float:
         """Compute the probability of values below `value`."""
         from scipy.special import ndtr

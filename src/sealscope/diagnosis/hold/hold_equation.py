@@ -5,9 +5,10 @@ chamber, the oil's relative compression c(p) and its thermal expansion a,
 
     s(t) - (V/A) (c(p(t)) - c(p(0))) = (Q/A) I(t) - a (V/A) (T(t) - T(0)) + what settles + noise,
 
-where I(t) is the time, weighted by the leak's law |p_A - p_B|^e. `regression` estimates Q/A, with an interval. The
-creep is the mean speed of s; its bends, by compression, the leak's law and oil that cools unlogged, are fitted without
-the chords between their ends. A temperature that was logged or stated is a term of it.
+where I(t) is the time, weighted by the leak's law |p_A - p_B|^e. `regression` estimates Q/A, with an interval; its
+prior is a tight cylinder or a leak of unknown size (`leak_prior`). The creep is the mean speed of s; its bends, by
+compression, the leak's law and oil that cools unlogged, are fitted without the chords between their ends. A temperature
+that was logged or stated is a term of it.
 
 Source: Merritt, Hydraulic Control Systems, 1967, sections 2.2 and 6.3.
 """
@@ -37,6 +38,7 @@ from sealscope.diagnosis.hold.regression import (
     Column,
     RateFit,
     RateRegression,
+    leak_prior,
     pool_fits,
 )
 from sealscope.diagnosis.hold.result import HoldCurve
@@ -51,7 +53,7 @@ from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM
 
-#: Lowest absolute pressure [Pa] of oil with free air.
+#: Lowest absolute pressure [Pa] at which oil with free air is compressed; below, its vapour fills the chamber.
 LOWEST = 2e4
 #: Ratio of the highest to the lowest pressure difference of a hold, above which the law of the leak counts.
 STEADY_PRESSURE = 1.02
@@ -95,6 +97,11 @@ class LeakEstimate(NamedTuple):
     flow: Mixture | None
     curve: HoldCurve | None = None
     fit: RateFit | None = None
+
+
+def _compress_oil(p: Array) -> Array:
+    """Compute the relative compressions of oil and of its air (2, n) at absolute pressures `p` (n,) [Pa]."""
+    return relative_compression(np.maximum(p, LOWEST))
 
 
 def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
@@ -148,14 +155,14 @@ class HeldLoad:
 
     @cached_property
     def loaded(self) -> str:
-        """Side of the load: stated, of the higher pressure or, without pressures, ahead of the moving piston."""
+        """Side of the load: stated, of the greater force or, without pressures, ahead of the moving piston."""
         if self.set_up.loaded:
             return self.set_up.loaded
         pressures = (
             {} if self.recording is None else {name[-1]: self.recording[name] for name in chambers_of(self.recording)}
         )
-        if pressures:
-            return max(pressures, key=lambda side: float(np.median(pressures[side])))
+        if pressures:  # by force where the areas are known
+            return max(pressures, key=lambda side: float(np.median(pressures[side])) * (self.set_up.area(side) or 1.0))
         x = self._channel("x")
         return "B" if x is not None and self._slope_of(x) > 0.0 else "A"
 
@@ -185,9 +192,9 @@ class HeldLoad:
         return _MM * length, deviation
 
     def _pressure(self, side: str) -> Array | None:
-        """Return the absolute pressure of a side [Pa], (n,), at least `LOWEST`; None if it is absent."""
+        """Return the absolute pressure of a side [Pa], (n,); None if it is absent."""
         p = self._channel(f"p_{side}")
-        return None if p is None else np.maximum(p + P_ATM, LOWEST)
+        return None if p is None else p + P_ATM
 
     @property
     def mean_pressure(self) -> float | None:
@@ -334,7 +341,7 @@ class HeldLoad:
         if (p := self._pressure(self.loaded)) is not None:
             part_t, course = smooth_course(self.t, p)
             length, deviation = self.column
-            compression = length * relative_compression(np.maximum(course, LOWEST)).sum(axis=0)
+            compression = length * _compress_oil(course).sum(axis=0)
             values = sample_course(readings, part_t, compression)
             bend = self._bend(readings.t, values, float(compression[-1] - compression[0]))
             columns.append(Column(bend, 1.0, math.hypot(deviation, INFERENCE.held_oil.deviation)))
@@ -366,8 +373,8 @@ class HeldLoad:
         """
         readings = read_channel(self.t, p, HOLD.noise.pressure * BAR)
         middle = float(np.mean(p)) + np.array([-0.5, 0.5]) * BAR
-        slope = length * float(np.diff(relative_compression(middle).sum(axis=0))[0]) / BAR
-        compression = length * relative_compression(readings.values).sum(axis=0)
+        slope = length * float(np.diff(_compress_oil(middle).sum(axis=0))[0]) / BAR
+        compression = length * _compress_oil(readings.values).sum(axis=0)
         travel = readings._replace(values=compression, loose=slope * readings.loose, quantum=slope * readings.quantum)
         size = INFERENCE.held_oil.misfit * float(np.ptp(compression))
         course = sample_course(readings, *smooth_course(self.t, p))
@@ -410,9 +417,12 @@ class HeldLoad:
             leak = (
                 self._leak_by_travel() if self.travel is not None and not self._is_at_stop else self._leak_by_pressure()
             )
-            if leak.rate is None or area is None:
+            if leak.rate is None:
                 return leak
-            return leak._replace(flow=leak.rate.scale(MM_PER_MINUTE * area))
+            leak = leak._replace(rate=leak.rate.multiply(leak_prior()))
+            if area is None:
+                return leak
+            return leak._replace(flow=None if leak.rate is None else leak.rate.scale(MM_PER_MINUTE * area))
         return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow)
 
     @cached_property
@@ -451,7 +461,7 @@ class HeldLoad:
             oil = INFERENCE.held_oil
             widths = (oil.deviation, oil.air_deviation)
             part_t, course = smooth_course(self.t, p)
-            for compression, width in zip(relative_compression(np.maximum(course, LOWEST)), widths, strict=True):
+            for compression, width in zip(_compress_oil(course), widths, strict=True):
                 column = length * sample_course(readings, part_t, compression - compression[0])
                 base.append(Column(column, 1.0, math.hypot(deviation, width)))
                 if np.ptp(column) > LEAST_BEND:
@@ -483,7 +493,7 @@ class HeldLoad:
         p = self._pressure(self.loaded)
         if p is None or self.creep is None or self.creep_interval is None:
             return False
-        _, compression = average_parts(self.t, relative_compression(p).sum(axis=0), 10)
+        _, compression = average_parts(self.t, _compress_oil(p).sum(axis=0), 10)
         low, high = self.creep_interval
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
         return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel

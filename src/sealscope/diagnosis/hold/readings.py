@@ -89,7 +89,7 @@ def read_channel(t: Array, values: Array, least_step: float) -> Readings:
     code = np.round(position)
     is_at_step = np.abs(position - code) < AT_STEP
     is_same = is_at_step[1:] & is_at_step[:-1] & (code[1:] == code[:-1])
-    if is_same.mean() > SHARE_AT_STEP and np.count_nonzero(np.diff(code)) <= HOLD.noise.nodes:
+    if is_same.mean() > SHARE_AT_STEP and np.abs(np.diff(code)).sum() <= HOLD.noise.nodes:
         return _read_passages(t, fine_t, position, float(values.min()), quantum)
     mean_t, means = average_parts(t, values, HOLD.noise.nodes)
     step = float(t[-1] - t[0]) / max(len(t) - 1, 1)

@@ -88,6 +88,14 @@ def list_noises(duration: float) -> list[Noise]:
     return noises
 
 
+def leak_prior() -> Mixture:
+    """Build the prior of a leak's rate [mm/min], of a tight cylinder or of a leak of unknown size (`[tight]`)."""
+    prior = HOLD.tight
+    sizes = np.array([prior.rate, *prior.leaks])
+    weights = np.array([prior.present, *([(1.0 - prior.present) / len(prior.leaks)] * len(prior.leaks))])
+    return Mixture(weights, sizes, np.zeros(len(sizes)))
+
+
 class RateFit(NamedTuple):
     """Posterior of the rate, the first coefficient, and the most probable fit of the readings."""
 

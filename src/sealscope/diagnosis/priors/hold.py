@@ -52,6 +52,14 @@ class ColumnPriors(PriorTable):
     stated: float  # that of a stated volume
 
 
+class TightHolds(PriorTable):
+    """Loads that are held without a leak."""
+
+    present: float  # their probability
+    rate: float  # [mm/min] standard deviation of their creep
+    leaks: tuple[float, ...]  # [mm/min] standard deviations of the creep of the others
+
+
 class NoisePriors(PriorTable):
     """Noise of means over parts of a hold."""
 
@@ -89,6 +97,7 @@ class HeldLoadPriors(PriorTable):
     settling: SettlingPriors
     cooling: CoolingPriors
     column: ColumnPriors
+    tight: TightHolds
     noise: NoisePriors
     other: OtherSide
     collected: CollectedOil
