@@ -6,8 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from scipy.special import gammaln, logsumexp
+from scipy.special import betaln, gammaln, log_ndtr, logsumexp
 
+from sealscope.diagnosis.estimate.change import ChangeSums
 from sealscope.diagnosis.live.kernel.step import _CHANGES, _MEMORY, PARTS, SIZES, WALKS
 from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.priors.live import LIVE
@@ -60,7 +61,8 @@ def direct_log_e(values, deviations):
                 followed = followed + gain[j + k] * f[k]
             a, b = (f * e[j:] / variance[j:]).sum(axis=0), (f**2 / variance[j:]).sum(axis=0)
             for v in SIZES:
-                ratio = -0.5 * np.log1p(v * b) - 0.5 * n * np.log1p(-(a**2) / ((b + 1.0 / v) * T))
+                score = -n * np.log1p(-(a**2) / ((b + 1.0 / v) * T))
+                ratio = np.log(2.0) + 0.5 * (score - np.log1p(v * b)) + log_ndtr(np.sqrt(score))
                 above = log_prior + log_p + np.where(a > 0.0, ratio, -np.inf)
                 total.append(logsumexp(above) - logsumexp(log_prior + log_p) - np.log(len(SIZES) * len(PARTS)))
     return logsumexp(total)
@@ -78,6 +80,27 @@ def test_log_m_is_that_of_its_formula(seed):
     for k in range(n):
         detector.take(3.0 * k, 3.0 * k + 3.0, 1e-13 * values[k], 1e-13 * deviations[k])
     assert detector.log_e() == pytest.approx(direct_log_e(values, deviations), rel=1e-9, abs=1e-9)
+
+
+@pytest.mark.parametrize("n", [4, 6, 12, 50, 400])
+@pytest.mark.parametrize("gain", [1e-2, 1.0, 30.0, 1e4, 1e8])
+def test_the_mean_ratio_of_a_rise_without_one_is_at_most_1(n, gain):
+    """Over n innovations of which one direction shows the step: its part u of the squares has a beta distribution.
+
+    This is what makes M an e-detector: `log_size_mixture` has the normal distribution in place of Student's.
+    """
+    # u = 1 - exp(-y): close to 1 as the ratio is largest there
+    y = np.concatenate([[0.0], np.geomspace(1e-12, 700.0, 20001)])
+    u = -np.expm1(-y)
+    with np.errstate(divide="ignore"):
+        log_density = -0.5 * np.log(u) - 0.5 * (n - 3.0) * y - betaln(0.5, 0.5 * (n - 1.0)) - y
+    log_density[0] = -np.inf
+    score = -n * np.log1p(-u * gain / (1.0 + gain))
+    moment = np.sqrt(score * (1.0 + gain))  # of a change with the root sqrt(score), for a prior of the scale 1
+    log_ratio = ChangeSums(np.full(len(y), gain), moment).log_mean_ratio(np.ones(len(y)))
+    ratio = np.exp(log_density + log_ratio)
+    mean = 0.5 * np.trapezoid(ratio, y)  # half of all have a rise, and the others count as 0
+    assert 0.5 < mean < 1.0
 
 
 def test_a_saved_state_that_does_not_fit_is_refused():

@@ -9,8 +9,7 @@ sum z^2, over all onsets: the likelihood ratio of a change to none is exp(moment
 - A *stream* and a *folder* filter: z are the prediction errors of each reading by the earlier ones (`filter_changes`;
   in bounded memory the Kalman filter of `live.sequential`). A *file* smooths: all readings are whitened together
   (`step_test`). After the last reading both have the same sums; a test checks it.
-- The size has a half-normal prior in folders, a normal one in streams (`ChangeSums.log_mean_ratio`); in a file it is
-  the most likely one, since the scale of its noise is fitted, too.
+- The size has a half-normal prior in folders and streams (`log_size_mixture`); in a file it is the most likely one.
 
 The threshold has one of three meanings:
 
@@ -63,9 +62,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.compiled import kernel
+from sealscope.compiled import kernel, law
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.special import log_scaled_tail
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
 
@@ -226,14 +226,35 @@ class ChangeSums(NamedTuple):
     def log_mean_ratio(self, scale: Array, *, signed: bool = False) -> Array:
         """Compute the log of the mean likelihood ratio over sizes, whose prior is half-normal, or normal if `signed`.
 
-        With the `scale` k of the prior, and mean m and variance v by `size`, it is -log(1 + energy k^2)/2 + m^2/(2 v).
-        A half-normal prior adds log(2 Phi(m / sqrt(v))), with the normal distribution function Phi.
+        `scale` k: standard deviation of the prior, or of the normal one whose half it is. With the `mean` m of `size`
+        the result is -log(1 + energy k^2)/2 + moment m/2 for a normal prior, and that of `log_size_mixture` for half.
         """
-        from scipy.special import log_ndtr
+        gain, mean = self.energy * scale**2, self.size(scale)[0]
+        score = self.moment * mean
+        if signed:
+            return np.asarray(0.5 * (score - np.log1p(gain)))
+        roots = np.sqrt(score) * np.sign(mean)
+        log_ratios = np.empty(roots.size)
+        _mix_sizes(gain.ravel(), roots.ravel(), log_ratios)
+        return log_ratios.reshape(roots.shape)
 
-        mean, variance = self.size(scale)
-        log_ratio = 0.5 * (self.moment * mean - np.log1p(self.energy * scale**2))
-        return np.asarray(log_ratio if signed else log_ratio + math.log(2.0) + log_ndtr(mean / np.sqrt(variance)))
+
+@law
+def log_size_mixture(gain: float, root: float) -> float:
+    """Compute the log of the mean likelihood ratio of a change, over sizes with a half-normal prior.
+
+    With g, the `gain`, = energy times the prior's variance, and r, the `root`, = the most probable size over its error,
+    it is 2 (1 + g)^(-1/2) exp(r^2/2) Phi(r) with the normal distribution function Phi. For noise of an unknown scale r
+    is the signed root of n log(1 + t^2/n), by which Student's t of the change in n readings is nearly normal.
+    """
+    return -0.5 * math.log1p(gain) + log_scaled_tail(root)
+
+
+@kernel
+def _mix_sizes(gains: Array, roots: Array, log_ratios: Array) -> None:
+    """Write the `log_size_mixture` of each of n changes to `log_ratios` (n,)."""
+    for i in range(gains.size):
+        log_ratios[i] = log_size_mixture(gains[i], roots[i])
 
 
 def filter_changes(values: Array, effects: Array, last_values: Array) -> ChangeSums:

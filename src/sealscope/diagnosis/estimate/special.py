@@ -10,6 +10,9 @@ from sealscope.compiled import law
 LOG_ZERO = -1e30
 #: Beyond so many standard deviations the normal distribution is 0 or 1 in double precision.
 _FAR = 37.0
+#: Standard deviations from which on the tail of the normal distribution is a continued fraction.
+_FRACTION_FROM = 7.07106781186547
+ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 #: Argument from which Stirling's series for the logarithm of the gamma function is exact to 1e-15.
 _STIRLING_FROM = 16.0
 _HALF_LOG_TWO_PI = 0.5 * math.log(2.0 * math.pi)
@@ -49,7 +52,7 @@ def normal_probability(z: float) -> float:
         tail = 0.0
     else:
         density = math.exp(-0.5 * x * x)
-        if x < 7.07106781186547:
+        if x < _FRACTION_FROM:
             above = 0.0352624965998911 * x + 0.700383064443688
             above = above * x + 6.37396220353165
             above = above * x + 33.912866078383
@@ -65,10 +68,23 @@ def normal_probability(z: float) -> float:
             below = below * x + 440.413735824752
             tail = density * above / below
         else:
-            fraction = x + 0.65
-            fraction = x + 4.0 / fraction
-            fraction = x + 3.0 / fraction
-            fraction = x + 2.0 / fraction
-            fraction = x + 1.0 / fraction
-            tail = density / fraction / 2.506628274631
+            tail = density / _tail_fraction(x) / ROOT_TWO_PI
     return 1.0 - tail if z > 0.0 else tail
+
+
+@law
+def _tail_fraction(x: float) -> float:
+    """Compute the density over the tail of a normal distribution, for x far above 0, as a continued fraction."""
+    fraction = x + 0.65
+    fraction = x + 4.0 / fraction
+    fraction = x + 3.0 / fraction
+    fraction = x + 2.0 / fraction
+    return float(x + 1.0 / fraction)
+
+
+@law
+def log_scaled_tail(z: float) -> float:
+    """Compute log(2 P exp(z^2/2)), where P is the probability that a standard normal variable is at most z."""
+    if z < -_FRACTION_FROM:
+        return math.log(2.0 / ROOT_TWO_PI / _tail_fraction(-z))
+    return 0.5 * z * z + math.log(2.0 * normal_probability(z))

@@ -5,12 +5,13 @@ a random walk, whose increment in a block has the variance q. The Kalman filter 
 earlier blocks. Its prediction errors (innovations) e_k have the variance kappa S_k with an unknown scale kappa, and so
 follow Student's t. A step of size delta that begins in block j adds f_k delta to e_k, where f is the filter's response
 to a unit step; the step may begin within block j (`PARTS`). Let a = sum f e / S, b = sum f^2 / S and T = sum e^2 / S,
-where T is over n innovations, including those before block j with fading memory. With the prior delta ~ N(0, v kappa)
-and kappa integrated out, the likelihood ratio of the step to no step is
+where T is over n innovations, including those before block j with fading memory. With a half-normal prior on delta of
+the variance v kappa, and kappa integrated out, the likelihood ratio of the step to no step is about
 
-    R_j = (1 + v b)^(-1/2) (1 - a^2 / ((b + 1/v) T))^(-n/2).
+    R_j = 2 (1 + v b)^(-1/2) exp(r^2/2) Phi(r),    r^2 = -n log(1 - a^2 / ((b + 1/v) T)),
 
-R_j is set to 0 unless a > 0, as only rises count. q is one of `WALKS`. Its prior pi_j is the probability of each q
+with the normal distribution function Phi (`estimate.change`). Student's would be exact; a test shows that E[R_j] <= 1
+without a step. R_j is set to 0 unless a > 0. q is one of `WALKS`. Its prior pi_j is the probability of each q
 given the blocks before j; a small part is shared equally by all q, as the walk may change. With the likelihood
 p_q(e_j..e_k) of the innovations without a step, numerator and denominator are both averaged over q:
 

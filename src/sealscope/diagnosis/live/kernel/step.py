@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.compiled import kernel, large_law, law
+from sealscope.diagnosis.estimate.change import log_size_mixture
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.estimate.special import LOG_ZERO, add_logs, log_gamma, normal_probability
 from sealscope.diagnosis.priors.live import LIVE
@@ -370,7 +371,7 @@ def weigh_onset(d: Any, j: int) -> None:
     n_before = n - (d.n_blocks - d.blocks[k, BLOCK] + 1.0)
     log_before = d.blocks[k, EVIDENCE] + _log_normalisation(n) - _log_normalisation(n_before)
     freedom = max(n - 2.0, 1.0)  # the variance is n/(n - 2) times the squared scale
-    log_m, weight_sum, size_sum, square_sum = LOG_ZERO, 0.0, 0.0, 0.0
+    weight_sum, size_sum, square_sum = 0.0, 0.0, 0.0
     reference = LOG_ZERO  # the largest logarithm so far, by which the sums are scaled
     for q in range(_N_WALKS):
         a, b = _step_sums(d, q, k, part)
@@ -379,11 +380,11 @@ def weigh_onset(d: Any, j: int) -> None:
         for v in range(_N_SIZES):
             precision = b + 1.0 / SIZES[v]
             rise = max(a, 0.0)
-            ratio = -0.5 * (math.log1p(SIZES[v] * b) + n * math.log1p(-(rise * rise) / (precision * rest)))
+            score = -n * math.log1p(-(rise * rise) / (precision * rest))
+            ratio = log_size_mixture(SIZES[v] * b, math.sqrt(score))
             log_ratio = add_logs(log_ratio, ratio)
             if a > 0.0:
                 log_weight = ratio + d.likelihood[q]
-                log_m = add_logs(log_m, log_weight)
                 size = a / precision
                 variance = max(rest - a * size, 0.0) / freedom / precision
                 if log_weight > reference:
@@ -399,6 +400,7 @@ def weigh_onset(d: Any, j: int) -> None:
         d.largest = max(d.largest, a / b + _FAR * _size_deviation(a, b, rest, n))
     d.posteriors[j] = LOG_ZERO
     if weight_sum > 0.0:
+        log_m = reference + math.log(weight_sum)
         d.log_e = add_logs(d.log_e, log_m - total - _LOG_CHOICES)
         _add_posterior(d, j, log_m + log_before, size_sum / weight_sum, square_sum / weight_sum)
 
