@@ -473,7 +473,7 @@ class SignEvidence(SavedAttributes):
             loads = [_load_pressure(values, roles, area_ratio) for area_ratio in (1.0, balance.area_ratio)]
             flow = balance.flow_sign * values[:, roles.left]  # into A
             flow_sign.add_rows(
-                self._motions[e], self._loads[e], np.reshape(motions, (-1, len(flow))), np.array(loads), flow
+                self._motions[e], self._loads[e], np.reshape(motions, (len(motions), len(flow))), np.array(loads), flow
             )
 
     @property
