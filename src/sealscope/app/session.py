@@ -114,8 +114,7 @@ class SessionMachine:
         check_request(self.channel_map, self.rate)
         if unknown := self.hold.keys() - HOLD_FIELDS:
             raise InputError(f"a hold test has {', '.join(HOLD_FIELDS)}, got {min(unknown)[:60]!r}")
-        stated = {name: self.hold.get(name) for name in HOLD_FIELDS if name not in ("start", "end")}
-        parse_set_up(area=self.area or None, **stated)
+        parse_set_up(area=self.area or None, **self.hold)
         RepairLimit.parse(self.limit)
         self.build_rig()
 

@@ -739,7 +739,7 @@ class Workbench:
         if not key:
             if "collected" not in stated.hold:
                 raise InputError("a hold test needs a log, or the oil that was collected, such as 12 mL in 10 min")
-            return hold_test(**{n: value for n, value in settings.items() if n not in ("start", "end")})
+            return hold_test(**settings)
         path = self.find_log(key)
         return hold_test(read_for(stated, path), file=str(path), **settings)
 

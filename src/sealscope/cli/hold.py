@@ -57,7 +57,7 @@ def hold(
 
     settings: dict[str, Any] = {
         "area": area or None, "volume": volume or None, "limit": limit, "oil": oil, "reference": reference,
-        "collected": collected, "valve": valve, "capped": capped, "loaded": loaded,
+        "collected": collected, "valve": valve, "capped": capped, "loaded": loaded, "start": start, "end": end,
     }  # fmt: skip
     parse_set_up(**settings)  # a wrong option is an error of the call, not of its first file
     if not files and collected is None:
@@ -72,7 +72,7 @@ def hold(
         results += hold_test(**settings)
     machine = stated if stated.has_map else opt.StatedMachine(channel_map="auto", rate=stated.rate)
     for file, recording in machine.read_all(files or []):
-        work = partial(hold_test, recording, start=start, end=end, file=str(file), **settings)
+        work = partial(hold_test, recording, file=str(file), **settings)
         judged = None if recording is None else opt.attempt(file, work)
         n_failed += judged is None
         results += judged or ()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from sealscope.diagnosis.hold.judgement import format_estimate
+from sealscope.diagnosis.hold.judgement import COOLING, format_estimate
 from sealscope.diagnosis.hold.result import HoldCurve, HoldResult
 from sealscope.reporting import template
 from sealscope.reporting.picture import Picture, ticks
@@ -24,10 +24,14 @@ SPANS = (3.0, 5.0, 10.0)
 def hold_text(result: HoldResult) -> str:
     """Format a result for the terminal: the result first, then the figures, the causes and what to do."""
     span = "" if result.start_s is None or result.end_s is None else f", {result.start_s:.4g} to {result.end_s:.4g} s"
-    head = result.result or ("leak" if result.causes and result.causes != ("cooling",) else "no leak shown")
-    lines = [f"{result.file}{span}: {head}" + ("" if result.limit is None else f" ({result.limit})")]
-    lines += [f"  {name:<9} {value}" for name, value in list_figures(result) if value]
+    lines = [f"{result.file}{span}: {name_result(result)}" + ("" if result.limit is None else f" ({result.limit})")]
+    lines += [f"  {name:<12} {value}" for name, value in list_figures(result) if value]
     return "\n".join(lines)
+
+
+def name_result(result: HoldResult) -> str:
+    """Name a result: pass, fail or undecided or, without a limit, whether a leak is shown."""
+    return result.result or ("leak" if set(result.causes) - {COOLING} else "no leak shown")
 
 
 def list_figures(result: HoldResult) -> list[tuple[str, str]]:
@@ -35,19 +39,27 @@ def list_figures(result: HoldResult) -> list[tuple[str, str]]:
     creep, creep_ends = result.creep_mm_per_min, result.creep_interval_mm_per_min
     leak, leak_ends = result.leak_lpm, result.leak_interval_lpm
     converted, converted_ends = result.leak_at_lpm, result.leak_at_interval_lpm
-    spans = creep and ", ".join(f"{creep * minutes:.3g} mm in {minutes:g} min" for minutes in SPANS)
+    spans = list[str]()
+    if creep is not None and creep_ends is not None:
+        for minutes in SPANS:
+            travel = format_estimate(*(number * minutes for number in (creep, *creep_ends))).partition(" ")[0]
+            spans.append(f"{travel} mm in {minutes:g} min")
+    possible = [" or ".join(result.causes)] if len(result.causes) > 1 else []
+    if result.oil == "not logged" and result.curve is not None:
+        possible.append("cooling or warming of the oil, which the interval of the leak includes")
     areas = " and ".join(f"{area:.5g}" for area in result.areas_mm2)
     quality = "; ".join(finding.text for finding in result.quality if finding.severity != "note")
     return [
         ("creep", "" if creep is None or creep_ends is None else f"{format_estimate(creep, *creep_ends)} mm/min"),
-        ("", spans or ""),
+        ("", ", ".join(spans)),
         ("leak", _format_flow(leak, leak_ends)),
         ("", "" if converted is None else f"{_format_flow(converted, converted_ends)} at {result.at_bar:.4g} bar"),
         ("pressure", "" if result.pressure_bar is None else f"{result.pressure_bar:.4g} bar"),
         ("area", f"{areas} mm^2" if areas else ""),
         ("oil", result.oil),
         ("reason", result.reason),
-        ("leaks", " or ".join(result.causes)),
+        ("cause", result.causes[0] if len(result.causes) == 1 else ""),
+        ("not excluded", "; ".join(possible)),
         ("next", result.second_test),
         ("data", quality),
     ]
@@ -66,7 +78,13 @@ def write_hold_page(results: Sequence[HoldResult], path: str | os.PathLike[str])
 def render_hold_page(results: Sequence[HoldResult]) -> str:
     """Render the page of hold tests as HTML."""
     holds = [
-        (result, STATES[result.result], list_figures(result), result.curve and draw_curve(result.curve))
+        (
+            result,
+            STATES[result.result],
+            name_result(result),
+            list_figures(result),
+            result.curve and draw_curve(result.curve),
+        )
         for result in results
     ]
     return template.render("hold.html.j2", holds=holds, title="Hold test")

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -18,7 +17,7 @@ from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.judgement import judge_hold
 from sealscope.diagnosis.hold.readings import find_held_parts
 from sealscope.diagnosis.hold.result import HoldResult
-from sealscope.diagnosis.hold.set_up import parse_set_up
+from sealscope.diagnosis.hold.set_up import SetUp, parse_set_up
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
@@ -28,7 +27,6 @@ from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import inspect
 from sealscope.recordings.recording import Recording
-from sealscope.units import parse_quantity
 
 
 @checked_call
@@ -98,7 +96,7 @@ def hold_test(
     >>> result.result, round(result.creep_mm_per_min, 2)
     ('pass', 0.67)
     """
-    set_up = parse_set_up(area, volume, limit, oil, reference, collected, valve, capped, loaded)
+    set_up = parse_set_up(area, volume, limit, oil, reference, collected, valve, capped, loaded, start, end)
     if recording is None:
         if set_up.collected is None:
             raise InputError("a hold test needs a recording, or the volume that was collected (collected)")
@@ -107,11 +105,12 @@ def hold_test(
         raise InputError(f"recording must be a Recording, got {type(recording).__name__}")
     name = os.fspath(file) if file else str(recording.provenance.get("file", "recording"))
     samples = _select_samples(recording)
-    findings, moment = inspect(recording), recording.provenance.get("start")
+    findings = tuple(finding for finding in inspect(recording) if finding.code != "too_short")  # for detectors
+    moment = recording.provenance.get("start")
     if moment is None and (start_s := start_seconds(recording, name)) is not None:
         moment = np.datetime64(round(start_s - float(samples.t[0])), "s")  # of t = 0
     date = None if moment is None else str(moment)
-    parts = _cut_holds(samples, start, end)
+    parts = _cut_holds(samples, set_up)
     with threadpool_limits(limits=1):  # faster for small matrices, and the results do not depend on the machine
         return tuple(judge_hold(HeldLoad(part, set_up, name, findings, date)) for part in parts)
 
@@ -122,13 +121,14 @@ def judge_held_recording(
     """Judge a recording of a held load, or return no result if it is none.
 
     It is one if it has a position in units of length, its pump and command rest, and `hold_test` finds holds in it that
-    last for the fraction `part.share` (`priors.toml`) of its duration or longer. `areas` [m^2]: of the sides A and B;
-    `limit`: as of `hold_test`. A limit or areas that `hold_test` refuses also give no result.
+    last for the fraction `part.share` (`priors.toml`) of its duration or longer. Pressures in raw counts are left out.
+    `areas` [m^2]: of the sides A and B; `limit`: as of `hold_test`. Those that it refuses also give no result.
     """
     if "x" not in recording or recording.units["x"] == COUNTS or not _is_pump_at_rest(recording):
         return ()
     try:
-        results = hold_test(recording, area=areas, limit=limit)
+        measured = recording.only(name for name in recording.channels if recording.units[name] != COUNTS)
+        results = hold_test(measured, area=areas, limit=limit)
     except InputError:
         return ()
     held_s = sum((result.end_s or 0.0) - (result.start_s or 0.0) for result in results)
@@ -152,37 +152,41 @@ def _select_samples(recording: Recording) -> Recording:
     names = [name for name in ("x", *CHAMBERS, "q_leak") if name in recording]
     for name in names:
         if recording.units[name] == COUNTS:
-            raise InputError(f"{name} must have a unit, got raw counts: state it, as in --map '{name}=COLUMN[bar]'")
+            unit = {"x": "mm", "q_leak": "mL/min"}.get(name, "bar")
+            raise InputError(f"{name} must have a unit, got raw counts: state it, as in --map '{name}=COLUMN[{unit}]'")
     values = {name: recording[name] for name in names}
     names = [name for name in names if np.count_nonzero(np.isfinite(values[name])) > 0.5 * len(recording)]
     if not names:
         unused = f"; unused: {join_names(recording.unused)}" if recording.unused else ""
         raise InputError(f"a hold test needs a position, a chamber pressure or a leakage flow, got none{unused}")
-    rows = np.isfinite(recording.t) & np.all([np.isfinite(values[name]) for name in names], axis=0)
-    later = np.maximum.accumulate(np.where(rows, recording.t, -np.inf))
-    rows &= np.append(True, recording.t[1:] > later[:-1])
+    whole = np.isfinite(recording.t) & np.all([np.isfinite(values[name]) for name in names], axis=0)
+    latest = np.maximum.accumulate(np.where(whole, recording.t, -np.inf))
+    rows = whole & np.append(True, recording.t[1:] > latest[:-1])
+    n_rows, n_whole = np.count_nonzero(rows), np.count_nonzero(whole)
+    if n_rows < 0.5 * n_whole:
+        raise InputError(f"time must increase, got {n_whole - n_rows} of {n_whole} samples not after those before them")
     kept = recording.only([*names, *(["T_oil"] if "T_oil" in recording else [])])
     return kept._select(rows, "samples of a hold")
 
 
-def _cut_holds(samples: Recording, start: Any, end: Any) -> list[Recording]:
-    """Cut the holds out of a log, those between `start` and `end` if these are stated; raise InputError without any."""
-    shortest = HOLD.part.shortest
-    if start is not None or end is not None:
-        first = samples.t[0] if start is None else parse_quantity(start, "s", name="from")
-        last = samples.t[-1] if end is None else parse_quantity(end, "s", name="until")
-        rows = np.flatnonzero((samples.t >= first) & (samples.t <= last))
-        parts = [(int(rows[0]), int(rows[-1]))] if rows.size > 1 else []
-    elif len(samples) < 3:
-        parts = []
-    else:
-        loaded = [samples[name] for name in CHAMBERS if name in samples]
-        highest = max(loaded, key=lambda p: float(np.median(p)), default=None)
-        parts = find_held_parts(samples.t, samples.channels.get("x"), highest)
-    durations = [float(samples.t[last] - samples.t[first]) for first, last in parts]
+def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
+    """Cut the holds out of a log, or out of the part whose start or end is stated; with both, this part is the hold.
+
+    Raises InputError if none is long enough.
+    """
+    extent, shortest = f"in a log of {len(samples)} samples over {samples.duration:.3g} s", HOLD.part.shortest
+    low, high = (-np.inf if set_up.start is None else set_up.start), (np.inf if set_up.end is None else set_up.end)
+    samples = samples._select((samples.t >= low) & (samples.t <= high), "stated part")
+    t, pressures = samples.t, [samples[name] for name in CHAMBERS if name in samples]
+    parts = [(0, len(t) - 1)] if len(t) else []
+    if parts and ("x" in samples or pressures) and None in (set_up.start, set_up.end):
+        highest = max(pressures, key=lambda p: float(np.median(p)), default=None)
+        parts = find_held_parts(t, samples.channels.get("x"), highest) if len(t) > 2 else []
+        extent = f"without motion {extent}"
+    durations = [float(t[last] - t[first]) for first, last in parts]
     held = [part for part, duration in zip(parts, durations, strict=True) if duration >= shortest]
     held = [(first, last) for first, last in held if last - first >= 4]
     if not held:
-        longest = f"{max(durations):.3g} s at most" if durations else "no sample"
-        raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} without motion")
+        longest = f"{max(durations):.3g} s at most" if durations else "none"
+        raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} {extent}")
     return [samples.samples(slice(first, last + 1)) for first, last in held]

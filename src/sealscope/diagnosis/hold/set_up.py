@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from sealscope.diagnosis.hold.limits import HoldLimit, parse_collected
+from sealscope.diagnosis.hold.limits import HoldLimit, parse_collected, parse_in_range
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.units import parse_quantity
 
-#: Smallest and largest area of a piston [m^2], of a rod of 4 mm and a bore of 1.1 m; and volume of its oil [m^3].
-AREAS, VOLUMES = (1e-5, 1.0), (1e-6, 1.0)
 #: Courses of a temperature that is not logged.
 COURSES = ("falling", "rising", "steady")
 
@@ -20,7 +18,8 @@ class SetUp(NamedTuple):
 
     `areas`, `volumes`: of one side, or of A and B; `valves`: sides with a load-holding valve, None if not stated;
     `capped`: sides whose port is capped; `reference`: pressure [Pa] to which the leak is converted; `oil_temperature`
-    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s]; `loaded`: side, or "".
+    [degC], `oil_course`: of oil that is not logged; `collected`: volume [m^3] and time [s]; `loaded`: side, or "";
+    `start`, `end` [s]: times of the hold, None to find them.
     """
 
     areas: tuple[float, ...]
@@ -33,6 +32,8 @@ class SetUp(NamedTuple):
     oil_course: str
     collected: tuple[float, float] | None
     loaded: str
+    start: float | None
+    end: float | None
 
     def area(self, side: str) -> float | None:
         """Return the area of a side [m^2]; None if it is not stated."""
@@ -54,31 +55,32 @@ class SetUp(NamedTuple):
 def parse_set_up(
     area: Any = None, volume: Any = None, limit: str | None = None, oil: str | None = None, reference: Any = None,
     collected: str | None = None, valve: str | None = None, capped: str | None = None, loaded: str | None = None,
+    start: Any = None, end: Any = None,
 ) -> SetUp:  # fmt: skip
     """Parse the arguments of `hold_test`; raise InputError for one that is out of its range."""
-    areas = _parse_sides(area, "m^2", "area")
-    volumes = _parse_sides(volume, "m^3", "volume")
-    for name, numbers, (low, high), unit in (("area", areas, AREAS, "m^2"), ("volume", volumes, VOLUMES, "m^3")):
-        for number in numbers:
-            if not low <= number <= high:
-                raise InputError(
-                    f"{name} must be {low:g} to {high:g} {unit}, got {number:g} {unit}: is its unit right?"
-                )
     temperature, course = _parse_oil(oil)
     side = "" if loaded is None else str(loaded).strip().upper()
     if side not in ("", "A", "B"):
         raise InputError(f"loaded must be A or B, got {loaded}")
+    first, last = (
+        None if moment is None else parse_quantity(moment, "s", name=f"{name} of the hold")
+        for name, moment in (("start", start), ("end", end))
+    )
+    if first is not None and last is not None and not first < last:
+        raise InputError(f"start of the hold must be before its end, got {first:g} s and {last:g} s")
     return SetUp(
-        areas,
-        volumes,
+        _parse_sides(area, "m^2", "area"),
+        _parse_sides(volume, "m^3", "volume"),
         None if limit is None else HoldLimit.parse(limit),
         None if valve is None else _parse_side_names(valve, "valve"),
         frozenset() if capped is None else _parse_side_names(capped, "capped"),
-        None if reference is None else parse_quantity(reference, "Pa", name="reference"),
+        None if reference is None else parse_in_range(reference, "Pa", "reference pressure"),
         temperature,
         course,
         None if collected is None else parse_collected(collected),
         side,
+        first,
+        last,
     )
 
 
@@ -89,7 +91,7 @@ def _parse_sides(value: Any, unit: str, name: str) -> tuple[float, ...]:
     entries = [value] if isinstance(value, str | int | float) else list(value)
     if len(entries) not in (1, 2):
         raise InputError(f"{name} must be one, or those of the sides A and B, got {len(entries)}")
-    return tuple(parse_quantity(entry, unit, name=name) for entry in entries)
+    return tuple(parse_in_range(entry, unit, name) for entry in entries)
 
 
 def _parse_side_names(text: str, name: str) -> frozenset[str]:
@@ -107,7 +109,8 @@ def _parse_oil(text: str | None) -> tuple[float | None, str]:
     if text is None:
         return None, ""
     words = text.split()
-    course = words.pop() if words and words[-1] in COURSES else ""
-    if not words:
-        return None, course
-    return parse_quantity(" ".join(words), "K", name="oil") - 273.15, course
+    course = words.pop().lower() if words and words[-1].lower() in COURSES else ""
+    temperature = " ".join(words)
+    if not (course if not words else any(map(str.isdigit, temperature))):
+        raise InputError(f"oil must be such as '45 degC falling', 'rising' or 'steady', got {text!r}")
+    return (parse_in_range(temperature, "K", "oil") - 273.15 if words else None), course
