@@ -2,12 +2,13 @@
 
     python benchmarks/hold_tests.py [--tests 2000] [--seed 1] [--jobs 2]
 
-Bores of 25 to 250 mm, loads on either side, laminar and turbulent leaks past piston or valve, oil with air that is
-warm, steady, cooling or warming, with and without a thermometer, valves that settle, seals that stick and slip, logs
-that begin with the lift or end with the release, and loggers of 0.1 to 1000 Hz with encoder steps, correlated noise and
-drift. The plant is integrated here, second by second, and shares no code with the estimator. Truth of the creep is the
-leak's flow over the area; where oil cools unlogged it is the mean speed of the piston over the hold, without what
-settles.
+Bores of 25 to 250 mm, loads on either side, laminar and turbulent leaks past piston, valve or rod seal, oil with air
+that is warm, steady, cooling or warming, with and without a thermometer, valves that settle, seals that stick and slip,
+logs that begin with the lift or end with the release, and loggers of 0.1 to 1000 Hz with encoder steps, correlated
+noise and drift. Some workshops state the oil's temperature, the sides with holding valves or capped ports, or measure
+what passes a piston at its stop, by a flow meter or a vessel. The plant is integrated here, second by second, and
+shares no code with the estimator. Truth of the creep is the leak's flow over the area; where oil cools unlogged it is
+the mean speed of the piston over the hold, without what settles.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ def draw_plant(random):
     stroke = log_uniform(random, 0.15, 1.5)
     x = random.uniform(0.15, 0.85) * stroke
     loaded = "B" if random.random() < 0.2 else "A"
+    paths = ["piston", "valve"] if loaded == "A" else ["piston", "valve", "rod seal"]  # A has no rod
     thermal = random.choice(["steady", "logged", "unlogged"], p=[0.4, 0.3, 0.3])
     swing = 0.0 if thermal == "steady" else random.choice([-1.0, 1.0], p=[0.8, 0.2]) * log_uniform(random, 1.0, 20.0)
     return {
@@ -46,7 +48,7 @@ def draw_plant(random):
         "tau": log_uniform(random, 600.0, 12000.0), "dead": random.uniform(0.05, 0.6),
         "p": log_uniform(random, 20, 250) * BAR, "K": random.uniform(1.0e9, 1.7e9), "air": random.uniform(0.0, 0.01),
         "exponent": random.choice([0.5, 0.75, 1.0]),
-        "path": random.choice(["piston", "valve"]), "far": random.choice(["tank", "locked"], p=[0.6, 0.4]),
+        "path": str(random.choice(paths)), "far": random.choice(["tank", "locked"], p=[0.6, 0.4]),
         "creep": 0.0 if random.random() < 0.25 else log_uniform(random, 0.02, 10.0) * MM_MIN,
         "settle": 0.0 if random.random() < 0.5 else log_uniform(random, 0.01, 0.5) * 1e-3,
         "settle_time": log_uniform(random, 1.0, 30.0), "stop": random.random() < 0.2,
@@ -72,7 +74,8 @@ def simulate(plant, seconds):
     alpha = 6.7e-4
     s, rows = 0.0, []
     for k in range(steps + 1):
-        flow = c * max(p - far_p if plant["path"] == "piston" else p - 101325.0, 0.0) ** plant["exponent"]
+        drop = p - far_p if plant["path"] == "piston" else p - 101325.0
+        flow = c * np.sign(drop) * abs(drop) ** plant["exponent"]
         rows.append((s, p, far_p, flow))
         if k == steps:
             break
@@ -114,6 +117,47 @@ def draw_logger(random):
         "lift": 0.0 if random.random() < 0.6 else random.uniform(5.0, 30.0),
         "release": 0.0 if random.random() < 0.7 else random.uniform(3.0, 10.0),
     }  # fmt: skip
+
+
+def draw_statements(random, plant, has_thermometer):
+    """Draw what the workshop states, all of it true: arguments of the hold test."""
+    far = "B" if plant["loaded"] == "A" else "A"
+    stated = {}
+    if not has_thermometer and random.random() < 0.4:
+        course = "falling" if plant["swing"] < 0.0 else "rising" if plant["swing"] > 0.0 else "steady"
+        # what the swing is of the oil's whole excess over the workshop; the rest stays, or went before
+        excess = min(-plant["swing"] / random.uniform(0.3, 1.0), 70.0) if plant["swing"] else random.uniform(0.0, 30.0)
+        degrees = max(5.0 * round((random.uniform(15.0, 25.0) + excess) / 5.0), 0.0)
+        stated["oil"] = f"{degrees:g} degC {course}" if random.random() < 0.7 else course
+    if plant["path"] != "valve" and random.random() < 0.2:
+        stated["capped"] = f"{plant['loaded']},{far}" if plant["far"] == "locked" else plant["loaded"]
+    if random.random() < 0.3:
+        sides = [side for side in (plant["loaded"], far) if random.random() < 0.5]
+        if plant["path"] == "valve":
+            sides = sorted({*sides, plant["loaded"]})
+        stated["valve"] = ",".join(sides) or "none"
+    return stated
+
+
+def measure_leak(random, plant, recording, flow, t_plant):
+    """Measure what passes a piston at its stop to the open far side, by a vessel or a flow meter.
+
+    Returns the recording, with the meter, and the collected volume as text; both are as they were in other tests.
+    """
+    measurable = plant["stop"] and plant["path"] == "piston" and plant["far"] == "tank" and plant["thermal"] == "steady"
+    kind = random.choice(["none", "vessel", "meter"])
+    if not measurable or kind == "none":
+        return recording, None
+    if kind == "vessel":  # a measuring cylinder, read to a drop; the truth is that of the whole hold
+        volume = float(np.trapezoid(flow, t_plant)) * (1.0 + 0.015 * random.standard_normal())
+        volume = max(volume + 0.05e-6 * random.standard_normal(), 0.0)
+        return recording, f"{1e6 * volume:.2f} mL in {t_plant[-1] / 60.0:.3f} min"
+    gain = 1.0 + 0.01 * random.standard_normal()
+    readings = gain * np.interp(recording.t, t_plant, flow)
+    readings = readings * (1.0 + 0.05 * random.standard_normal(readings.size))
+    channels = {**recording.channels, "q_leak": readings}
+    units = {**recording.units, "q_leak": "m^3/s"}
+    return ss.Recording(recording.t, channels, units, rate=recording.rate), None
 
 
 def colour(random, n, step, memory):
@@ -171,41 +215,59 @@ def record(random, plant, logger):
         values["T_oil"] = np.round(10.0 * (320.0 + np.interp(t, t_plant, T))) / 10.0
     units = {name: "m" if name == "x" else "K" if name == "T_oil" else "Pa" for name in values}
     sunk = s - (0.0 if plant["stop"] else plant["settle"]) * -np.expm1(-t_plant / plant["settle_time"])
-    return ss.Recording(t, values, units, rate=logger["rate"]), (t_plant, flow, sunk)
+    return ss.Recording(t, values, units, rate=logger["rate"]), (t_plant, flow, sunk, p)
 
 
 def truths(course, start, end):
     """Compute mean flow and mean speed, without what settles, between two times of a simulated `course`."""
-    t, flow, sunk = course
+    t, flow, sunk, _ = course
     volume = np.concatenate([[0.0], np.cumsum(0.5 * (flow[1:] + flow[:-1]) * np.diff(t))])
     return [float(np.diff(np.interp([start, end], t, values))[0]) / (end - start) for values in (volume, sunk)]
 
 
-def bound_deviation(plant, logger, channels, has_volume, course):
-    """Compute the Cramer-Rao bound of the leak's flow [m^3/s], with the noise known and the priors of the hold test.
+def bound_deviation(plant, logger, channels, has_volume, course, stated):
+    """Compute the Cramer-Rao bound of the leak's flow [m^3/s]: noise and law known, all else with its prior.
 
-    Cooling that nobody logs has the smaller of the assumed sizes; what settles is left out.
+    Unknown are size and time of what settles and of cooling that is not logged (of the smaller of the assumed sizes, or
+    as stated), the column of a logged temperature, and its steps of 0.1 K, and the oil that the pressure compresses.
     """
-    t_plant, flow, _ = course
+    t_plant, flow, _, p = course
     seconds, area = float(t_plant[-1]), plant[plant["loaded"]]
     reach = plant["x"] if plant["loaded"] == "A" else plant["stroke"] - plant["x"]
     column, mean_flow = reach + plant["dead"], float(np.mean(flow))
-    cooling = 7e-4 * column * -np.expm1(-np.linspace(0.0, seconds, 200) / plant["tau"])
-    known = "T_oil" in channels
+    if "collected" in stated or "q_leak" in channels:
+        return float(np.hypot((0.02 if "collected" in stated else 0.01) * mean_flow, 5e-8 / seconds))
+    m = 200
+    t = np.linspace(0.0, seconds, m)
+
+    def courses(size, swing, time):
+        """Compute an exponential of a size, and its derivative by the logarithm of its time."""
+        return [size * -np.expm1(-t / time), swing * -t / time * np.exp(-t / time)]
+
     # oil temperature: its prior of 4 K, or the logged course times a column of 40 % uncertainty
-    size = 0.41 * abs(plant["swing"]) if known else 4.0
+    size = 0.3 if stated.get("oil", "").endswith("steady") else 4.0
+    cooling = [7e-4 * column * values for values in courses(size, plant["swing"], plant["tau"])]
+    known = "T_oil" in channels
+    if known:
+        cooling = [7e-4 * column * 0.41 * values for values in courses(plant["swing"], 0.0, plant["tau"])]
+        cooling.append(7e-4 * column * 0.015 * t / seconds)
     if plant["stop"] or "x" not in channels:  # volume times compressibility is known to so much
         scale = np.hypot(0.05 if has_volume else 0.4 if "x" in channels else 0.7, 0.3)
-        return float(np.hypot(scale * mean_flow, size * cooling[-1] * area / seconds))
-    m, n = 200, seconds * logger["rate"]
-    t = np.linspace(0.0, seconds, m)
+        return float(np.hypot(scale * mean_flow, np.linalg.norm([values[-1] for values in cooling]) * area / seconds))
+    n = seconds * logger["rate"]
     memory = 1.0 + 2.0 * logger["memory"] * logger["rate"]
     white = (
         logger["noise"] ** 2 * min(memory * m / n, m / 2.0) + (logger["slip"] ** 2 + logger["step"] ** 2 * m / n) / 12.0
     )
     covariance = white * np.eye(m) + logger["drift"] ** 2 * np.minimum(t[:, None], t[None, :]) / seconds
-    columns = np.column_stack([t, np.ones(m), size * cooling])
-    information = columns.T @ np.linalg.solve(covariance, columns) + np.diag([0.0, 0.0, 1.0])
+    strain = np.concatenate([[0.0], np.cumsum(compressibility(plant, p[1:]) * np.diff(p))])
+    compressed = 0.5 * column * np.interp(t, t_plant, strain)  # known to so much, as the test assumes
+    columns = np.column_stack(
+        [t, np.ones(m), compressed, *cooling, *courses(1e-3, plant["settle"], plant["settle_time"])]
+    )
+    information = columns.T @ np.linalg.solve(covariance, columns) + np.diag(
+        [0.0, 0.0] + [1.0] * (columns.shape[1] - 2)
+    )
     return float(area * np.sqrt(np.linalg.inv(information)[0, 0]))
 
 
@@ -216,6 +278,10 @@ def run_test(seed, first):
     while plant["stop"] and simulate(plant, logger["seconds"])[2][-1] < 0.3 * plant["p"]:
         plant["creep"], plant["swing"] = 0.3 * plant["creep"], 0.5 * plant["swing"]  # else the chamber empties
     recording, course = record(random, plant, logger)
+    recording, collected = measure_leak(random, plant, recording, course[1], course[0])
+    stated = draw_statements(random, plant, "T_oil" in recording.channels)
+    if collected is not None:
+        stated["collected"] = collected
     recording, begin_s = add_motions(random, recording, plant, logger)
     flow, speed = truths(course, 0.0, course[0][-1])
     area = plant[plant["loaded"]]
@@ -229,23 +295,29 @@ def run_test(seed, first):
     loaded = None if any(name.startswith("p_") for name in recording.channels) else plant["loaded"]
     begin = time.process_time()
     try:
-        results = ss.hold_test(recording, area=areas, volume=volumes, limit=f"{limit / ML_MIN} mL/min", loaded=loaded)
+        results = ss.hold_test(
+            recording, area=areas, volume=volumes, limit=f"{limit / ML_MIN} mL/min", loaded=loaded, **stated
+        )
         result = max(results, key=lambda hold: hold.end_s - hold.start_s)
     except Exception as error:
-        return {"seed": seed, "error": f"{type(error).__name__}: {error}", "plant": plant, "logger": logger}
+        error = f"{type(error).__name__}: {error}"
+        return {"seed": seed, "error": error, "plant": plant, "logger": logger, "stated": stated}
     seconds = time.process_time() - begin
-    start, end = (min(max(moment - begin_s, 0.0), logger["seconds"]) for moment in (result.start_s, result.end_s))
+    if collected is not None:
+        start, end = 0.0, logger["seconds"]
+    else:
+        start, end = (min(max(moment - begin_s, 0.0), logger["seconds"]) for moment in (result.start_s, result.end_s))
     flow, speed = truths(course, start, end)
-    unlogged = plant["thermal"] == "unlogged"
+    unlogged = plant["thermal"] == "unlogged" and not stated.get("oil")
     true_creep = (speed if unlogged else flow / area if not plant["stop"] else 0.0) / MM_MIN
     if plant["far"] == "locked" and not plant["stop"]:
         true_creep = None if unlogged else speed / MM_MIN if plant["thermal"] == "steady" else None
     return {
-        "seed": seed, "plant": plant, "logger": logger, "seconds": seconds, "result": result.result,
+        "seed": seed, "plant": plant, "logger": logger, "stated": stated, "seconds": seconds, "result": result.result,
         "causes": result.causes, "flow": 6e4 * flow, "limit": 6e4 * limit, "creep": true_creep,
         "creep_interval": result.creep_interval_mm_per_min, "leak_interval": result.leak_interval_lpm,
         "log": sorted(recording.channels), "n": len(recording),
-        "bound": 6e4 * 1.96 * bound_deviation(plant, logger, recording.channels, volumes is not None, course),
+        "bound": 6e4 * 1.96 * bound_deviation(plant, logger, recording.channels, volumes is not None, course, stated),
     }  # fmt: skip
 
 

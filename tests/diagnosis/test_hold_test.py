@@ -159,6 +159,19 @@ def test_a_result_near_its_limit_states_the_minutes_that_are_needed():
     assert longer.result == "pass"
 
 
+def test_a_flow_meter_shows_the_mean_flow_also_while_the_pressure_falls():
+    t = np.arange(0.0, 600.0, 0.5)
+    p_A = 1e7 * np.exp(-t / 400.0)
+    flow = 5e-8 * (p_A / 1e7) ** 0.5
+    for seed in range(3):
+        noise = 1.0 + 0.05 * np.random.default_rng(seed).standard_normal(t.size)
+        recording = ss.Recording(t, {"p_A": p_A, "q_leak": flow * noise}, {"p_A": "Pa", "q_leak": "m^3/s"}, rate=2.0)
+        (result,) = ss.hold_test(recording)
+        low, high = result.leak_interval_lpm
+        assert low <= 6e4 * float(flow.mean()) <= high
+        assert high - low < 0.1 * result.leak_lpm
+
+
 def test_collected_oil_needs_no_log():
     (result,) = ss.hold_test(collected="12 mL in 10 min", limit="ISO 10100: 0.3 mL/min")
     low, high = result.leak_interval_lpm

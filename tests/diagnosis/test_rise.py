@@ -544,3 +544,14 @@ def test_a_rise_of_infinite_freedom_is_normal() -> None:
     """Infinity times zero was no number, and no explanation had a probability."""
     assert Rise(3.0, 1.0, np.inf).log_ratio(3.0) == pytest.approx(4.5)
     assert Rise(3.0, 1.0, 1e9).log_ratio(3.0) == pytest.approx(4.5, rel=1e-6)
+
+
+def test_a_condensed_mixture_has_the_same_quantiles():
+    random = np.random.default_rng(5)
+    weights = random.exponential(size=20_000)
+    mixture = Mixture(weights / weights.sum(), random.lognormal(size=20_000), random.standard_normal(20_000))
+    condensed = mixture.condense()
+    assert len(condensed.weights) < 5_000
+    assert condensed.mean == pytest.approx(mixture.mean, abs=1e-12)
+    assert condensed.deviation == pytest.approx(mixture.deviation, rel=1e-12)
+    assert condensed.interval == pytest.approx(mixture.interval, rel=5e-4)

@@ -50,6 +50,8 @@ MAX_SQUARE = 1e100
 #: Number of parts of a large mixture that give the first estimate of a quantile; maximum number of steps to it; and
 #: distance [standard deviations] beyond which a normal distribution has no probability of the order of rounding.
 SAMPLED, MAX_STEPS, NEGLIGIBLE_TAIL = 128, 200, 9.0
+#: Width of the cells whose parts are merged, in standard deviations and in the logarithm of these.
+CELL = 0.1
 #: Number of factors into which an uncertain one is divided, and least weight of a part of a pooled mixture, over the
 #: largest.
 N_FACTORS, LEAST_WEIGHT = 15, 1e-5
@@ -109,6 +111,19 @@ class Mixture(NamedTuple):
         centres = self.centres[:, None] - differences * variances / totals**2
         deviations = self.deviations[:, None] * prior.deviations / totals
         return Mixture(weights[usual] / weights[usual].sum(), deviations[usual], centres[usual])
+
+    def condense(self) -> Mixture:
+        """Merge parts that are nearly equal, with their mean and variance: an approximation of far fewer parts."""
+        width = np.round(np.log(self.deviations) / CELL)
+        place = np.round(self.centres / (CELL * np.exp(CELL * width)))
+        order = np.lexsort((place, width))
+        is_new = (np.diff(width[order], prepend=np.nan) != 0.0) | (np.diff(place[order], prepend=np.nan) != 0.0)
+        starts = np.flatnonzero(is_new)
+        weights, centres = self.weights[order], self.centres[order]
+        sums = np.add.reduceat(weights, starts)
+        means = np.add.reduceat(weights * centres, starts) / sums
+        spread = self.deviations[order] ** 2 + (centres - np.repeat(means, np.diff(starts, append=len(order)))) ** 2
+        return Mixture(sums, np.sqrt(np.add.reduceat(weights * spread, starts) / sums), means)
 
     def below(self, value: float) -> float:
         """Compute the probability of values below `value`."""

@@ -80,13 +80,14 @@ _MM = 1e3
 
 
 class LeakClock(NamedTuple):
-    """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean rate 1.
+    """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean `flow` (m,) 1.
 
     `spare` (m,): how much of it is due to the sensors' offset in a hold whose pressures a leak has equalised.
     """
 
     weight: float
     minutes: Array
+    flow: Array
     spare: Array | None = None
 
 
@@ -147,7 +148,6 @@ class HeldLoad:
         self.recording, self.set_up, self.file, self.findings, self.start = recording, set_up, file, findings, start
         self.t = np.zeros(0) if recording is None else recording.t - recording.t[0]
         self.duration = float(self.t[-1]) if self.t.size else 0.0
-        self.rounding = 0.0  # error of the rate [mm/min] due to the steps of a logged temperature
 
     def _channel(self, name: str) -> Array | None:
         """Return the samples of a channel; None if it is absent."""
@@ -224,13 +224,12 @@ class HeldLoad:
         coefficients = np.linalg.lstsq(basis, weights * logged.values, rcond=None)[0]
         length, deviation = self.column
         scale = -HOLD.cooling.expansion * length
-        self.rounding = abs(scale) * ROUNDED * logged.quantum / (self.duration / 60.0)
         change = course_basis(t / self.duration, degree, times) - course_basis(np.zeros(1), degree, times)
         travel = scale * np.asarray(change @ coefficients)
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
-        size = HOLD.cooling.misfit * float(np.ptp(travel))
-        misfit = self._misfit(t, t, size) + [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]
-        return [Column(travel, 1.0, uncertainty), *(misfit if size > HOLD.cooling.misfit * LEAST_BEND else ())]
+        size = math.hypot(HOLD.cooling.misfit * float(np.ptp(travel)), 0.5 * scale * ROUNDED * logged.quantum)
+        misfit = [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]
+        return [Column(travel, 1.0, uncertainty), *self._misfit(t, t, size), *misfit]
 
     def _misfit(self, t: Array, course: Array, size: float) -> list[Column]:
         """Build the slope, of a standard deviation `size` [mm], and bends that a correction leaves at times `t` [s].
@@ -270,13 +269,14 @@ class HeldLoad:
     def _clocks(self, readings: Readings) -> list[LeakClock]:
         """List the clocks of the laws of a leak, as `readings` see them."""
         p, other = self._pressure(self.loaded), self._pressure(self.unloaded)
+        steady = LeakClock(1.0, readings.t / 60.0, np.ones_like(readings.t))
         if p is None:
-            return [LeakClock(1.0, readings.t / 60.0)]
+            return [steady]
         # past the piston, or out of the cylinder
         differences = [p - P_ATM] if other is None else [p - other, p - P_ATM]
         courses = [smooth_course(self.t, difference) for difference in differences]
         if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
-            return [LeakClock(1.0, readings.t / 60.0)]
+            return [steady]
         clocks = []
         for k, (part_t, course) in enumerate(courses):
             driving = course
@@ -288,18 +288,22 @@ class HeldLoad:
                     noise = float(np.std(p[last] - other[last])) / math.sqrt(max(len(p) / N_PARTS, 1.0))
                     driving = (course - offset) * small_difference_factor(course - offset, RESOLVED * noise)
             for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
-                minutes = self._weigh_time(readings, part_t, driving, exponent)
-                spare = None if driving is course else minutes - self._weigh_time(readings, part_t, course, exponent)
-                clocks.append(LeakClock(weight / len(differences), minutes, spare))
+                minutes, flow = self._weigh_time(readings, part_t, driving, exponent)
+                spare = minutes - self._weigh_time(readings, part_t, course, exponent)[0]
+                clocks.append(LeakClock(weight / len(differences), minutes, flow, None if driving is course else spare))
         return clocks
 
-    def _weigh_time(self, readings: Readings, t: Array, difference: Array, exponent: float) -> Array:
-        """Compute the time [min] of `readings` weighted by a power of a pressure `difference` at `t`, mean weight 1."""
+    def _weigh_time(self, readings: Readings, t: Array, difference: Array, exponent: float) -> tuple[Array, Array]:
+        """Compute times [min] of `readings` weighted by a power of a pressure `difference` at `t`, and the weights.
+
+        Their mean is 1.
+        """
         flow = np.sign(difference) * np.abs(difference) ** exponent
         steps = 0.5 * (flow[1:] + flow[:-1]) * np.diff(t)
         volume = flow[0] * t[0] + np.concatenate([[0.0], np.cumsum(steps)])
         total = float(volume[-1] + flow[-1] * (self.duration - t[-1]))
-        return sample_course(readings, t, volume) * (self.duration / 60.0 / (total or 1.0))
+        scale = self.duration / (total or 1.0)
+        return sample_course(readings, t, volume) * (scale / 60.0), sample_course(readings, t, flow) * scale
 
     @cached_property
     def creep(self) -> RateFit | None:
@@ -332,25 +336,40 @@ class HeldLoad:
         change = float(fit.fit[-1] - fit.fit[0]) * self.duration / float(t[-1] - t[0])
         bend = float(np.ptp(self._bend(t, fit.fit, change)))
         bent = HOLD.cooling.misfit * bend / (self.duration / 60.0)
-        return fit._replace(rate=fit.rate.add_error(math.hypot(self.rounding, bent)))
+        return fit._replace(rate=fit.rate.add_error(bent))
 
     def _pressure_bends(self) -> list[Column]:
         """Build the bends [mm] of the travel by pressures that change: compression, and laws of a leak."""
         readings = self._travel_readings
-        columns = []
-        if (p := self._pressure(self.loaded)) is not None:
-            part_t, course = smooth_course(self.t, p)
-            length, deviation = self.column
-            compression = length * _compress_oil(course).sum(axis=0)
-            values = sample_course(readings, part_t, compression)
-            bend = self._bend(readings.t, values, float(compression[-1] - compression[0]))
-            columns.append(Column(bend, 1.0, math.hypot(deviation, INFERENCE.held_oil.deviation)))
-        clocks = self._clocks(readings)
+        columns, clocks = self._compression_columns(is_bend=True), self._clocks(readings)
         speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
         for k, clock in enumerate(clocks):
             if len(clocks) > 1 and k % len(EXPONENTS) != 1:  # the law between is nearly their mean
                 columns.append(Column(speed * self._bend(readings.t, clock.minutes, self.duration / 60.0), 0.0, 1.0))
         return [column for column in columns if np.ptp(column.values) > LEAST_BEND]
+
+    def _compression_columns(self, *, is_bend: bool = False) -> list[Column]:
+        """Build the columns of the travel [mm] by compression of the loaded side's oil and air, and what these leave.
+
+        `is_bend`: without the chords between their ends, which leaves no mean speed.
+        """
+        p = self._pressure(self.loaded)
+        if p is None:
+            return []
+        oil, readings, (length, deviation) = INFERENCE.held_oil, self._travel_readings, self.column
+        t, course = smooth_course(self.t, p)
+        columns = []
+        for compression, width in zip(_compress_oil(course), (oil.deviation, oil.air_deviation), strict=True):
+            travel = length * (compression - compression[0])
+            columns.append(Column(travel, 1.0, math.hypot(deviation, width)))
+            if np.ptp(travel) > LEAST_BEND:
+                columns += self._misfit(t, travel, oil.misfit * float(np.ptp(travel)))
+        if is_bend:
+            columns = [
+                entry._replace(values=self._bend(t, entry.values, float(entry.values[-1] - entry.values[0])))
+                for entry in columns
+            ]
+        return [entry._replace(values=sample_course(readings, t, entry.values)) for entry in columns]
 
     def _bend(self, t: Array, course: Array, change: float) -> Array:
         """Subtract from a `course` at times `t` [s] a line with its `change` over the hold: no mean speed is left."""
@@ -398,7 +417,7 @@ class HeldLoad:
         alternatives = [self._settling(compression, sizes), thermal]
         clocks = self._clocks(compression)[: len(EXPONENTS)]
         if len(clocks) > 1:  # a steady gain, too, whatever its law
-            clocks.append(LeakClock(clocks[0].weight, t / 60.0))
+            clocks.append(LeakClock(clocks[0].weight, t / 60.0, np.ones_like(t)))
         fit = self._fit_laws(RateRegression(compression, self.duration), base, alternatives, clocks)
         return fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
 
@@ -441,31 +460,23 @@ class HeldLoad:
         return rate_ends, (MM_PER_MINUTE * area * low, MM_PER_MINUTE * area * high)
 
     def _metered_flow(self, meter: Array) -> Mixture:
-        """Estimate the mean flow [m^3/s] of a leakage flow meter, with its zero and gain."""
+        """Estimate the mean flow [m^3/s] of a leakage flow meter, whose gain is uncertain, under each law of a leak."""
         readings = read_channel(self.t, meter, ML_PER_MINUTE)
         scale = float(np.abs(readings.values).max()) or ML_PER_MINUTE
-        t = readings.t
         scaled = readings._replace(
             values=readings.values / scale, loose=readings.loose / scale, quantum=readings.quantum / scale
         )
         regression = RateRegression(scaled, self.duration, from_first=False)
-        fit = regression.fit_rate([Column(np.ones_like(t))], [self._settling(readings, (0.1, 1.0))])
+        settling, clocks = self._settling(readings, (0.1, 1.0)), self._clocks(readings)
+        fits = [regression.fit_rate([Column(clock.flow)], [settling]) for clock in clocks]
+        logs = [math.log(clock.weight) + fit.log_evidence for clock, fit in zip(clocks, fits, strict=True)]
+        fit = pool_fits(fits, logs)
         return fit.rate.scale(scale).add_error(INFERENCE.size.meter * abs(fit.rate.mean) * scale)
 
     def _leak_by_travel(self) -> LeakEstimate:
         """Estimate the leak from the travel, corrected for the compression of the loaded chamber's oil."""
         readings = self._travel_readings
-        base, p = [Column(np.ones_like(readings.t))], self._pressure(self.loaded)
-        if p is not None:
-            length, deviation = self.column
-            oil = INFERENCE.held_oil
-            widths = (oil.deviation, oil.air_deviation)
-            part_t, course = smooth_course(self.t, p)
-            for compression, width in zip(_compress_oil(course), widths, strict=True):
-                column = length * sample_course(readings, part_t, compression - compression[0])
-                base.append(Column(column, 1.0, math.hypot(deviation, width)))
-                if np.ptp(column) > LEAST_BEND:
-                    base += self._misfit(readings.t, column, oil.misfit * float(np.ptp(column)))
+        base = [Column(np.ones_like(readings.t)), *self._compression_columns()]
         fit = self._fit_leak(self._regression, base, HOLD.settling.travel)
         return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
@@ -526,7 +537,7 @@ class HeldLoad:
         fit = self._fit_laws(regression, columns, alternatives, self._clocks(readings))
         # oil that cools unlogged follows an exponential but for a share, which is as straight as a leak
         misfit = HOLD.cooling.misfit * float(np.ptp(fit.last)) / (self.duration / 60.0)
-        return fit._replace(rate=fit.rate.add_error(math.hypot(self.rounding, misfit)))
+        return fit._replace(rate=fit.rate.add_error(misfit))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:
         """Make the curve of a hold from readings to be drawn; `factor`: from the unit of the fit to theirs."""

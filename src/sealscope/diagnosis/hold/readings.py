@@ -32,7 +32,7 @@ N_BETWEEN = 10
 SMOOTH_DEGREE, SMOOTH_TIMES, MAX_CORRELATION = 4, (0.02, 0.06, 0.2), 0.3
 #: Largest residual of such a course, root mean square over the noise of the means.
 MAX_MISFIT = 1.5
-#: Largest number of bins in which holds are sought.
+#: Largest number of bins in which holds are sought, and of readings that tell the noise meanwhile.
 MAX_BINS = 20_000
 
 
@@ -60,13 +60,10 @@ class Readings(NamedTuple):
 
 def average_parts(t: Array, values: Array, n_parts: int) -> tuple[Array, Array]:
     """Average samples (n,) at `t` [s] over `n_parts` equal times; return mean times and means of the parts with any."""
-    width = max(float(t[-1] - t[0]), np.finfo(float).tiny) / n_parts
-    part = np.minimum(((t - t[0]) / width).astype(np.intp), n_parts - 1)
-    counts = np.bincount(part, minlength=n_parts)
-    has_samples = counts > 0
-    sums = (np.bincount(part, weights=series, minlength=n_parts) for series in (t - t[0], values - values[0]))
-    times, means = (total[has_samples] / counts[has_samples] for total in sums)
-    return times + t[0], means + values[0]
+    starts = np.unique(np.searchsorted(t, t[0] + (t[-1] - t[0]) / n_parts * np.arange(n_parts)))
+    counts = np.diff(starts, append=len(t))
+    times, means = (np.add.reduceat(series - series[0], starts) / counts + series[0] for series in (t, values))
+    return times, means
 
 
 def sample_course(readings: Readings, t: Array, course: Array) -> Array:
@@ -178,7 +175,9 @@ def find_held_parts(t: Array, x: Array | None, p: Array | None) -> list[tuple[in
             continue
         bin_t, means = average_parts(t, values, n_bins)
         changes = np.abs(np.diff(means))
-        scatter = 1.4826 * float(np.median(np.abs(np.diff(values, 2)))) / 6.0**0.5
+        rows = np.arange(0, len(values) - 2, max(len(values) // MAX_BINS, 1))
+        bends = values[rows] - 2.0 * values[rows + 1] + values[rows + 2]
+        scatter = 1.4826 * float(np.median(np.abs(bends))) / 6.0**0.5
         moves = changes > fastest * np.diff(bin_t) + prior.noise * 2.0**0.5 * min(scatter, largest)
         is_moving = moves if not is_moving.size else is_moving | moves
     runs = find_runs(~is_moving)

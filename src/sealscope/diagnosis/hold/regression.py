@@ -112,7 +112,7 @@ def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
     """Pool fits (k,) whose logarithms of probability are `logs` (k,): the most probable, with the rates of all."""
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
-    rate = pool_mixtures([fit.rate for fit in fits], weights)
+    rate = pool_mixtures([fit.rate for fit in fits], weights).condense()
     return fits[int(weights.argmax())]._replace(rate=rate)
 
 
@@ -188,7 +188,7 @@ class RateRegression:
             gram, values, choices, precision, mean, int(rows[best]), float(grid[best])
         )
         return RateFit(
-            Mixture(weights[usual] / weights[usual].sum(), solution[usual, 1], solution[usual, 2]),
+            Mixture(weights[usual] / weights[usual].sum(), solution[usual, 1], solution[usual, 2]).condense(),
             design @ coefficients,
             band,
             design[:, len(coefficients) - n_last :] @ coefficients[len(coefficients) - n_last :],
