@@ -12,10 +12,10 @@ from sealscope.diagnosis.inference.balance import max_rest_rate, recorded_blocks
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, find_rests
 from sealscope.diagnosis.inference.equations.terms import TURNING
+from sealscope.diagnosis.inference.hypotheses import MachineOdds, Valves
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
-from sealscope.diagnosis.inference.volumes.volume_detector import _healthy_sign_log_odds as healthy_sign_log_odds
 from sealscope.diagnosis.inference.volumes.volume_detector import _sums_from_summary as learnt_sums
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.parameters import load_rig
@@ -95,7 +95,7 @@ def metered_press(seed: int, leak: float = 0.0, since: float = 0.0) -> Recording
 
 @cache
 def balance(seed: int, odds: float = 0.0, **options: Any) -> RecordedBalance:
-    judged = VolumeBalance(RIG).balance(press(seed, **options), odds)
+    judged = VolumeBalance(RIG).balance(press(seed, **options), MachineOdds(odds))
     assert judged is not None
     return judged
 
@@ -112,7 +112,7 @@ def test_a_valve_that_shuts_is_told_from_one_that_stays_open() -> None:
         shut, opened = (recorded_blocks(press(seed, shut=way), RIG) for way in (True, False))
         assert shut is not None and opened is not None
         assert shut.odds > 1.0 > -1.0 > opened.odds
-    assert balance(0).shut and not balance(0, shut=False).shut
+    assert balance(0).valves is Valves.SHUT and balance(0, shut=False).valves is Valves.OPEN
 
 
 def relaxing_press(seed: int, ratio: float) -> Recording:
@@ -154,7 +154,7 @@ def test_pressures_that_relax_at_rest_do_not_tell_if_a_valve_shuts(ratio: float)
 def test_behind_a_shut_valve_the_leak_is_the_pistons_alone() -> None:
     assert balance(0).conductance.high < 0.05 * PUMP
     own = balance(0, odds=10.0, leak=2e-13)
-    assert own.shut
+    assert own.valves is Valves.SHUT
     assert own.conductance.value == pytest.approx(2e-13, rel=0.01)
 
 
@@ -163,8 +163,8 @@ def test_the_pressure_of_its_own_side_drives_an_external_leak(odds: float) -> No
     """The machine is fed at 100 bar, so that p_A and p_B exceed their difference."""
     recording = press(0)
     channels = {**recording.channels, "p_A": recording["p_A"] + 1e7, "p_B": recording["p_B"] + 1e7}
-    judged = VolumeBalance(RIG).balance(Recording(recording.t, channels, recording.units, RATE), odds)
-    assert judged is not None and judged.shut == (odds > 0.0)
+    judged = VolumeBalance(RIG).balance(Recording(recording.t, channels, recording.units, RATE), MachineOdds(odds))
+    assert judged is not None and (judged.valves is Valves.SHUT) == (odds > 0.0)
     assert judged.mean_pressure() < 6e6
     for side in "AB":
         expected = float(channels[f"p_{side}"].mean()) * judged.size.scale
@@ -186,7 +186,7 @@ def test_a_drive_that_no_longer_turns_in_holds_is_no_leak_that_ends() -> None:
     """Neither past the piston nor to the outside; a leak that begins shows beside it."""
     for seed in range(3):
         switched = balance(seed, odds=10.0, holds_until=50.0)
-        assert switched.shut
+        assert switched.valves is Valves.SHUT
         assert switched.test is not None and switched.test.chance > 0.01
         assert min(test.chance for test in switched.observables if test.name != TURNING) > 1e-3
         leaking = balance(seed, odds=10.0, holds_until=50.0, leak=0.5e-13, since=60.0).test
@@ -197,15 +197,15 @@ def test_a_drive_that_no_longer_turns_in_holds_is_no_leak_that_ends() -> None:
 def test_a_press_that_keeps_up_its_pressure_for_longer_does_not_leak() -> None:
     """The pump is still connected then, and its own leakage is none of the piston's."""
     made = balance(3, kept=(1.0, 2.0))
-    assert made.shut and made.test is not None
+    assert made.valves is Valves.SHUT and made.test is not None
     assert made.test.chance > 0.01
     assert made.conductance.high < 1e-3 * PUMP
 
 
 def test_behind_a_flow_meter_a_load_that_creeps_by_a_leak_does_not_move_by_the_valve() -> None:
     for seed in range(3):
-        measured = VolumeBalance(RIG).balance(metered_press(seed, leak=2e-13, since=50.0), 10.0)
-        assert measured is not None and measured.shut and measured.test is not None
+        measured = VolumeBalance(RIG).balance(metered_press(seed, leak=2e-13, since=50.0), MachineOdds(10.0))
+        assert measured is not None and measured.separates_pump and measured.test is not None
         assert measured.test.chance < 1e-4
         assert measured.test.onset().low < 50.0 < measured.test.onset().high
         assert measured.test.fitted.value == pytest.approx(2e-13, rel=0.1)
@@ -229,7 +229,7 @@ def test_healthy_recordings_tell_which_it_is_for_a_leaking_one() -> None:
     odds = sum(summary["shut_odds"] for summary in summaries())
     assert odds > 4.0
     leaking = press(7, leak=1e-13)
-    assert balance(7, odds=odds, leak=1e-13).shut
+    assert balance(7, odds=odds, leak=1e-13).valves is Valves.SHUT
     healthy = [press(seed) for seed in range(4)]
     assert judge(detector, leaking, healthy).verdict == "leak"
 
@@ -269,16 +269,17 @@ def test_a_hold_before_the_onset_does_not_hide_the_rise_of_the_whole_recording()
 
 def test_holds_without_a_load_or_with_a_pump_that_makes_good_a_leakage_measure_none() -> None:
     """Equal pressures show no leak, and a pump that turns slower than its noise keeps up a load."""
-    loaded = balance(0, odds=10.0)
-    unloaded = balance(0, odds=10.0, loads=(-0.5, 0.5, 1.0, 0.01, 0.01, -0.5, -0.5))
-    kept_up = balance(0, odds=10.0, shut=False, servo=True, pump=5e-14, speed_noise=1.0)
-    assert loaded.locked and unloaded.locked and kept_up.locked
+    loaded = balance(0, odds=np.inf)
+    unloaded = balance(0, odds=np.inf, loads=(-0.5, 0.5, 1.0, 0.01, 0.01, -0.5, -0.5))
+    kept_up = balance(0, odds=np.inf, shut=False, servo=True, pump=5e-14, speed_noise=1.0)
+    assert {each.valves for each in (loaded, unloaded, kept_up)} == {Valves.SURELY_SHUT}
+    assert balance(0, odds=10.0).chambers is None
     assert loaded.chambers is not None and unloaded.chambers is None and kept_up.chambers is None
 
 
 @pytest.mark.parametrize("leak", few([1e-13, 0.0], 1))
 def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
-    own = balance(3, odds=10.0, leak=leak)
+    own = balance(3, odds=np.inf, leak=leak)
     assert own.chambers is not None
     assert own.chambers.leaks.piston == pytest.approx(leak, rel=0.35, abs=2e-15)
 
@@ -286,8 +287,8 @@ def test_a_locked_hold_measures_the_seal_alone(leak: float) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("leak", few([2e-14, 0.0], 1))
 def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
-    healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
-    judged = balance(7, odds=10.0, leak=leak)
+    judged = balance(7, odds=np.inf, leak=leak)
+    healthy = [learnt_sums(summary, judged.columns) for summary in summaries()]
     held, wide = BalanceLeak(judged, healthy), Rise(leak, 5e-14, np.inf)
     held.__dict__["_motion_rise"] = wide
     assert leak * judged.mean_pressure() < held.bound_flow
@@ -296,9 +297,9 @@ def test_the_bound_is_the_holds_where_they_know_better(leak: float) -> None:
 
 @pytest.mark.slow
 def test_a_rise_that_began_within_the_recording_is_dated_by_the_holds() -> None:
-    healthy = [learnt_sums(summary, shut=True, locked=True) for summary in summaries()]
     for leak, since in ((1e-13, 0.0), (1e-13, 50.0)):
-        judged = balance(7, odds=10.0, leak=leak, since=since)
+        judged = balance(7, odds=np.inf, leak=leak, since=since)
+        healthy = [learnt_sums(summary, judged.columns) for summary in summaries()]
         onset = BalanceLeak(judged, healthy).rise_onset
         assert (onset is None) == (since == 0.0)
         assert onset is None or onset.low <= since <= onset.high
@@ -346,10 +347,21 @@ def test_the_sense_of_a_flow_is_that_of_the_force_on_both_areas() -> None:
 def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
     rewired = INFERENCE.sense.rewired
     summaries = [{"sign_log_odds": np.array([12.0])}] * 9
-    assert healthy_sign_log_odds(summaries, 1) == pytest.approx(np.log((1.0 - rewired) / rewired))
-    assert healthy_sign_log_odds([{}], 1) == 0.0
+    assert MachineOdds.from_healthy(summaries, 1).flow_sign == pytest.approx(np.log((1.0 - rewired) / rewired))
+    assert MachineOdds.from_healthy([{}], 1).flow_sign == 0.0
     other_channels = {"sign_log_odds": np.array([-1.0, 2.0])}
-    np.testing.assert_array_equal(healthy_sign_log_odds([*summaries, other_channels], 2), [-1.0, 2.0])
+    np.testing.assert_array_equal(MachineOdds.from_healthy([*summaries, other_channels], 2).flow_sign, [-1.0, 2.0])
+
+
+def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> None:
+    prior, limit, sure = INFERENCE.rest.valves, INFERENCE.rest.alone, INFERENCE.rest.locked
+    assert MachineOdds.from_healthy([{}], 1) == MachineOdds(flow_sign=np.zeros(1))
+    doubtful = [{"shut_odds": 0.5}, {"shut_odds": -9.0}, {}]
+    assert MachineOdds.from_healthy(doubtful, 1).valves == pytest.approx(prior + 0.5 - limit)
+    assert MachineOdds.from_healthy(doubtful, 1, scatter_log_odds=2.0).valves == pytest.approx(prior + 2.5 - limit)
+    for key in ("shut_odds", "held_odds"):
+        assert MachineOdds.from_healthy([{key: sure + 0.1}, {}], 1).is_valve_certain
+        assert not MachineOdds.from_healthy([{key: sure - 0.1}], 1).is_valve_certain
 
 
 def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump() -> None:

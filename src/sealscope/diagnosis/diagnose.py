@@ -32,6 +32,7 @@ from sealscope.diagnosis.hold.recorded_holds import (
     held_leakage,
     summarise_hold,
 )
+from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
@@ -107,9 +108,8 @@ class Examination:
         """
         # tests may replace the built-in detectors, so that there is no volume balance
         leak = self.report(VOLUME_BALANCE).leak if VOLUME_BALANCE in detectors() else None
-        # `shut`: the valves cut the pump off at rest; `locked`: they also hold the load then
-        is_shut_at_rest = isinstance(leak, BalanceLeak) and (leak.balance.shut or leak.balance.locked)
-        return healthy_null(self.baseline, load_rig(self.rig), shut=is_shut_at_rest)
+        is_shut = isinstance(leak, BalanceLeak) and leak.balance.valves is not Valves.OPEN
+        return healthy_null(self.baseline, load_rig(self.rig), Valves.SHUT if is_shut else Valves.OPEN)
 
     def evidence(self, name: str) -> Evidence:
         """Decide from the observations of the detector called `name` alone if the machine leaks.

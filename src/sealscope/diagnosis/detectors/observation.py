@@ -23,6 +23,7 @@ from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS, observe_signals
+from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.learnt import keep_once, learn_once
@@ -125,13 +126,13 @@ def _unusable_baseline(detector: Detector, healthy: Healthy) -> str | None:
     return None if has_summary else "its samples were not kept, and it has no summary for this method"
 
 
-def healthy_surprisals(recording: Recording, rig: Rig, *, shut: bool = False) -> Mapping[str, float]:
+def healthy_surprisals(recording: Recording, rig: Rig, valves: Valves = Valves.OPEN) -> Mapping[str, float]:
     """Compute the surprisal of each change within a healthy recording, by its key (`null.null_key`); cached.
 
-    `shut`: true to assume that valves cut the pump off at rest.
+    `valves`: those that are assumed at rest, open or shut.
     """
-    key = (SURPRISALS, "shut" if shut else "open")
-    return learn_once(recording, key, lambda samples: _compute_surprisals(samples, rig, shut), rig)
+    key = (SURPRISALS, valves.value)
+    return learn_once(recording, key, lambda samples: _compute_surprisals(samples, rig, valves), rig)
 
 
 def stored_surprisals(recording: Recording, rig: Rig) -> dict[str, float]:
@@ -139,22 +140,22 @@ def stored_surprisals(recording: Recording, rig: Rig) -> dict[str, float]:
 
     Those under the assumption that they cut the pump off have keys that begin with `SHUT`, where they differ.
     """
-    by_open, by_shut = (healthy_surprisals(recording, rig, shut=shut) for shut in (False, True))
+    by_open, by_shut = (healthy_surprisals(recording, rig, valves) for valves in (Valves.OPEN, Valves.SHUT))
     differing = {key: surprisal for key, surprisal in by_shut.items() if surprisal != by_open.get(key)}
     return {**by_open, **{f"{SHUT}{key}": surprisal for key, surprisal in differing.items()}}
 
 
-def _compute_surprisals(recording: Recording, rig: Rig, shut: bool) -> Mapping[str, float]:
+def _compute_surprisals(recording: Recording, rig: Rig, valves: Valves) -> Mapping[str, float]:
     """Compute the surprisals of changes of the signals and of the volume balance within a recording, by their keys.
 
-    `shut`: as in `healthy_surprisals`. Without a balance the pressure response, which then judges, is tested.
+    `valves`: as in `healthy_surprisals`. Without a balance the pressure response, which then judges, is tested.
     """
     surprisals = _max_surprisals(observe_signals(recording))
     balance, report = VolumeBalance(rig), None
     if unusable_reason(balance, recording) is None:
         try:
             with np.errstate(all="ignore"):
-                report = balance.observe_alone(recording, shut=shut)
+                report = balance.observe_alone(recording, valves)
         except Exception as error:
             log_failure(balance.name, distribution=None, error=error)
     if report is None and PRESSURE_RESPONSE in detectors():
@@ -174,21 +175,20 @@ def _max_surprisals(report: Observed) -> dict[str, float]:
     return surprisals
 
 
-def healthy_null(baseline: Sequence[Healthy], rig: Rig, *, shut: bool = False) -> HealthyNull:
+def healthy_null(baseline: Sequence[Healthy], rig: Rig, valves: Valves = Valves.OPEN) -> HealthyNull:
     """Collect the surprisals of all tests in healthy recordings, as the null distributions of the tests.
 
     Each test for a change within a recording has a list (`null_key`) with one value from each recording. Comparisons
     with other recordings share one list for each kind of data (`comparison_key`): each recording is compared with all
-    others, and the largest surprisal counts. With `shut`, the volume balance assumes that valves cut the pump off at
-    rest.
+    others, and the largest surprisal counts. `valves`: those that the volume balance assumes at rest, open or shut.
     """
     surprisals_by_key = defaultdict[str, list[float]](list)
     for healthy in baseline:
         if isinstance(healthy, Recording):
-            surprisals = healthy_surprisals(healthy, rig, shut=shut)
+            surprisals = healthy_surprisals(healthy, rig, valves)
         else:
             surprisals = healthy.statistics
-            shut_keys = [key for key in surprisals if shut and key.startswith(SHUT)]
+            shut_keys = [key for key in surprisals if valves is Valves.SHUT and key.startswith(SHUT)]
             surprisals = {**surprisals, **{key.removeprefix(SHUT): surprisals[key] for key in shut_keys}}
         for key, surprisal in surprisals.items():
             surprisals_by_key[key].append(surprisal)

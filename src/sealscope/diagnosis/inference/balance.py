@@ -47,6 +47,7 @@ from sealscope.diagnosis.inference.equations.signals import (
     find_rests,
 )
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
+from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.pressure_offset import (
     area_mismatch,
     fit_pressure_offset,
@@ -741,7 +742,7 @@ class RegimeBlocks(NamedTuple):
 
     - `blocks`, `plain`: the blocks after removal of the sensor offset of p_A - p_B, and with p_A - p_B as recorded;
     - `equations`: the volume balances; `columns`: the roles of their columns;
-    - `shut`: true if valves cut the pump off from the cylinder while it rests, false if it stays connected;
+    - `valves`: the assumption;
     - `delay_changes`: changes of channels' delays that were removed before; `delay_tests`: tests for them.
     """
 
@@ -749,7 +750,7 @@ class RegimeBlocks(NamedTuple):
     plain: Blocks
     equations: tuple[Equation, ...]
     columns: tuple[ColumnRoles, ...]
-    shut: bool = False
+    valves: Valves = Valves.OPEN
     delay_changes: tuple[DelayChange, ...] = ()
     delay_tests: tuple[DelayTest, ...] = ()
 
@@ -858,24 +859,24 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
     odds = shut_odds(recorded, columns) if may_shut else 0.0
     has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.lasting
 
-    def compute_regime_blocks(offset: float, shut: bool) -> Blocks:
-        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for open or `shut` valves at rest."""
+    def compute_regime_blocks(offset: float, valves: Valves) -> Blocks:
+        """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for these `valves` at rest."""
         blocks = compute_blocks(offset)
-        if not may_shut:
-            return blocks
-        return apply_regime(blocks, columns, shut, has_holds=has_holds, is_certain=odds > INFERENCE.rest.locked)
+        return apply_regime(blocks, columns, valves, has_holds=has_holds) if may_shut else blocks
 
     delays: dict[str, Any] = {"delay_changes": aligned.changes, "delay_tests": aligned.tests}
     # stated areas are exact, to within tolerances
     ratio_deviation: float = (
         INFERENCE.size.area if rig.states("cylinder.A_A", "cylinder.A_B") else INFERENCE.held_oil.sides_deviation
     )
-    open_blocks, shut_blocks = (partial(compute_regime_blocks, shut=shut) for shut in (False, True))
+    open_blocks = partial(compute_regime_blocks, valves=Valves.OPEN)
     open_regime = _build_regime(balances, open_blocks, ratio_deviation)._replace(**delays)
     if not may_shut or not has_rests(recorded, columns):
         return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds, holds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut_regime = _build_regime(shut_balances, shut_blocks, ratio_deviation)._replace(shut=True, **delays)
+    shut = Valves.SURELY_SHUT if odds > INFERENCE.rest.locked else Valves.SHUT
+    shut_blocks = partial(compute_regime_blocks, valves=shut)
+    shut_regime = _build_regime(shut_balances, shut_blocks, ratio_deviation)._replace(valves=Valves.SHUT, **delays)
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds, holds)
 
 

@@ -32,6 +32,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LEAK, MOVING_BIAS, STATES, TURNING
+from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
@@ -41,8 +42,8 @@ NEGLIGIBLE = 1e-6
 MIN_STATE_BLOCKS = 2
 
 
-def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: bool, is_certain: bool) -> Blocks:
-    """Convert blocks to the volume balance for valves that are open, or `shut`, while the pump rests.
+def apply_regime(blocks: Blocks, roles: ColumnRoles, valves: Valves, *, has_holds: bool) -> Blocks:
+    """Convert blocks to the volume balance for `valves` that are open, or shut, while the pump rests.
 
     `roles` includes the columns `STATES` that `balances.with_rests` adds.
 
@@ -53,18 +54,18 @@ def apply_regime(blocks: Blocks, roles: ColumnRoles, shut: bool, *, has_holds: b
       coefficient describes the holds as well.
 
     If all holds are short and the pump is off at other times, the machine is a press, whose pump builds up the pressure
-    through open valves in these holds. If its valves are certainly shut at rest (`is_certain`, by their log odds),
-    holds count as motion: the column `HOLDING` is added to the column `TURNING` before it is set to zero.
+    through open valves in these holds. If its valves are certainly shut at rest (`Valves.SURELY_SHUT`), holds count as
+    motion: the column `HOLDING` is added to the column `TURNING` before it is set to zero.
     """
     names = (*roles.names, "left")  # the last column is the left side of the balance
-    if not shut:
+    if valves is Valves.OPEN:
         columns = [k for k, name in enumerate(names) if name not in STATES]
         return replace(blocks, gram=np.asarray(blocks.gram[..., columns, :][..., columns]))
     moving_bias, turning, holding = (names.index(name) for name in (MOVING_BIAS, TURNING, HOLDING))
     columns = [moving_bias if name == BIAS else k for k, name in enumerate(names) if name != MOVING_BIAS]
     gram = blocks.gram.copy()
     is_always_on = _rest_share(blocks, roles, TURNING, HOLDING) < NEGLIGIBLE  # the pump moves or holds the load
-    if is_certain and not is_always_on and not has_holds:
+    if valves is Valves.SURELY_SHUT and not is_always_on and not has_holds:
         gram[..., turning, :] += gram[..., holding, :]
         gram[..., turning] += gram[..., holding]
     if not has_holds or is_always_on:

@@ -59,7 +59,9 @@ class BalanceLeak(LeakMeasure):
             return "piston or external leak"
         hold_rise, chambers = self._rises.get(True), balance.chambers
         is_in_holds = (
-            hold_rise is not None and hold_rise is self.rise and (balance.shut or hold_rise.chance < prior.significance)
+            hold_rise is not None
+            and hold_rise is self.rise
+            and (balance.separates_pump or hold_rise.chance < prior.significance)
         )
         if is_in_holds and chambers is not None:
             # with one chamber open to the tank, the other loses oil alike by a leak past the piston or to the outside
@@ -137,7 +139,7 @@ class BalanceLeak(LeakMeasure):
         recording: its error exceeds both the error and the value of that rise.
         """
         motion_rise = self._motion_rise
-        if not self.balance.locked or motion_rise is None:
+        if motion_rise is None:
             return None
         hold_rise = held_rise(self.balance.recording_sums, self.healthy)
         if hold_rise is None:
@@ -457,7 +459,7 @@ class BalanceLeak(LeakMeasure):
         onset if the total leakage is not known block by block: shut valves separate pump and piston at rest.
         """
         balance = self.balance
-        if not balance.size.stated or (onset_s is None and (balance.shut or balance.total_flow is None)):
+        if not balance.size.stated or (onset_s is None and (balance.separates_pump or balance.total_flow is None)):
             return None
         if onset_s is None:
             blocks, history = balance.blocks, balance.total_history

@@ -56,7 +56,8 @@ from sealscope.diagnosis.inference.equations.signals import (
     find_rests,
     interval_means,
 )
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, LOCKED, Equation
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, LOCKED, TURNING, Equation
+from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
@@ -113,8 +114,8 @@ class RecordedBalance:
       a servo valve, one for each chamber; and the roles of their columns.
     - `oil_loss`: tests for external leaks by the volume of the accumulator, by the name of the term.
     - `plain`: the blocks without the correction of the pressure offset, None if there is no such correction.
-    - `shut`: true if valves cut the pump off at rest, so that only the piston leaks then (`regimes`).
-    - `locked`: true if shut valves hold the load at rest, so that these times measure the leaks (`chambers`).
+    - `valves`: those between pump and cylinder at rest; if they hold the load, these times measure the leaks
+      (`chambers`).
     - `known_stroke`: ends of the motion in other recordings of the machine [m], None if unknown.
     - `delay_changes`: changes of channels' delays, which the blocks no longer contain; `delay_tests`: tests for them.
     - `by_state`: the blocks for shut valves, which separate the states of the pump; None if it never rests.
@@ -127,8 +128,7 @@ class RecordedBalance:
     recording: Recording
     oil_loss: Mapping[str, StepTest] = field(default_factory=dict)
     plain: Blocks | None = None
-    shut: bool = False
-    locked: bool = False
+    valves: Valves = Valves.OPEN
     known_stroke: tuple[float, float] | None = None
     delay_changes: tuple[DelayChange, ...] = ()
     delay_tests: tuple[DelayTest, ...] = ()
@@ -138,6 +138,11 @@ class RecordedBalance:
     def is_creep(self) -> bool:
         """True if the balance's flow is the creep of a load that valves hold, since no pump's flow is known."""
         return self.equations[0].name == LOCKED
+
+    @property
+    def separates_pump(self) -> bool:
+        """True if the pump's leakage has terms of its own, as valves cut it off at rest (`regimes`)."""
+        return TURNING in self.columns[0].names
 
     @cached_property
     def _first_motion(self) -> int:
@@ -251,9 +256,10 @@ class RecordedBalance:
     def chambers(self) -> HeldChambers | None:
         """Estimator of the chambers' leaks from holds: times in which the pump rests and shut valves hold the load.
 
-        None without `locked`, without a long and loaded hold, or if pressures have no unit or the areas are unknown.
+        None unless `valves` hold the load for long, or if pressures have no unit or the areas are unknown.
         """
-        sides = self._cylinder_sides() if self.locked and self.recording.units["p_A"] != COUNTS else None
+        is_held = self.valves is Valves.SURELY_SHUT
+        sides = self._cylinder_sides() if is_held and self.recording.units["p_A"] != COUNTS else None
         if sides is None:
             return None
         recording, pumped = self.recording, self._pumped

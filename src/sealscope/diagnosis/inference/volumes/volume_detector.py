@@ -29,6 +29,7 @@ from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
+from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, MachineOdds, Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
 from sealscope.diagnosis.inference.regimes import add_pump_columns
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
@@ -39,7 +40,7 @@ from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Array, Recording, compute_once
+from sealscope.recordings.recording import Recording, compute_once
 
 if TYPE_CHECKING:
     from sealscope.parameters import Rig
@@ -104,31 +105,21 @@ class VolumeBalance:
                 return f"{name} is constant or missing"
         return None
 
-    def balance(
-        self,
-        recording: Recording,
-        odds: float = INFERENCE.rest.valves,
-        *,
-        is_locked: bool = False,
-        sign_log_odds: Array | float = 0.0,
-        healthy_holds: HoldCounts | None = None,
-    ) -> RecordedBalance | None:
+    def balance(self, recording: Recording, odds: MachineOdds = PRIOR_ODDS) -> RecordedBalance | None:
         """Set up the volume balance of a recording; return None if its channels or its length allow no balance.
 
-        `odds`: log odds, before this recording, that valves cut a resting pump off from the cylinder; `is_locked`: true
-        if healthy recordings show that they do; `sign_log_odds` (E,): log odds from healthy recordings that the
-        recorded flow has the right sign, for each of E balance equations; `healthy_holds`: as in `_compute_blocks`.
+        `odds`: what is known of the machine before this recording.
         """
         if not equations(self.rig, frozenset(recording.channels)):
-            return self._balance_without_position(recording)
-        recorded = self._compute_blocks(recording, healthy_holds)
-        if recorded is None:
+            balance = self._balance_without_position(recording)
+        elif (recorded := self._compute_blocks(recording, odds.holds)) is None:
             return None
-        recorded = recorded.with_sign_prior(np.asarray(sign_log_odds))
-        # limits the log odds of this recording alone, since a leak in it can look like open valves
-        max_odds: float = INFERENCE.rest.alone
-        odds = np.inf if is_locked else odds + float(np.clip(recorded.odds, -max_odds, max_odds))
-        return self._build_balance(recording, recorded.regime(odds), recorded.shut)
+        else:
+            recorded = recorded.with_sign_prior(np.asarray(odds.flow_sign))
+            # a leak in this recording can look like open valves, so its evidence is limited
+            regime = recorded.regime(float(VALVES._replace(prior=odds.valves).add([recorded.odds])))
+            balance = self._build_balance(recording, regime, recorded.shut)
+        return replace(balance, valves=Valves.SURELY_SHUT) if balance is not None and odds.is_valve_certain else balance
 
     def _balance_without_position(self, recording: Recording) -> RecordedBalance | None:
         """Choose the volume balance with the smallest upper bound of a leak, without a position or without a flow.
@@ -174,9 +165,8 @@ class VolumeBalance:
         )
         return RecordedBalance(
             regime.blocks, regime.equations, regime.columns, self.rig, recording, oil_loss,
-            plain=regime.plain, shut=regime.shut, locked=regime.shut,  # shut valves hold the load
+            plain=regime.plain, valves=regime.valves, by_state=by_state,
             delay_changes=regime.delay_changes, delay_tests=regime.delay_tests,
-            by_state=by_state,
         )  # fmt: skip
 
     def learn(self, recording: Recording) -> Summary | None:
@@ -218,7 +208,7 @@ class VolumeBalance:
             summary["sign_log_odds"] = np.array(recorded.sign_log_odds)
             summary["holds"] = np.array(recorded.holds)
         if recorded is not None and recorded.shut is not None:
-            shut_balance = self._build_balance(recording, recorded.shut)  # supposing that valves hold the load
+            shut_balance = replace(self._build_balance(recording, recorded.shut), valves=Valves.SURELY_SHUT)
             shut_sums, hold_odds = shut_balance.recording_sums, shut_balance.locked_log_odds(balance.conductance)
             summary |= {"shut_sums": shut_sums.sums, "shut_odds": recorded.odds}
             summary |= {"held": shut_sums.held, "held_odds": hold_odds, "held_pump": shut_sums.held_pump}
@@ -232,40 +222,39 @@ class VolumeBalance:
         and pressure. `channels`: channels of the recordings; `n_repeats`: number of times that each healthy recording
         counts, as if it were repeated on later days.
         """
-        shut = _are_valves_shut(summaries) or self._shut_log_odds(summaries, channels) > 0.0
-        healthy = [_sums_from_summary(summary, shut) for summary in summaries]
+        odds = self._learn_odds(summaries, channels)
+        columns = self._columns(channels, Valves.SHUT if odds.valves > 0.0 else Valves.OPEN)
+        healthy = [_sums_from_summary(summary, columns) for summary in summaries]
         repetitions = [sums._replace(start_s=_shift_start(sums, k)) for k in range(n_repeats) for sums in healthy]
         flow, pressure = (float(np.median([summary[name] for summary in summaries])) for name in ("flow", "pressure"))
         typical = healthy[0]._replace(flow=flow, pressure=pressure, start_s=None, held=None)
         first_dated = next((sums for sums in healthy if sums.start_s is not None), typical)
         # after all repetitions; undated if no healthy recording has a date
         later_recording = typical._replace(start_s=_shift_start(first_dated, n_repeats))
-        return rise(later_recording, repetitions, self._columns(channels, shut))
+        return rise(later_recording, repetitions, columns)
 
-    def _shut_log_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> float:
-        """Compute the log odds that valves cut the pump off at rest, from summaries of healthy recordings (`learn`).
+    def _learn_odds(self, summaries: Sequence[Summary], channels: frozenset[str]) -> MachineOdds:
+        """Learn the odds of what is unknown about the machine from summaries of healthy recordings (`learn`).
 
-        Each recording adds those from its leakage at rest and in motion (`regimes.shut_odds`) to the prior log odds
-        `rest.valves` (`priors.toml`). The right assumption on the valves also makes the estimated leakage scatter less:
-        n recordings (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if open / scatter if shut).
+        The right assumption on the valves also makes the estimated leakage scatter less: n recordings with rests
+        (`MIN_FOR_SCATTER` or more) together add (n - 1) log(scatter if open / scatter if shut) to its log odds.
         """
-        with_rests = [summary for summary in summaries if "shut_sums" in summary]
-        odds = float(INFERENCE.rest.valves + _sum_log_odds(with_rests, "shut_odds"))
-        if len(with_rests) < MIN_FOR_SCATTER:
-            return odds
-        scatter = []
-        for shut in (False, True):
-            sums = [_sums_from_summary(summary, shut) for summary in with_rests]
-            values = leak_deviations_from_mean(sums, self._columns(channels, shut))
-            scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
-        return odds + (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
+        with_rests, log_ratio = [summary for summary in summaries if "shut_sums" in summary], 0.0
+        if len(with_rests) >= MIN_FOR_SCATTER:
+            scatter = []
+            for valves in (Valves.OPEN, Valves.SHUT):
+                columns = self._columns(channels, valves)
+                values = leak_deviations_from_mean([_sums_from_summary(each, columns) for each in with_rests], columns)
+                scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
+            log_ratio = (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
+        return MachineOdds.from_healthy(summaries, len(equations(self.rig, channels)), log_ratio)
 
-    def _columns(self, channels: frozenset[str], shut: bool) -> list[ColumnRoles]:
-        """Return the column roles of each volume balance of channels with a position, for open or `shut` valves."""
+    def _columns(self, channels: frozenset[str], valves: Valves) -> list[ColumnRoles]:
+        """Return the column roles of each volume balance of channels with a position, for open or shut `valves`."""
         balances = equations(self.rig, channels)
         if not balances and (hold_balance := locked(self.rig, channels)) is not None:
             balances = (hold_balance,)
-        return [ColumnRoles(shut_at_rest(equation) if shut else equation) for equation in balances]
+        return [ColumnRoles(equation if valves is Valves.OPEN else shut_at_rest(equation)) for equation in balances]
 
     def observe(self, recording: Recording, baseline: Sequence[Healthy] = ()) -> Observed:
         """Test each term of a recording's volume balance for a step, measure the leakage, and report both.
@@ -275,45 +264,38 @@ class VolumeBalance:
         cannot be measured, the report says what is missing.
         """
         summaries = healthy_summaries(self, baseline)
-        is_locked = _are_valves_shut(summaries)
-        channels = frozenset(recording.channels)
-        odds = self._shut_log_odds(summaries, channels)
-        sign_log_odds = _healthy_sign_log_odds(summaries, len(equations(self.rig, channels)))
-        healthy_holds = _count_holds(summaries)
-        balance = self.balance(
-            recording, odds, is_locked=is_locked, sign_log_odds=sign_log_odds, healthy_holds=healthy_holds
-        )
+        odds = self._learn_odds(summaries, frozenset(recording.channels))
+        balance = self.balance(recording, odds)
         has_flow, has_position = flow_source(recording.channels) is not None, "x" in recording
         if balance is None and (has_flow or not has_position):
-            if equations(self.rig, channels):
+            if equations(self.rig, frozenset(recording.channels)):
                 return Observed(self.name, lack=f"finds the recording too short, {recording.duration:.3g} s")
             needed = f"; it needs {self.rig.circuit.needed_channels}" if has_position else ""
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration) + needed)
         # a balance without a flow (`is_creep`) shows the leakage only if no loop controls the position: a meter,
         # speed or command of the pump is recorded, or the load creeps in the healthy recordings as well
-        is_held = has_flow or _sum_log_odds(summaries, "creep_odds") > 0.0
-        if balance is None or (balance.is_creep and not is_held):
+        if balance is None or (balance.is_creep and not (has_flow or odds.creep > 0.0)):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
-        balance = replace(balance, locked=is_locked, known_stroke=_joint_stroke(summaries))
+        balance = replace(balance, known_stroke=_joint_stroke(summaries))
         # the summaries list the terms without those that only a balance for shut valves has
         names = [name for name in balance.columns[0].names if name not in (TURNING, HOLDING)]
         comparable = [summary for summary in summaries if summary["terms"] == names]
-        healthy = [_sums_from_summary(summary, balance.shut, balance.locked) for summary in comparable]
+        healthy = [_sums_from_summary(summary, balance.columns) for summary in comparable]
         report = self._report(balance, healthy)
         if comparable or not summaries or report.lack:
             return report
         return replace(report, refusal="the channels of the healthy recordings give another balance of volumes")
 
-    def observe_alone(self, recording: Recording, *, shut: bool) -> Observed | None:
+    def observe_alone(self, recording: Recording, valves: Valves) -> Observed | None:
         """Report on a recording without a baseline; None without a balance.
 
-        `shut`: true to assume, if the pump rests in the recording, that valves then cut it off from the cylinder.
+        `valves`: those that are assumed if the pump rests in the recording.
         """
         recorded = self._compute_blocks(recording)
         if recorded is None:
             balance = self.balance(recording)  # a balance without a position, or None
         else:
-            regime = recorded.shut if shut and recorded.shut is not None else recorded.open
+            regime = recorded.regime(-np.inf if valves is Valves.OPEN else np.inf)
             balance = self._build_balance(recording, regime, recorded.shut)
         return None if balance is None else self._report(balance, ())
 
@@ -375,44 +357,10 @@ def compare_motion(
         yield observable
 
 
-def _healthy_sign_log_odds(summaries: Sequence[Summary], n_balances: int) -> Array:
-    """Add the log odds of all healthy recordings that the recorded flow has the right sign, (`n_balances`,).
-
-    `summaries` with another number of balances are omitted. The sums are limited, since the sensor may have been
-    reversed since these recordings (`sense.rewired` of `priors.toml`).
-    """
-    recorded = (summary.get("sign_log_odds", ()) for summary in summaries)
-    total = sum((values for values in recorded if len(values) == n_balances), start=np.zeros(n_balances))
-    rewired: float = INFERENCE.sense.rewired
-    limit = float(np.log((1.0 - rewired) / rewired))
-    return np.clip(total, -limit, limit)
-
-
-def _count_holds(summaries: Sequence[Summary]) -> HoldCounts | None:
-    """Add the holds of all healthy recordings; None if none is known."""
-    counts = np.sum([np.zeros(2), *(summary["holds"] for summary in summaries if "holds" in summary)], axis=0)
-    return HoldCounts(*map(int, counts)) if counts.any() else None
-
-
 def _joint_stroke(summaries: Sequence[Summary]) -> tuple[float, float] | None:
     """Return the ends of the motion in all recordings with the given `summaries` [m]; None if none has a position."""
     strokes = [summary["stroke"] for summary in summaries if "stroke" in summary]
     return (float(min(low for low, _ in strokes)), float(max(high for _, high in strokes))) if strokes else None
-
-
-def _sum_log_odds(summaries: Sequence[Summary], key: str) -> float:
-    """Add the log odds `key` of all summaries, each limited to +-`rest.alone` (`priors.toml`) and 0 if missing."""
-    max_odds: float = INFERENCE.rest.alone
-    return float(np.sum(np.clip([summary.get(key, 0.0) for summary in summaries], -max_odds, max_odds)))
-
-
-def _are_valves_shut(summaries: Sequence[Summary]) -> bool:
-    """Return True if the healthy recordings show that valves cut the pump off at rest.
-
-    Their mean log odds from all rests ("shut_odds") or from rests under load ("held_odds") must exceed `rest.locked`.
-    """
-    log_odds = ([summary[key] for summary in summaries if key in summary] for key in ("shut_odds", "held_odds"))
-    return any(bool(odds) and float(np.mean(odds)) > INFERENCE.rest.locked for odds in log_odds)
 
 
 def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
@@ -423,17 +371,16 @@ def _shift_start(recorded: RecordingSums, n_ages: int) -> float | None:
     return None if recorded.start_s is None else recorded.start_s + n_ages * _MAX_AGE_S
 
 
-def _sums_from_summary(summary: Summary, shut: bool = False, locked: bool = False) -> RecordingSums:
-    """Restore the sums of a healthy recording from its summary (`learn`).
+def _sums_from_summary(summary: Summary, columns: Sequence[ColumnRoles]) -> RecordingSums:
+    """Restore the sums of a healthy recording from its summary (`learn`), for the balances with the given `columns`.
 
-    `shut`: true for the Gram matrices under the assumption that valves cut the pump off at rest. These have additional
-    columns for the pump's leakage, which are added here if the recording has no rests. `locked`: true to include the
-    leaks measured while valves hold the load.
+    If these have columns for the leakage of a pump that valves cut off at rest, so have the Gram matrices; they are
+    added here if the recording has no rests.
     """
     sums = np.asarray(summary["sums"], dtype=float)
-    if shut:
+    if TURNING in columns[0].names:
         sums = np.asarray(summary["shut_sums"]) if "shut_sums" in summary else add_pump_columns(sums, summary["terms"])
-    names = ["resistance", *(("held", "held_pump") if locked else ())]
+    names = ("resistance", "held", "held_pump")
     measured = {name: np.asarray(summary[name], dtype=float) for name in names if name in summary}
     start_s, oil_degC = summary.get("start_s"), summary.get("oil_degC")
     return RecordingSums(sums, summary["flow"], summary["pressure"], start_s, oil_degC, **measured)

@@ -1,0 +1,109 @@
+"""What is not known about a machine: alternatives of which one is true, their prior odds, and the evidence for each.
+
+| unknown | alternatives | prior (`priors.toml`) | evidence of a recording | here |
+| --- | --- | --- | --- | --- |
+| valves at rest | `Valves` | `rest.valves` | `regimes.shut_odds` | `VALVES` |
+| sign of the recorded flow | right, reversed | equal | `rows.flow_sign` | `FLOW_SIGN` |
+| held load without a flow | creeps by leakage, a loop holds it | equal | `RecordedBalance.creep_log_odds` | `CREEP` |
+| flow at rest | circulates, holds the load | `feed.circulates` | `feed.flag_circulation` | `HoldCounts` |
+| chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `feed.FeedSums.find_feed` | |
+| zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
+| law of the leak | laminar to orifice | `size.laminar` | `leak_law`, `comparison.laws` | |
+
+The first four are the same in all recordings of a machine, so their log odds add up: those of the healthy recordings,
+from their summaries, are the prior of the judged one (`MachineOdds`). The others are decided, or averaged over, in each
+recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.inference.equations.feed import HoldCounts
+from sealscope.diagnosis.priors.inference import INFERENCE
+from sealscope.recordings.recording import Array
+
+
+class Valves(Enum):
+    """Valves between pump and cylinder while the pump rests.
+
+    `OPEN`: they connect the two; `SHUT`: they probably cut the pump off, so that only the piston leaks at rest;
+    `SURELY_SHUT`: they surely do, so that the leaks can be measured in the holds of a load.
+    """
+
+    OPEN = "open"
+    SHUT = "shut"
+    SURELY_SHUT = "surely shut"
+
+
+class Unknown(NamedTuple):
+    """Two alternatives: log odds of the first before any recording, and limits of the evidence.
+
+    The log odds of one recording are believed up to +-`one`, since something else may cause them, and those of all up
+    to +-`all`, since the machine may have been changed.
+    """
+
+    prior: float = 0.0
+    one: float = np.inf
+    all: float = np.inf
+
+    def add(self, log_odds: Any) -> Array:
+        """Add the log odds (n, ...) of n recordings to those of the prior."""
+        evidence = np.sum(np.clip(log_odds, -self.one, self.one), axis=0)
+        return np.asarray(self.prior + np.clip(evidence, -self.all, self.all))
+
+
+VALVES = Unknown(INFERENCE.rest.valves, one=INFERENCE.rest.alone)
+FLOW_SIGN = Unknown(all=float(np.log(1.0 / INFERENCE.sense.rewired - 1.0)))
+CREEP = Unknown(one=INFERENCE.rest.alone)
+
+
+class MachineOdds(NamedTuple):
+    """What is assumed of a machine before a recording of it is seen; by default without healthy recordings.
+
+    - `valves`: log odds that valves cut a resting pump off, infinite if the healthy recordings leave no doubt;
+    - `flow_sign` (E,): log odds of each balance that the recorded flow has the right sign;
+    - `creep`: log odds that a held load creeps by leakage, rather than that a control loop holds it;
+    - `holds`: holds of an open circuit, None if none is known.
+    """
+
+    valves: float = VALVES.prior
+    flow_sign: Array | float = FLOW_SIGN.prior
+    creep: float = CREEP.prior
+    holds: HoldCounts | None = None
+
+    @classmethod
+    def from_healthy(cls, summaries: Sequence[Summary], n_balances: int, scatter_log_odds: float = 0.0) -> MachineOdds:
+        """Add the evidence of healthy recordings, from their `summaries` (`VolumeBalance.learn`).
+
+        `n_balances`: number of balances E of the judged recording; healthy recordings with another number tell nothing
+        of the signs. `scatter_log_odds`: log odds of shut valves by the scatter of the healthy leakages. The valves
+        hold a load for certain if the mean log odds of all rests, or of the rests under load, exceed `rest.locked`
+        (`priors.toml`).
+        """
+        by_rests, by_holds, signs, creep, holds = (
+            [summary[key] for summary in summaries if key in summary]
+            for key in ("shut_odds", "held_odds", "sign_log_odds", "creep_odds", "holds")
+        )
+        is_certain = any(odds and float(np.mean(odds)) > INFERENCE.rest.locked for odds in (by_rests, by_holds))
+        counts = np.sum([np.zeros(2), *holds], axis=0)
+        return cls(
+            valves=np.inf if is_certain else float(VALVES.add(by_rests)) + scatter_log_odds,
+            flow_sign=FLOW_SIGN.add([np.zeros(n_balances), *(odds for odds in signs if len(odds) == n_balances)]),
+            creep=float(CREEP.add(creep)),
+            holds=HoldCounts(*map(int, counts)) if counts.any() else None,
+        )
+
+    @property
+    def is_valve_certain(self) -> bool:
+        """True if the healthy recordings leave no doubt that shut valves hold a load at rest (`Valves.SURELY_SHUT`)."""
+        return self.valves == np.inf
+
+
+#: The odds without healthy recordings.
+PRIOR_ODDS = MachineOdds()
