@@ -27,7 +27,7 @@ from sealscope.diagnosis.inference.balance import (
     find_rest_limits,
 )
 from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.equations.terms import LOCKED, START
+from sealscope.diagnosis.inference.equations.terms import START, Flow
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig
@@ -88,7 +88,7 @@ def compute_flow_curves(
     with limit_threads(), np.errstate(all="ignore"):
         if detector.usable(part) is not None or (balance := detector.balance(part)) is None:
             return None
-        number, by_piston = "AB".index(chamber), len(balance.equations) > 1
+        number = "AB".index(chamber)
         if number >= len(balance.equations):
             return None
         equation, roles, blocks = balance.equations[number], balance.columns[number], balance.blocks
@@ -123,7 +123,7 @@ def compute_flow_curves(
             name = _PARTS.get(term.drift, "other")
             if name == "compression" and (side := _SIDE.search(term.name)):
                 name = f"compression {side[0]}"
-            elif name == "other" and by_piston:  # what passes a servo valve at its null
+            elif name == "other" and balance.flow is Flow.VALVE:  # what passes a servo valve at its null
                 name = "valve"
             increments[name] = increments.get(name, 0.0) + np.nan_to_num(values)
         left = np.nan_to_num(equation.left(signals))
@@ -139,7 +139,7 @@ def compute_flow_curves(
         return FlowCurves(
             part.t,
             _accumulate(scale * left),
-            "piston" if by_piston else "creep" if equation.name == LOCKED else "pump",
+            "piston" if equation.flow is Flow.VALVE else "creep" if equation.flow is Flow.CREEP else "pump",
             volumes,
             np.column_stack([running.start, running.end, shares]),
             balance.size.stated,

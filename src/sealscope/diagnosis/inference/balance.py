@@ -46,7 +46,7 @@ from sealscope.diagnosis.inference.equations.signals import (
     extend_flags,
     find_rests,
 )
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, MOVING_BIAS, START, Equation
+from sealscope.diagnosis.inference.equations.terms import MOVING_BIAS, START, Equation, Flow
 from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.pressure_offset import (
     area_mismatch,
@@ -810,11 +810,11 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
         return None
     source = flow_source(names)
     # only a recorded flow of a pump shows whether valves cut the pump off
-    may_shut = balances[0].name == CYLINDER and not balances[0].by_command and source != "q_supply"
+    may_shut = balances[0].flow in (Flow.PUMP, Flow.METER)
     channels = {"x", "p_A", "p_B", str(source)}  # no channel is named "None"
     channels |= {name for balance in balances for term in balance.terms for name in term.needs}
     samples = bridged_samples(recording, channels)
-    if balances[0].by_command:
+    if balances[0].flow is Flow.COMMAND:
         samples = derive_drive_signals(samples, rig, recording.rate)
     holds = HoldCounts()
     if may_shut:
@@ -841,7 +841,9 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
         """Compute the blocks of samples of which a channel was shifted, with the columns of delays."""
         return make_stream(delay_balances, left_signs=stream.left_signs).push(shifted, last=True)
 
-    clock = SampleClock(recording.rate, start, flow_channel="omega" if balances[0].by_command else source or "")
+    clock = SampleClock(
+        recording.rate, start, flow_channel="omega" if balances[0].flow is Flow.COMMAND else source or ""
+    )
     aligned = align_samples(samples, with_delay_columns, compute_with_delay_columns, stream.columns, clock)
     samples = dict(aligned.samples)
     recorded = drop_delay_columns(aligned.blocks, stream.columns[0])

@@ -22,7 +22,7 @@ from sealscope.diagnosis.inference.balance import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest
-from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation
+from sealscope.diagnosis.inference.equations.terms import PUMP, STATES, Equation, Flow
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.pressure_offset import remove_pressure_offset
 from sealscope.diagnosis.inference.regimes import NEGLIGIBLE
@@ -513,7 +513,7 @@ def live_equations(rig: Rig, names: Sequence[str], with_tested_terms: bool = Fal
     """
     balances = []
     for balance in equations(rig, frozenset(names)):
-        if balance.by_command:
+        if balance.flow is Flow.COMMAND:
             continue
         # fitted terms (`Term.is_fitted`) have unknown coefficients in any machine, as the leak past the piston has
         terms = [term for term in balance.terms if (term.is_fitted or with_tested_terms) and term.name != PUMP]

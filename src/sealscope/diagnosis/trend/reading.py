@@ -22,6 +22,7 @@ from sealscope.diagnosis.hold.recorded_holds import held_leakage
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.equations.terms import Flow
 from sealscope.diagnosis.inference.pressures.leak import conductance_scale_error
 from sealscope.diagnosis.inference.pressures.response_detector import PressureResponse
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
@@ -123,7 +124,7 @@ def _estimate_level(part: Recording, rig: Rig, machine: AssumedMachine) -> dict[
     balance_lack, response_lack = unusable_reason(balance, part), unusable_reason(response, part)
     fields: dict[str, Any] = {"ringing": details.learn(part) if unusable_reason(details, part) is None else None}
     solution = balance.balance(part) if balance_lack is None else None
-    if solution is not None and len(solution.columns) == 1:  # several balances have no common leak
+    if solution is not None and solution.flow is not Flow.VALVE:  # several balances have no common leak
         return fields | _balance_fields(solution, machine)
     if response_lack is None and (reading := response.reading(part)) is not None:
         level, error = reading.level

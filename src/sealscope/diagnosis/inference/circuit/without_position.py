@@ -31,7 +31,7 @@ from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
 from sealscope.diagnosis.inference.circuit.store import cycle_length, oil_loss_tests
 from sealscope.diagnosis.inference.equations.balances import circulation, locked
 from sealscope.diagnosis.inference.equations.signals import Signals
-from sealscope.diagnosis.inference.equations.terms import LEAK, LOCKED, ORIFICE, Equation
+from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow
 from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.weak_form import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE
@@ -71,7 +71,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     equation = locked(rig, channels) if "x" in channels else circulation(rig, channels)
     if equation is None:
         return []
-    is_locked = equation.name == LOCKED  # shut valves hold the piston
+    is_locked = equation.flow is Flow.CREEP  # shut valves hold the piston
     samples = samples_without_holes(recording, _READ)
     if not is_locked:
         # `loaded`: a droop of the speed under load is no leakage

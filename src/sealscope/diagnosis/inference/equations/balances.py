@@ -25,7 +25,6 @@ from sealscope.diagnosis.inference.equations.terms import (
     LEAKS,
     LINES_TERM,
     LOADED_NULL_FLOW,
-    LOCKED,
     MOTIONS,
     MOVING_BIAS,
     NULL_FLOW,
@@ -37,6 +36,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     TURNING,
     Coefficient,
     Equation,
+    Flow,
     Term,
     chamber_terms,
     compensated_leak_term,
@@ -169,7 +169,8 @@ def _supply_equation(rig: Rig) -> Equation:
         ),
         *LEAKS,
     )
-    equation = Equation(CYLINDER, _supply_volume, terms, area_ratio=rig.cylinder.A_B / rig.cylinder.A_A)
+    area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
+    equation = Equation(CYLINDER, _supply_volume, terms, flow=Flow.SUPPLY, area_ratio=area_ratio)
     return _separate_at_rest(equation, direction)
 
 
@@ -198,7 +199,7 @@ def _chamber_equation(side: str, rig: Rig, channels: Container[str]) -> Equation
         *LEAKS,
     )
     equation = Equation(
-        f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, flow_sign=-1.0
+        f"chamber {side}", lambda s: -area * s.step("x"), terms, INFERENCE.healthy.piston, Flow.VALVE, flow_sign=-1.0
     )
     return _separate_at_rest(equation, lambda s: np.ones_like(s.time_step))
 
@@ -235,7 +236,7 @@ def equations(rig: Rig, channels: frozenset[str]) -> tuple[Equation, ...]:
     air = free_air_term(rig, weight_A=lambda s: interval_means(s.carried_by_A) if single_rod else 0.5)
     area_ratio = rig.cylinder.A_B / rig.cylinder.A_A
     equation = Equation(
-        CYLINDER, left, tuple(terms), by_command=source == "u", area_ratio=area_ratio,
+        CYLINDER, left, tuple(terms), flow=_FLOWS.get(str(source), Flow.PUMP), area_ratio=area_ratio,
         left_expression=PUMP_VOLUMES.get(str(source), ""),
     )  # fmt: skip
     balance = _insert_before_leaks(equation, air)
@@ -260,7 +261,9 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(PRESSURES):
         return None
-    return Equation("circulation", left, (START_TERM, *_STANDSTILL))
+    # here the speed that is computed from a command includes the droop under load, as a recorded one does
+    flow = _FLOWS.get(str(flow_source(channels - {"u"})), Flow.PUMP)
+    return Equation("circulation", left, (START_TERM, *_STANDSTILL), flow=flow)
 
 
 def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
@@ -287,9 +290,12 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     compliance = compliance_term(
         "compliance of the loaded side", "m^3/Pa", lambda s: s.step(f"p_{loaded_side(s)}"), needs=PRESSURES
     )
-    return Equation(LOCKED, lambda s: -areas[loaded_side(s)] * s.step("x"), (compliance, *_STANDSTILL_LEAKS))
+    terms = (compliance, *_STANDSTILL_LEAKS)
+    return Equation("locked", lambda s: -areas[loaded_side(s)] * s.step("x"), terms, flow=Flow.CREEP)
 
 
+#: What shows the flow, by the channel that is not the pump's.
+_FLOWS = {"q_pump": Flow.METER, "q_supply": Flow.SUPPLY, "u": Flow.COMMAND}
 #: The volume that a pump delivers, as an expression of the channel that shows it.
 PUMP_VOLUMES = {
     "theta": "displacement * change(theta)",

@@ -17,6 +17,7 @@ Source: Merritt, Hydraulic Control Systems, 1967, sections 5.2 and 6.3 (continui
 from __future__ import annotations
 
 from collections.abc import Callable, Container
+from enum import Enum
 from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -82,6 +83,28 @@ class Term(NamedTuple):
         return self.drift == "speed"
 
 
+class Flow(Enum):
+    """What shows the flow of a volume balance.
+
+    `PUMP`: the pump's angle or speed; `METER`: a flow meter between pump and cylinder; `SUPPLY`: one in the supply line
+    of a valve; `COMMAND`: the command u, from which a speed is computed (`balance.derive_drive_signals`); `VALVE`: the
+    opening of a servo valve, with one balance for each chamber; `CREEP`: nothing but the creep of a load that valves
+    hold.
+    """
+
+    PUMP = "pump"
+    METER = "meter"
+    SUPPLY = "supply"
+    COMMAND = "command"
+    VALVE = "valve"
+    CREEP = "creep"
+
+    @property
+    def is_measured(self) -> bool:
+        """True if a flow meter measures it, which sees no leakage inside the pump."""
+        return self in (Flow.METER, Flow.SUPPLY)
+
+
 class Equation(NamedTuple):
     """A volume balance of a machine: its left side equals the sum of its terms.
 
@@ -95,9 +118,8 @@ class Equation(NamedTuple):
         The terms; those of the leak are the last two.
     healthy : float
         Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
-    by_command : bool
-        True if no channel gives the pump's flow. A speed is then computed from the command u
-        (`balance.derive_drive_signals`).
+    flow : Flow
+        What shows the flow of the left side.
     flow_sign : float
         1 if a flow into A is positive on the left side, -1 if it is negative.
     area_ratio : float
@@ -112,7 +134,7 @@ class Equation(NamedTuple):
     left: Callable[[Signals], Array]
     terms: tuple[Term, ...]
     healthy: float = float("inf")
-    by_command: bool = False
+    flow: Flow = Flow.PUMP
     flow_sign: float = 1.0
     area_ratio: float = 1.0
     fed_outward: Literal["", "A", "B"] = ""
@@ -144,8 +166,8 @@ MOVING_BIAS = "bias in motion"
 STATES = TURNING, HOLDING, MOVING_BIAS
 #: Flow from the supply past a valve while the piston rests: a constant part, and one in proportion to p_A - p_B.
 NULL_FLOW, LOADED_NULL_FLOW = "flow past the valve at rest", "flow past the valve at rest, under load"
-#: Names of two balances: of a cylinder, by its position and the flow of a pump or meter, and of a load held by valves.
-CYLINDER, LOCKED = "cylinder", "locked"
+#: Name of the balance of a cylinder, by its position and the flow of a pump or meter.
+CYLINDER = "cylinder"
 #: Name of a derived signal: the decay, with the drive's time constant, of the speed loop's unknown initial state.
 START = "start"
 

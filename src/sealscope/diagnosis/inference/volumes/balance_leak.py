@@ -17,6 +17,7 @@ from sealscope.diagnosis.inference.comparison.laws import compare_laws
 from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
+from sealscope.diagnosis.inference.equations.terms import Flow
 from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
@@ -24,7 +25,6 @@ from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE, Cause, LeakCourse, RelativeLeak, TotalLeakage
 from sealscope.diagnosis.verdict.machine_sizes import healthy_leakage
-from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
 from sealscope.units import BAR, LITRE_PER_MINUTE
 
@@ -55,7 +55,7 @@ class BalanceLeak(LeakMeasure):
         meter, too, the pump's leakage is not measured.
         """
         balance, prior = self.balance, INFERENCE.held_oil
-        if balance.is_creep:
+        if balance.flow is Flow.CREEP:
             return "piston or external leak"
         hold_rise, chambers = self._rises.get(True), balance.chambers
         is_in_holds = (
@@ -67,8 +67,7 @@ class BalanceLeak(LeakMeasure):
             # with one chamber open to the tank, the other loses oil alike by a leak past the piston or to the outside
             is_certain = chambers.piston_leak.probability >= 1.0 - prior.significance
             return "piston leak" if is_certain else "piston or external leak"
-        has_servo_valve = len(balance.columns) > 1  # one balance for each chamber
-        is_behind_pump = has_servo_valve or flow_source(balance.recording.channels) in METERS
+        is_behind_pump = balance.flow is Flow.VALVE or balance.flow.is_measured
         return "piston leak" if is_behind_pump else "piston or pump leak"
 
     @property
@@ -289,7 +288,7 @@ class BalanceLeak(LeakMeasure):
         limit, size = healthy_leakage(balance.rig), balance.size
         # the edges of a servo valve (several balances) leak, too; without a measured flow, a drive that slows down
         # under load seems to leak
-        is_measured = len(balance.columns) == 1 and not balance.equations[0].by_command
+        is_measured = balance.flow not in (Flow.VALVE, Flow.COMMAND)
         if not (limit > 0.0 and self.rise is None and size.stated and is_measured):
             return None
         total = Interval(*(size.scale * conductance for conductance in balance.conductance))

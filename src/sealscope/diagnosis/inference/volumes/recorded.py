@@ -56,7 +56,7 @@ from sealscope.diagnosis.inference.equations.signals import (
     find_rests,
     interval_means,
 )
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, LOCKED, TURNING, Equation
+from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, TURNING, Equation, Flow
 from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.observable import Observable
@@ -135,9 +135,14 @@ class RecordedBalance:
     by_state: RegimeBlocks | None = None
 
     @property
-    def is_creep(self) -> bool:
-        """True if the balance's flow is the creep of a load that valves hold, since no pump's flow is known."""
-        return self.equations[0].name == LOCKED
+    def flow(self) -> Flow:
+        """What shows the flow of the balance."""
+        return self.equations[0].flow
+
+    @property
+    def has_position_and_flow(self) -> bool:
+        """True if the balance has the position, and the flow of a pump, a meter or a valve's opening."""
+        return self.equations[0].name == CYLINDER or self.flow is Flow.VALVE
 
     @property
     def separates_pump(self) -> bool:
@@ -153,7 +158,7 @@ class RecordedBalance:
         too few blocks would remain.
         """
         first = int(np.argmax(self.blocks.is_moving))
-        if self.equations[0].name == CYLINDER or len(self.equations) > 1:
+        if self.has_position_and_flow:
             rate = self.recording.rate
             rests = find_rests(self._pumped, rate, max_rest_rate(self._pumped, rate))
             begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
@@ -243,7 +248,7 @@ class RecordedBalance:
         """Summary of the recording for comparison with others; what is not known is None."""
         start_s, oil_degC = start_seconds(self.recording), oil_temperature(self.recording)
         sums = RecordingSums.from_blocks(self.blocks, self.columns, start_s, oil_degC)
-        if self.is_creep:
+        if self.flow is Flow.CREEP:
             sums = sums._replace(flow=self.mean_flow)  # a test of creep records no flow of a pump
         hold_leaks = None if self.chambers is None else np.array(self.chambers.leaks)
         pump_leakage = None if self.held_pump_leakage is None else np.array(self.held_pump_leakage)
@@ -294,15 +299,14 @@ class RecordedBalance:
         It is NaN while the piston moves past the resting pump (`flag_lowering`). It is computed once for the balances
         with open and with shut valves.
         """
-        equation = self.equations[0]
         return compute_once(
-            self.recording, ("pumped", self.rig, equation.by_command, equation.left), self._compute_pumped
+            self.recording, ("pumped", self.rig, self.flow, self.equations[0].left), self._compute_pumped
         )
 
     def _compute_pumped(self, recording: Recording) -> Array:
         """Compute the volume that the pump delivers between the samples (`_pumped`)."""
         channels, rate = dict(recording.channels), recording.rate
-        if self.equations[0].by_command:
+        if self.flow is Flow.COMMAND:
             channels = derive_drive_signals(channels, self.rig, rate)
         signals = Signals(channels, rate)
         pumped = self.equations[0].left(signals)
@@ -510,8 +514,8 @@ class RecordedBalance:
 
     @cached_property
     def mean_flow(self) -> float:
-        """Mean magnitude of the pump's flow [m^3/s]; if `is_creep`, of that which the larger piston side displaces."""
-        if not self.is_creep:  # weights: positive, so that a mean exists
+        """Mean magnitude of the pump's flow [m^3/s]; of a creeping load, of what the larger side displaces."""
+        if self.flow is not Flow.CREEP:  # weights: positive, so that a mean exists
             return float(np.average(self.blocks.flow, weights=np.maximum(self.blocks.rows, 1e-9)))
         area = max(self.rig.cylinder.A_A, self.rig.cylinder.A_B)
         return area * float(np.nanmean(np.abs(np.diff(self.recording["x"])))) * self.recording.rate
@@ -536,8 +540,8 @@ class RecordedBalance:
         has_pressure_unit = COUNTS not in (units["p_A"], units["p_B"])
         states_displacement = rig.states("pump.q_b") and is_flow_scalable and source not in METERS
         states_areas = rig.states("cylinder.A_A", "cylinder.A_B")
-        if len(self.columns) > 1 or self.is_creep:  # behind a servo valve, or for a load that shut valves hold
-            deviation = float(np.hypot(prior.area, prior.creep)) if self.is_creep else prior.area
+        if self.flow in (Flow.VALVE, Flow.CREEP):
+            deviation = float(np.hypot(prior.area, prior.creep)) if self.flow is Flow.CREEP else prior.area
             return Size(1.0, deviation, stated=states_areas and has_pressure_unit)
         area = self._loaded_area if units.get("x") == "m" else None
         if area is None or not is_flow_scalable:
@@ -598,9 +602,7 @@ class RecordedBalance:
         drive that slows down under load, and behind a servo valve the edges leak as well. The 95 % interval must
         contain a flow above 0, and none above that which the pump delivers.
         """
-        equation = self.equations[0]
-        is_pump_seen = flow_source(self.recording.channels) not in METERS and not equation.by_command
-        if len(self.columns) > 1 or self.is_creep or not is_pump_seen:
+        if self.flow is not Flow.PUMP:
             return None
         regime = self.by_state
         blocks, roles = (self.blocks, self.columns[0]) if regime is None else (regime.blocks, regime.columns[0])

@@ -28,7 +28,7 @@ from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSum
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
-from sealscope.diagnosis.inference.equations.terms import CYLINDER, HOLDING, TURNING
+from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING, Flow
 from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, MachineOdds, Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
 from sealscope.diagnosis.inference.regimes import add_pump_columns
@@ -134,8 +134,8 @@ class VolumeBalance:
             RecordedBalance(cycle.blocks, (cycle.equation,), (cycle.columns,), self.rig, recording, cycle.oil_loss)
             for cycle in balances
         )
-        usable = (candidate for candidate in candidates if candidate.is_creep or compensates_leakage(candidate))
-        return min(usable, key=lambda candidate: BalanceLeak(candidate).bound_flow, default=None)
+        usable = (balance for balance in candidates if balance.flow is Flow.CREEP or compensates_leakage(balance))
+        return min(usable, key=lambda balance: BalanceLeak(balance).bound_flow, default=None)
 
     def _compute_blocks(self, recording: Recording, healthy_holds: HoldCounts | None = None) -> RecordedBlocks | None:
         """Compute the blocks for a volume balance with a position, once for each recording; None if it allows none.
@@ -186,7 +186,7 @@ class VolumeBalance:
         - `sign_log_odds`, with a position: log odds that the recorded flow has the right sign, for each balance;
         - `delivered`: mean flow of the pump in motion [m^3/s], as computed with the assumed sizes;
         - `stroke`, with a position: ends of the recorded motion [m];
-        - `creep_odds`, if no pump's flow is recorded (`is_creep`): log odds that the load creeps by leakage.
+        - `creep_odds`, if no pump's flow is recorded (`Flow.CREEP`): log odds that the load creeps by leakage.
         """
         return learn_once(recording, (self.name, "summary"), self._summarise, self.rig)
 
@@ -201,7 +201,7 @@ class VolumeBalance:
             "scale": balance.size.scale if balance.size.stated else 0.0,
             "delivered": balance.blocks.moving_flow,
             "stroke": balance.recorded_stroke,
-            "creep_odds": balance.creep_log_odds() if balance.is_creep else None,
+            "creep_odds": balance.creep_log_odds() if balance.flow is Flow.CREEP else None,
             **balance.recording_sums._asdict(),
         }
         if recorded is not None:
@@ -272,9 +272,9 @@ class VolumeBalance:
                 return Observed(self.name, lack=f"finds the recording too short, {recording.duration:.3g} s")
             needed = f"; it needs {self.rig.circuit.needed_channels}" if has_position else ""
             return Observed(self.name, lack=_NO_BALANCE[has_position].format(recording.duration) + needed)
-        # a balance without a flow (`is_creep`) shows the leakage only if no loop controls the position: a meter,
+        # a balance without a flow (`Flow.CREEP`) shows the leakage only if no loop controls the position: a meter,
         # speed or command of the pump is recorded, or the load creeps in the healthy recordings as well
-        if balance is None or (balance.is_creep and not (has_flow or odds.creep > 0.0)):
+        if balance is None or (balance.flow is Flow.CREEP and not (has_flow or odds.creep > 0.0)):
             return Observed(self.name, lack=_NO_CREEP.format(self.rig.circuit.needed_channels))
         balance = replace(balance, known_stroke=_joint_stroke(summaries))
         # the summaries list the terms without those that only a balance for shut valves has
@@ -313,12 +313,12 @@ class VolumeBalance:
         # a block with missing samples has fewer rows; but in a balance over cycles or holds (`without_position`) the
         # number of rows also depends on the motion, and the whole recording counts as judged; only a position gives the
         # balance of the cylinder, or two balances, one a chamber
-        has_position = balance.equations[0].name == CYLINDER or len(balance.columns) > 1
+        has_position = balance.has_position_and_flow
         share = float(rows.mean() / max(rows.max(), 1.0)) if has_position else 1.0
         # end of the last block with rows, over the number of blocks
         judged_until = (np.flatnonzero(rows > 0.0)[-1] + 1.0) / len(rows) if has_position and rows.any() else 1.0
         observables = balance.observables
-        if healthy and len(balance.columns) == 1 and has_position:
+        if healthy and has_position and balance.flow is not Flow.VALVE:
             observables += tuple(compare_motion(balance.recording_sums, healthy, balance.columns[0]))
             observables += rival_rises(
                 balance.recording_sums,
