@@ -344,26 +344,6 @@ def test_the_sense_of_a_flow_is_that_of_the_force_on_both_areas() -> None:
     assert recorded is not None and recorded.sign_log_odds[0] > 1.0
 
 
-def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
-    rewired = INFERENCE.sense.rewired
-    summaries = [{"sign_log_odds": np.array([12.0])}] * 9
-    assert MachineOdds.from_healthy(summaries, 1).flow_sign == pytest.approx(np.log((1.0 - rewired) / rewired))
-    assert MachineOdds.from_healthy([{}], 1).flow_sign == 0.0
-    other_channels = {"sign_log_odds": np.array([-1.0, 2.0])}
-    np.testing.assert_array_equal(MachineOdds.from_healthy([*summaries, other_channels], 2).flow_sign, [-1.0, 2.0])
-
-
-def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> None:
-    prior, limit, sure = INFERENCE.rest.valves, INFERENCE.rest.alone, INFERENCE.rest.locked
-    assert MachineOdds.from_healthy([{}], 1) == MachineOdds(flow_sign=np.zeros(1))
-    doubtful = [{"shut_odds": 0.5}, {"shut_odds": -9.0}, {}]
-    assert MachineOdds.from_healthy(doubtful, 1).valves == pytest.approx(prior + 0.5 - limit)
-    assert MachineOdds.from_healthy(doubtful, 1, scatter_log_odds=2.0).valves == pytest.approx(prior + 2.5 - limit)
-    for key in ("shut_odds", "held_odds"):
-        assert MachineOdds.from_healthy([{key: sure + 0.1}, {}], 1).is_valve_certain
-        assert not MachineOdds.from_healthy([{key: sure - 0.1}], 1).is_valve_certain
-
-
 def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump() -> None:
     """The volume of an interval is the mean of two samples of the speed, and half of its noise the next one's."""
     rate, random = 50.0, np.random.default_rng(2)

@@ -27,6 +27,7 @@ import numpy as np
 from sealscope.diagnosis.decision.events import Event, load_events
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES
 from sealscope.diagnosis.inference.comparison.rise import RISE
+from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import LeakRise, Observable
 from sealscope.diagnosis.priors.decision import DECISION
 
@@ -109,20 +110,19 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
     if not terms:
         return list(log_factors)
     best_likelihood, best_factor = max(terms, key=lambda term: term[0])
-    divisor = 1.0 + 2.0 * DECISION.explanation.misfit * best_likelihood
+    misfit = DECISION.explanation.misfit
     factors = []
     for observable, factor in log_factors:
-        deficit = (best_likelihood - log_bayes_factor(observable.chance)) / divisor
+        deficit = temper(best_likelihood - log_bayes_factor(observable.chance), best_likelihood, misfit)
         is_term = observable.data == VOLUMES
         factors.append((observable, max(best_factor - deficit, 0.0) if is_term else factor))
     return factors
 
 
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
-    """Divide log Bayes factors by 1 + 2 m B, with the largest factor B of the same data (module's docstring)."""
-    max_factors = _largest_by_data(log_factors)
-    slope = 2.0 * DECISION.explanation.misfit
-    return [(observable, factor / (1.0 + slope * max_factors[observable.data])) for observable, factor in log_factors]
+    """Temper log Bayes factors by the largest factor of the same data (`temper`)."""
+    max_factors, misfit = _largest_by_data(log_factors), DECISION.explanation.misfit
+    return [(each, temper(factor, max_factors[each.data], misfit)) for each, factor in log_factors]
 
 
 def _largest_by_data(log_factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:

@@ -29,6 +29,7 @@ from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian, solve
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, information
 from sealscope.diagnosis.inference.equations.terms import LAG, ORIFICE, delay_name
+from sealscope.diagnosis.inference.hypotheses import compare_residuals
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -266,9 +267,8 @@ def _find_shift(
     by_flow = _fit_shift(samples, found, clock.flow_channel, -1.0, compute_blocks, columns, clock)
     if by_flow is None:
         return by_channel
-    tiny = np.finfo(float).tiny
-    ratio = float(np.log(max(by_flow.residual, tiny) / max(by_channel.residual, tiny)))
-    log_odds = 0.5 * INFERENCE.size.readings * ratio  # of the position
+    tiny = float(np.finfo(float).tiny)
+    log_odds = compare_residuals(max(by_channel.residual, tiny), max(by_flow.residual, tiny))  # of the position
     if abs(log_odds) < np.log(1.0 / INFERENCE.delay.other):
         return by_channel._replace(rival_channel=clock.flow_channel)
     return by_channel if log_odds > 0.0 else by_flow

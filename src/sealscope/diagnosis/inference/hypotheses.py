@@ -13,10 +13,15 @@
 The first four are the same in all recordings of a machine, so their log odds add up: those of the healthy recordings,
 from their summaries, are the prior of the judged one (`MachineOdds`). The others are decided, or averaged over, in each
 recording.
+
+No model describes a machine exactly, so likelihoods of models are believed less than many data would allow. They are
+tempered in two ways: a residual counts as `size.readings` independent ones (`compare_residuals`), and a logarithm as
+exact to within a relative misfit (`temper`).
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from enum import Enum
 from typing import Any, NamedTuple
@@ -56,6 +61,23 @@ class Unknown(NamedTuple):
         """Add the log odds (n, ...) of n recordings to those of the prior."""
         evidence = np.sum(np.clip(log_odds, -self.one, self.one), axis=0)
         return np.asarray(self.prior + np.clip(evidence, -self.all, self.all))
+
+
+def compare_residuals(square: float, other: float) -> float:
+    """Compute the log likelihood ratio of a description of a volume balance to another, by residual sums of squares.
+
+    It is N/2 log(`other` / `square`) with N = `size.readings` (`priors.toml`): what a balance leaves repeats from cycle
+    to cycle, so that no more residuals count as independent.
+    """
+    return -0.5 * float(INFERENCE.size.readings) * math.log(square / other)
+
+
+def temper(log_ratio: Any, largest: float, misfit: float) -> Any:
+    """Reduce log likelihood ratios l of models that describe a change only to within a relative `misfit` m.
+
+    The result is l / (1 + 2 m L), where L is the `largest` log likelihood ratio of the same data, at least 0.
+    """
+    return log_ratio / (1.0 + 2.0 * misfit * largest)
 
 
 VALVES = Unknown(INFERENCE.rest.valves, one=INFERENCE.rest.alone)

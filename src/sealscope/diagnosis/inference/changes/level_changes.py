@@ -37,6 +37,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, RANK_TOLERANCE, Information, step_test
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE, central_difference
+from sealscope.diagnosis.inference.hypotheses import temper
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
@@ -373,7 +374,7 @@ def _test_pattern(name: str, rows: Array, whitened: Array, time: Array) -> Obser
     best = int(np.argmax(log_ratios))
     log_ratio = float(log_ratios[best])
     # a pattern describes the levels only approximately
-    rank = 2.0 * log_ratio / (1.0 + 2.0 * _PRIORS.misfit * log_ratio) - (n_directions - 1) * math.log(n_blocks)
+    rank = 2.0 * temper(log_ratio, log_ratio, _PRIORS.misfit) - (n_directions - 1) * math.log(n_blocks)
     # sum over the pattern's directions of F = variance without a step / variance with it - 1
     gains = np.log1p((variance_without[:n_directions, None] / variance - 1.0).sum(axis=0))
     score = n_blocks * float(gains.max())

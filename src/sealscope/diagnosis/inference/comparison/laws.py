@@ -12,6 +12,7 @@ from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.excess import marginal_difference, subtract_reference
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
+from sealscope.diagnosis.inference.hypotheses import compare_residuals
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import TINY
 
@@ -20,8 +21,7 @@ class LawFit(NamedTuple):
     """Comparison of an orifice's law with the laminar law, for leakage above that of healthy recordings.
 
     `regression`: slope of the flow sign(dp) sqrt(abs(dp)) of a unit orifice on dp = p_A - p_B [Pa^-0.5], with all other
-    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak for one independent residual,
-    of which a recording has `size.readings` (`priors.toml`).
+    terms eliminated; `log_ratio`: log likelihood ratio of the orifice to the laminar leak.
     """
 
     regression: float
@@ -34,8 +34,8 @@ def compare_laws(
     """Compare how well a turbulent leak through an orifice and a laminar leak explain a recording's excess flow.
 
     Both are fitted alone, with all other columns integrated out, in all balances together; the coefficient may be
-    negative. The result is the log of the likelihood ratio of the orifice to the laminar leak for one independent
-    residual, and the laminar coefficient that fits an orifice of coefficient 1. Return None if a balance has no column
+    negative. The result is the log of the likelihood ratio of the orifice to the laminar leak (`compare_residuals`),
+    and the laminar coefficient that fits an orifice of coefficient 1. Return None if a balance has no column
     of an orifice, if the recording has no information on one of the two leaks, or if their columns, both with the sign
     of p_A - p_B, are not positively correlated.
     """
@@ -47,8 +47,7 @@ def compare_laws(
         return None
     min_square = 1e-9 * abs(left_square) + TINY  # above rounding errors
     square_laminar, square_orifice = np.maximum(left_square - moments**2 / energies, min_square)
-    log_ratio = float(-0.5 * np.log(square_orifice / square_laminar))
-    return LawFit(regression=float(cross / energies[0]), log_ratio=log_ratio)
+    return LawFit(float(cross / energies[0]), compare_residuals(square_orifice, square_laminar))
 
 
 def compare_with_leak(
@@ -56,13 +55,10 @@ def compare_with_leak(
 ) -> float | None:
     """Compare how well the leak and another term of the volume balance, `rival`, explain a recording's excess flow.
 
-    Returns the log likelihood ratio of rival to leak per independent residual,
-
-        -log(residual sum of squares with the rival / the same with the leak) / 2.
-
-    While the rival (for example an external leak) is fitted, the leak may differ as it does between healthy recordings.
-    A negative coefficient is not fitted, except that of free air, of which there may be less. Return None if the
-    balance has no column named `rival`, or if the recording has no information on the leak or on the rival.
+    Returns the log likelihood ratio of rival to leak (`compare_residuals`). While the rival (for example an external
+    leak) is fitted, the leak may differ as it does between healthy recordings. A negative coefficient is not fitted,
+    except that of free air, of which there may be less. Return None if the balance has no column named `rival`, or if
+    the recording has no information on the leak or on the rival.
     """
     if any(rival not in roles.names for roles in columns):
         return None
@@ -76,7 +72,7 @@ def compare_with_leak(
             moment = max(moment, 0.0)
         # above rounding errors
         squares.append(max(left_square - moment**2 / energy, 1e-9 * abs(left_square) + TINY))
-    return float(-0.5 * np.log(squares[1] / squares[0]))
+    return compare_residuals(squares[1], squares[0])
 
 
 def _fit_excess(

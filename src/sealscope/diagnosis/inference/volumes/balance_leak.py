@@ -256,11 +256,10 @@ class BalanceLeak(LeakMeasure):
         leak that looks like a laminar one with a conductance of 1. The law lies the fraction f = 2 (1 - e) of the way
         from laminar to orifice flow:
 
-            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f N L,
+            flow = laminar^(1 - f) orifice^f,    log weight = log prior + f L,
 
-        with the log likelihood ratio L of an orifice to a laminar leak for one residual, and the number N of
-        independent residuals (`size.readings` of `priors.toml`). If L is unknown, all laws have the laminar flow and
-        the log weight 0.
+        with the log likelihood ratio L of an orifice to a laminar leak (`compare_laws`). If L is unknown, all laws have
+        the laminar flow and the log weight 0.
         """
         balance = self.balance
         laminar_flow = balance.mean_pressure()
@@ -270,10 +269,9 @@ class BalanceLeak(LeakMeasure):
         # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
         root = np.average(balance.blocks.mean_root(), weights=balance.blocks.pressure_weights)
         orifice_flow = float(root) / fit.regression
-        log_ratio = INFERENCE.size.readings * fit.log_ratio
         fractions = 2.0 * (1.0 - np.array(EXPONENTS))
         return [
-            (laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * log_ratio)
+            (laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * fit.log_ratio)
             for f, log_prior in zip(fractions, np.log(law_priors()), strict=True)
         ]
 

@@ -74,10 +74,10 @@ def rival_rises(
             continue
         if is_outside:
             rival = _penalise_size(rival, judged, unit_flows)
-        # likelihood ratio of the rival to a leak past the piston, for one independent residual
+        # likelihood ratio of the rival to a leak past the piston
         log_ratio = compare_with_leak(judged, healthy, columns, name)
         if log_ratio is not None:
-            rival = replace(rival, log_ratio_to_leak=INFERENCE.size.readings * (log_ratio - orifice_log_ratio))
+            rival = replace(rival, log_ratio_to_leak=log_ratio - orifice_log_ratio)
         observables.append(rival)
     return (*filter(None, observables), *(hold_rivals or ()))
 

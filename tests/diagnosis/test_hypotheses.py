@@ -1,0 +1,46 @@
+"""What is unknown about a machine: odds of alternatives, and how far likelihoods of models are believed."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sealscope.diagnosis.inference.hypotheses import MachineOdds, compare_residuals, temper
+from sealscope.diagnosis.priors.inference import INFERENCE
+
+
+def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> None:
+    rewired = INFERENCE.sense.rewired
+    summaries = [{"sign_log_odds": np.array([12.0])}] * 9
+    assert MachineOdds.from_healthy(summaries, 1).flow_sign == pytest.approx(np.log((1.0 - rewired) / rewired))
+    assert MachineOdds.from_healthy([{}], 1).flow_sign == 0.0
+    other_channels = {"sign_log_odds": np.array([-1.0, 2.0])}
+    np.testing.assert_array_equal(MachineOdds.from_healthy([*summaries, other_channels], 2).flow_sign, [-1.0, 2.0])
+
+
+def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> None:
+    prior, limit, sure = INFERENCE.rest.valves, INFERENCE.rest.alone, INFERENCE.rest.locked
+    assert MachineOdds.from_healthy([{}], 1) == MachineOdds(flow_sign=np.zeros(1))
+    doubtful = [{"shut_odds": 0.5}, {"shut_odds": -9.0}, {}]
+    assert MachineOdds.from_healthy(doubtful, 1).valves == pytest.approx(prior + 0.5 - limit)
+    assert MachineOdds.from_healthy(doubtful, 1, scatter_log_odds=2.0).valves == pytest.approx(prior + 2.5 - limit)
+    for key in ("shut_odds", "held_odds"):
+        assert MachineOdds.from_healthy([{key: sure + 0.1}, {}], 1).is_valve_certain
+        assert not MachineOdds.from_healthy([{key: sure - 0.1}], 1).is_valve_certain
+
+
+def test_residuals_that_repeat_count_as_few() -> None:
+    n = INFERENCE.size.readings
+    assert compare_residuals(2.0, 2.0) == 0.0
+    assert compare_residuals(1.0, math.e) == pytest.approx(0.5 * n) == -compare_residuals(math.e, 1.0)
+
+
+def test_a_model_is_believed_no_further_than_it_is_exact() -> None:
+    """Small ratios stay, and none exceeds half the inverse of the misfit; the order stays."""
+    ratios = np.array([0.0, 1e-3, 1.0, 10.0, 1e9])
+    tempered = np.array([temper(ratio, ratio, 0.01) for ratio in ratios])
+    assert (np.diff(tempered) > 0.0).all() and tempered[-1] < 0.5 / 0.01
+    assert tempered[:2] == pytest.approx(ratios[:2], rel=1e-4)
+    np.testing.assert_array_equal(temper(ratios, 5.0, 0.0), ratios)
