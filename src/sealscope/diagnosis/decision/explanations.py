@@ -122,7 +122,7 @@ def _compare_by_likelihood(log_factors: Sequence[tuple[Observable, float]]) -> l
 def _correct_for_misfit(log_factors: Sequence[tuple[Observable, float]]) -> list[tuple[Observable, float]]:
     """Temper log Bayes factors by the largest factor of the same data (`temper`)."""
     max_factors, misfit = _largest_by_data(log_factors), DECISION.explanation.misfit
-    return [(each, temper(factor, max_factors[each.data], misfit)) for each, factor in log_factors]
+    return [(test, temper(factor, max_factors[test.data], misfit)) for test, factor in log_factors]
 
 
 def _largest_by_data(log_factors: Sequence[tuple[Observable, float]]) -> dict[str, float]:

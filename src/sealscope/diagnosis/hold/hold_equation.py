@@ -45,7 +45,7 @@ from sealscope.diagnosis.hold.result import HoldCurve
 from sealscope.diagnosis.hold.set_up import SetUp
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import relative_compression
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_hold_offsets, small_difference_factor
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
+from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.chambers import chambers_of
@@ -287,7 +287,7 @@ class HeldLoad:
                 if is_equalised:
                     noise = float(np.std(p[last] - other[last])) / math.sqrt(max(len(p) / N_PARTS, 1.0))
                     driving = (course - offset) * small_difference_factor(course - offset, RESOLVED * noise)
-            for exponent, weight in zip(EXPONENTS, law_priors().tolist(), strict=True):
+            for exponent, weight in LAWS.items():
                 minutes, flow = self._weigh_time(readings, part_t, driving, exponent)
                 spare = minutes - self._weigh_time(readings, part_t, course, exponent)[0]
                 clocks.append(LeakClock(weight / len(differences), minutes, flow, None if driving is course else spare))
@@ -344,7 +344,7 @@ class HeldLoad:
         columns, clocks = self._compression_columns(is_bend=True), self._clocks(readings)
         speed = float(np.ptp(readings.values)) / (self.duration / 60.0)
         for k, clock in enumerate(clocks):
-            if len(clocks) > 1 and k % len(EXPONENTS) != 1:  # the law between is nearly their mean
+            if len(clocks) > 1 and k % len(LAWS) != 1:  # the law between is nearly their mean
                 columns.append(Column(speed * self._bend(readings.t, clock.minutes, self.duration / 60.0), 0.0, 1.0))
         return [column for column in columns if np.ptp(column.values) > LEAST_BEND]
 
@@ -415,7 +415,7 @@ class HeldLoad:
         thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
         sizes = [_MM * length * strain for strain in HOLD.settling.strain]
         alternatives = [self._settling(compression, sizes), thermal]
-        clocks = self._clocks(compression)[: len(EXPONENTS)]
+        clocks = self._clocks(compression)[: len(LAWS)]
         if len(clocks) > 1:  # a steady gain, too, whatever its law
             clocks.append(LeakClock(clocks[0].weight, t / 60.0, np.ones_like(t)))
         fit = self._fit_laws(RateRegression(compression, self.duration), base, alternatives, clocks)

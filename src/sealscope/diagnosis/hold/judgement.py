@@ -14,7 +14,7 @@ from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
 from sealscope.diagnosis.hold.plan import predict_rate_error
 from sealscope.diagnosis.hold.result import HoldResult
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors
+from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.paragraphs import join_names
 from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
@@ -97,7 +97,7 @@ def _convert_flow(flow: Mixture, pressure: float | None, reference: float) -> Mi
     if pressure is None or not pressure > 0.0:
         return None
     ratio = reference / pressure
-    return pool_mixtures([flow.scale(ratio**exponent) for exponent in EXPONENTS], law_priors())
+    return pool_mixtures([flow.scale(ratio**exponent) for exponent in LAWS], np.array([*LAWS.values()]))
 
 
 def _list_causes(hold: HeldLoad) -> tuple[str, ...]:

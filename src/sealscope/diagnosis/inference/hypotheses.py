@@ -8,7 +8,8 @@
 | flow at rest | circulates, holds the load | `feed.circulates` | `feed.flag_circulation` | `HoldCounts` |
 | chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `feed.FeedSums.find_feed` | |
 | zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
-| law of the leak | laminar to orifice | `size.laminar` | `leak_law`, `comparison.laws` | |
+| law of a leak | exponent of its flow | `size.laminar` | `leak_law`, `comparison.laws` | `LAWS` |
+| course of a leak | growth from its onset to the end | `growth` | `leak_flow`, `HeldChambers` | `GROWTHS` |
 
 The first four are the same in all recordings of a machine, so their log odds add up: those of the healthy recordings,
 from their summaries, are the prior of the judged one (`MachineOdds`). The others are decided, or averaged over, in each
@@ -49,18 +50,18 @@ class Valves(Enum):
 class Unknown(NamedTuple):
     """Two alternatives: log odds of the first before any recording, and limits of the evidence.
 
-    The log odds of one recording are believed up to +-`one`, since something else may cause them, and those of all up
-    to +-`all`, since the machine may have been changed.
+    The log odds of one recording are believed up to +-`each_limit`, since something else may cause them, and those of
+    all up to +-`total_limit`, since the machine may have been changed.
     """
 
     prior: float = 0.0
-    one: float = np.inf
-    all: float = np.inf
+    each_limit: float = np.inf
+    total_limit: float = np.inf
 
     def add(self, log_odds: Any) -> Array:
         """Add the log odds (n, ...) of n recordings to those of the prior."""
-        evidence = np.sum(np.clip(log_odds, -self.one, self.one), axis=0)
-        return np.asarray(self.prior + np.clip(evidence, -self.all, self.all))
+        evidence = np.sum(np.clip(log_odds, -self.each_limit, self.each_limit), axis=0)
+        return np.asarray(self.prior + np.clip(evidence, -self.total_limit, self.total_limit))
 
 
 def compare_residuals(square: float, other: float) -> float:
@@ -80,13 +81,22 @@ def temper(log_ratio: Any, largest: float, misfit: float) -> Any:
     return log_ratio / (1.0 + 2.0 * misfit * largest)
 
 
-VALVES = Unknown(INFERENCE.rest.valves, one=INFERENCE.rest.alone)
-FLOW_SIGN = Unknown(all=float(np.log(1.0 / INFERENCE.sense.rewired - 1.0)))
-CREEP = Unknown(one=INFERENCE.rest.alone)
+#: Prior probability of each law of a leak, by the exponent e of its flow c |p_A - p_B|^e: 1 is laminar, 0.5 an orifice.
+LAWS: dict[float, float] = {
+    1.0: INFERENCE.size.laminar,
+    **dict.fromkeys((0.75, 0.5), (1.0 - INFERENCE.size.laminar) / 2.0),
+}
+_STEADY, _GROWING = INFERENCE.growth.steady, INFERENCE.growth.most * (np.arange(6) + 1.0) / 6
+#: Prior probability of each relative growth of a leak from its onset to the recording's end; first that of none.
+GROWTHS: dict[float, float] = {0.0: _STEADY, **dict.fromkeys(_GROWING.tolist(), (1.0 - _STEADY) / len(_GROWING))}
+
+VALVES = Unknown(INFERENCE.rest.valves, each_limit=INFERENCE.rest.alone)
+FLOW_SIGN = Unknown(total_limit=float(np.log(1.0 / INFERENCE.sense.rewired - 1.0)))
+CREEP = Unknown(each_limit=INFERENCE.rest.alone)
 
 
 class MachineOdds(NamedTuple):
-    """What is assumed of a machine before a recording of it is seen; by default without healthy recordings.
+    """Odds of a machine's unknowns before a recording of it is seen; by default those without healthy recordings.
 
     - `valves`: log odds that valves cut a resting pump off, infinite if the healthy recordings leave no doubt;
     - `flow_sign` (E,): log odds of each balance that the recorded flow has the right sign;

@@ -19,13 +19,10 @@ from sealscope.diagnosis.estimate.change import Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.equations.terms import ORIFICE
+from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 
-#: Exponents e of the leak laws: 1 is laminar flow, 0.5 an orifice.
-EXPONENTS = (1.0, 0.75, 0.5)
-#: Number of relative growths of a step that are tried, besides zero.
-N_GROWTHS = 6
 #: Smallest divisor, and base of a power, where a block has no pressure difference.
 _TINY = np.finfo(float).tiny
 
@@ -35,34 +32,23 @@ def apparent_conductances(blocks: Blocks, columns: Sequence[ColumnRoles]) -> dic
 
     For an orifice, e = 1/2, it is the regression coefficient r of its column on that of the laminar leak. For the other
     exponents it is approximated by r^(2 (1 - e)), which is 1 for laminar flow, e = 1. The result maps each exponent e
-    of `EXPONENTS` to an array (K,) [Pa^(e - 1)].
+    of `LAWS` to an array (K,) [Pa^(e - 1)].
     """
     leak, orifice = columns[0].leak, columns[0].names.index(ORIFICE)
     gram = blocks.gram.sum(axis=1)  # sum over the equations
     energy = np.maximum(gram[:, leak, leak], _TINY)
     orifice_slope = np.maximum(gram[:, orifice, leak] / energy, _TINY)  # r
-    return {exponent: orifice_slope ** (2.0 * (1.0 - exponent)) for exponent in EXPONENTS}
+    return {exponent: orifice_slope ** (2.0 * (1.0 - exponent)) for exponent in LAWS}
 
 
 def law_flows(blocks: Blocks) -> dict[float, Array]:
     """Compute the mean of |p_A - p_B|^e in each of K blocks: the flow of a leak with the coefficient 1.
 
     With dp = p_A - p_B, and <> for the mean over a block, it is approximated by <|dp|>^(2 e - 1) <|dp|^(1/2)>^(2 - 2
-    e), exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of `EXPONENTS` to (K,) [Pa^e].
+    e), exact for e = 1 (laminar) and e = 1/2 (orifice). The result maps each exponent e of `LAWS` to (K,) [Pa^e].
     """
     pressure, root = blocks.mean_pressure(), blocks.mean_root()
-    return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in EXPONENTS}
-
-
-def law_priors() -> Array:
-    """Return the prior probability of each leak law, i.e. of each exponent in `EXPONENTS`, shape (3,).
-
-    Laminar flow (e = 1, the first) has the probability `size.laminar` (`priors.toml`); the other exponents are equally
-    probable.
-    """
-    laminar: float = INFERENCE.size.laminar
-    n_others = len(EXPONENTS) - 1
-    return np.array([laminar, *[(1.0 - laminar) / n_others] * n_others])
+    return {exponent: pressure ** (2.0 * exponent - 1.0) * root ** (2.0 - 2.0 * exponent) for exponent in LAWS}
 
 
 def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnRoles]) -> Information:
@@ -87,7 +73,7 @@ def with_turbulence(leak: Information, blocks: Blocks, columns: Sequence[ColumnR
 def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information) -> StepTest | None:
     """Test for a leak that begins within a recording, with a flow proportional to a power of |p_A - p_B|.
 
-    A step is tested for each exponent of `EXPONENTS`; the p-value of each is divided by the prior probability of the
+    A step is tested for each exponent of `LAWS`; the p-value of each is divided by the prior probability of the
     exponent, and the smallest one counts. For an exponent other than 1 the step varies with the pressure, and its size
     is the mean over the blocks, weighted by their information. `leak`: likelihood of the leak's coefficient in the
     blocks. Return None if too few blocks determine this coefficient.
@@ -95,24 +81,13 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     weights = np.maximum(leak.precision.sum(axis=0), 0.0)  # information of each block; it may be negative
     shapes = apparent_conductances(blocks, columns)
     tests = []
-    for exponent, prior in zip(EXPONENTS, law_priors(), strict=True):
+    for exponent, prior in LAWS.items():
         mean_shape = float(weights @ shapes[exponent]) / max(float(weights.sum()), _TINY)
         test = step_test(leak, shape=shapes[exponent] / max(mean_shape, _TINY))
         if test is not None:
-            tests.append(test.share_alarms(float(prior)))
+            tests.append(test.share_alarms(prior))
     # of equal p-values, such as 1, the highest score counts
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
-
-
-def growth_priors() -> list[tuple[float, float]]:
-    """List possible relative growths of a leak from its onset to the recording's end, as (growth, probability).
-
-    The first is 0, a leak that stays constant, with the probability `growth.steady` (`priors.toml`).
-    """
-    prior = INFERENCE.growth
-    growths = prior.most * (np.arange(N_GROWTHS) + 1.0) / N_GROWTHS  # evenly spaced up to the largest
-    probability = (1.0 - prior.steady) / N_GROWTHS
-    return [(0.0, prior.steady), *((float(growth), probability) for growth in growths)]
 
 
 def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:

@@ -19,7 +19,8 @@ from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Interval
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
+from sealscope.diagnosis.inference.hypotheses import LAWS
+from sealscope.diagnosis.inference.leak_law import mixture_flow
 from sealscope.diagnosis.inference.observable import LeakMeasure, LeakRise, Observable, Observed, Ringing
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.rms_change.rms_detector import DETAILS, compare_summaries, has_same_rate
@@ -75,14 +76,15 @@ def _measure_leak(
     """Describe the increase of the leakage since the last repair; flows are in the unit of the trend.
 
     `chance` is the probability of such an increase in a healthy machine; for the other arguments see `decide_trend`.
-    The flow of the leak is proportional to p^k, with k from `EXPONENTS` for a laminar leak, an orifice and laws
+    The flow of the leak is proportional to p^k, with k from `LAWS` for a laminar leak, an orifice and laws
     between; the stated flow is the mean over these laws.
     """
     onset_day = -np.inf if wear.onset is None else wear.onset.value
     pressures_since = [point.pressure for point in points if point.day >= onset_day]
     pressure_ratio = float(np.median(pressures_since)) / pressure if pressure and pressures_since else 1.0
     # the flow at `pressure` is the level times `pressure` for a laminar leak, k = 1; other laws have a further factor
-    flow_factors = pressure_ratio ** (1.0 - np.array(EXPONENTS))
+    exponents, probabilities = np.array([*LAWS.items()]).T
+    flow_factors = pressure_ratio ** (1.0 - exponents)
     # mean flow of the pump in the trend's unit, converted like a level, which is a flow over a pressure
     pump_flow = float(np.median([point.pump / point.pressure for point in points])) * trend_units_per_level
     pump_flow = pump_flow if np.isfinite(pump_flow) else 0.0
@@ -93,7 +95,7 @@ def _measure_leak(
         cause=_CAUSES.get(str(points[0].basis), "piston or pump leak"),
         rise=rise,
         step_rise=None if rise is None else LeakRise(rise),
-        rise_flow=mixture_flow(law_priors(), wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),
+        rise_flow=mixture_flow(probabilities, wear.leak.value * flow_factors, wear.leak.deviation * flow_factors),
         rise_onset=wear.onset and Interval(*(points[0].seconds_since_1970(day) for day in wear.onset)),
         bound_flow=wear.bound,
         pump_flow=(pump_flow, pump_flow),  # also stands for the mean while the pump delivers

@@ -38,7 +38,8 @@ from sealscope.diagnosis.inference.equations.terms import (
     Term,
     delay_name,
 )
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, apparent_conductances, law_priors
+from sealscope.diagnosis.inference.hypotheses import LAWS
+from sealscope.diagnosis.inference.leak_law import apparent_conductances
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
@@ -54,7 +55,7 @@ OUTSIDE = "loss to the outside"
 #: Observable of the offset of the flow's sensor.
 FLOW_ZERO = "zero of the flow"
 #: Exponents of the flow of leaks in p_A - p_B, by the name of the observable.
-_LEAK_EXPONENTS = {LEAK: 1.0, ORIFICE: 0.5} | {f"leak of exponent {e:g}": e for e in EXPONENTS if e < 1.0}
+_LEAK_EXPONENTS = {LEAK: 1.0, ORIFICE: 0.5} | {f"leak of exponent {e:g}": e for e in LAWS if e < 1.0}
 #: Causes whose coefficients wear can only raise: leaks.
 _ONE_WAY = ("piston leak", "piston or pump leak", "pump leak", "external leak")
 
@@ -101,7 +102,6 @@ def volume_observables(
         leak_disadvantage = max(
             leak_disadvantage + _port_penalty(offset, port_offset) - _port_penalty(0.0, port_offset), 0.0
         )
-    law_prior_of = dict(zip(EXPONENTS, law_priors(), strict=True))
     observables = dict[str, Observable]()
     terms = [term for term in balances[0].terms if with_orifice or term.name != ORIFICE]
     for name, signs, coefficient, shape, is_centred in _step_hypotheses(
@@ -115,8 +115,8 @@ def volume_observables(
             advantage = -leak_disadvantage
         else:
             advantage = -_size_penalty(name, step.fitted.value, recorded, columns[0].names, volume_ratio, flow_scale)
-        prior = law_prior_of[_LEAK_EXPONENTS.get(name, 1.0)]  # 1.0, without effect, for all but leaks past the piston
-        advantage += 2.0 * float(np.log(prior / law_prior_of[1.0]))
+        prior = LAWS[_LEAK_EXPONENTS.get(name, 1.0)]  # 1.0, without effect, for all but leaks past the piston
+        advantage += 2.0 * float(np.log(prior / LAWS[1.0]))
         term = name.removesuffix(MADE_UP)  # the end of a name that marks a leak whose lost oil a check valve replaces
         if (accumulator_test := oil_loss.get(term)) is not None:
             advantage += _accumulator_support(step, accumulator_test)

@@ -294,7 +294,7 @@ def locked(rig: Rig, channels: frozenset[str]) -> Equation | None:
     return Equation("locked", lambda s: -areas[loaded_side(s)] * s.step("x"), terms, flow=Flow.CREEP)
 
 
-#: What shows the flow, by the channel that is not the pump's.
+#: Source of the flow by the channel that shows it, if that is not the pump's angle or speed.
 _FLOWS = {"q_pump": Flow.METER, "q_supply": Flow.SUPPLY, "u": Flow.COMMAND}
 #: The volume that a pump delivers, as an expression of the channel that shows it.
 PUMP_VOLUMES = {

@@ -84,7 +84,7 @@ class Term(NamedTuple):
 
 
 class Flow(Enum):
-    """What shows the flow of a volume balance.
+    """Source of the flow in a volume balance.
 
     `PUMP`: the pump's angle or speed; `METER`: a flow meter between pump and cylinder; `SUPPLY`: one in the supply line
     of a valve; `COMMAND`: the command u, from which a speed is computed (`balance.derive_drive_signals`); `VALVE`: the
@@ -119,7 +119,7 @@ class Equation(NamedTuple):
     healthy : float
         Standard deviation of a healthy machine's leakage conductance [m^3/(s Pa)]; infinite if unknown.
     flow : Flow
-        What shows the flow of the left side.
+        Source of the flow on the left side.
     flow_sign : float
         1 if a flow into A is positive on the left side, -1 if it is negative.
     area_ratio : float

@@ -18,7 +18,8 @@ from sealscope.diagnosis.inference.comparison.levels import held_rise, rise
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.terms import Flow
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, law_priors, mixture_flow
+from sealscope.diagnosis.inference.hypotheses import LAWS
+from sealscope.diagnosis.inference.leak_law import mixture_flow
 from sealscope.diagnosis.inference.observable import UNKNOWN_FLOW, LeakMeasure, LeakRise, Remark
 from sealscope.diagnosis.inference.volumes.leak_flow import RiseFits, estimate_step_flow, fit_rise
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
@@ -252,7 +253,7 @@ class BalanceLeak(LeakMeasure):
     def _rise_laws(self) -> list[tuple[float, float]]:
         """Weigh the laws of a leak's flow by their fit to the rise over healthy recordings.
 
-        Returns for each exponent e of `EXPONENTS` a log weight, and before it the mean flow per conductance [Pa] of a
+        Returns for each exponent e of `LAWS` a log weight, and before it the mean flow per conductance [Pa] of a
         leak that looks like a laminar one with a conductance of 1. The law lies the fraction f = 2 (1 - e) of the way
         from laminar to orifice flow:
 
@@ -265,14 +266,14 @@ class BalanceLeak(LeakMeasure):
         laminar_flow = balance.mean_pressure()
         fit = compare_laws(balance.recording_sums, self.healthy, balance.columns)
         if fit is None:
-            return [(laminar_flow, 0.0)] * len(EXPONENTS)
+            return [(laminar_flow, 0.0)] * len(LAWS)
         # an orifice with the coefficient 1 / `regression` looks like a laminar leak with the coefficient 1
         root = np.average(balance.blocks.mean_root(), weights=balance.blocks.pressure_weights)
         orifice_flow = float(root) / fit.regression
-        fractions = 2.0 * (1.0 - np.array(EXPONENTS))
+        fractions = 2.0 * (1.0 - np.array([*LAWS]))
         return [
             (laminar_flow ** (1.0 - f) * orifice_flow**f, float(log_prior) + f * fit.log_ratio)
-            for f, log_prior in zip(fractions, np.log(law_priors()), strict=True)
+            for f, log_prior in zip(fractions, np.log([*LAWS.values()]), strict=True)
         ]
 
     @property

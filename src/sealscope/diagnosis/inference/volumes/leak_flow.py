@@ -22,10 +22,9 @@ from sealscope.diagnosis.estimate.change import Information, StepTest, bound_ste
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
+from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
 from sealscope.diagnosis.inference.leak_law import (
-    EXPONENTS,
     apparent_conductances,
-    growth_priors,
     law_flows,
     mixture_flow,
 )
@@ -40,18 +39,12 @@ MAX_ERROR = 1e6
 #: Smallest mean flow of a unit step after an onset, over that of other onsets.
 MIN_UNIT = 1e-6
 _TINY = np.finfo(float).tiny
-
-
-def _step_growths() -> list[tuple[float, float]]:
-    """List the relative growths of a leak that begins within a recording, with their prior probabilities.
-
-    They are those of `growth_priors`, and infinity for a leak that grows from nothing, which has the fraction
-    `growth.from_nothing` (`priors.toml`) of the probability of all leaks that grow.
-    """
-    from_nothing: float = INFERENCE.growth.from_nothing
-    (no_growth, steady), *growing = growth_priors()
-    growths = [(growth, (1.0 - from_nothing) * probability) for growth, probability in growing]
-    return [(no_growth, steady), *growths, (math.inf, from_nothing * (1.0 - steady))]
+_FROM_NOTHING: float = INFERENCE.growth.from_nothing
+#: The `GROWTHS` of a leak that begins within a recording; a part of those that grow begin from nothing, infinitely.
+STEP_GROWTHS: dict[float, float] = {
+    **{growth: (1.0 - _FROM_NOTHING if growth else 1.0) * probability for growth, probability in GROWTHS.items()},
+    math.inf: _FROM_NOTHING * (1.0 - GROWTHS[0.0]),
+}
 
 
 def _onset_positions(leak: Information, test: StepTest) -> Array:
@@ -63,7 +56,7 @@ def _onset_positions(leak: Information, test: StepTest) -> Array:
 class _StepFit(NamedTuple):
     """Steps of a leak with one law and one growth, fitted at each of o onsets.
 
-    - `law`: index of the law in `EXPONENTS`; `log_prior`: log probability of the growth;
+    - `law`: index of the law in `LAWS`; `log_prior`: log probability of the growth;
     - `conductance` (K,): change of the conductance in K blocks by a leak with the coefficient 1 that is older than the
       recording; `course` (K, o): factor on it for each onset and this growth (`step_shapes`);
     - `log_ratio`, `size`, `error` (o,): log likelihood ratio to no step, coefficient and its standard error;
@@ -83,7 +76,7 @@ class _StepFit(NamedTuple):
 def _fit_steps(
     blocks: Blocks, columns: Sequence[ColumnRoles], leak: Information, positions: Array, onsets: NDArray[np.intp]
 ) -> tuple[list[_StepFit], Array]:
-    """Fit a step of the leak with each growth of `_step_growths` and each law of `EXPONENTS`, at each of o onsets.
+    """Fit a step of the leak with each growth of `STEP_GROWTHS` and each law of `LAWS`, at each of o onsets.
 
     `positions` (o,): the onsets, counted in blocks; `onsets` (o,): their indices in the step test. Returns the fits,
     and for each onset the fraction of the blocks with a known pressure after it, (o,).
@@ -91,9 +84,9 @@ def _fit_steps(
     weights = blocks.pressure_weights / max(float(blocks.pressure_weights.sum()), _TINY)
     part_after = np.maximum(weights @ step_shapes(len(blocks), positions), _TINY)
     conductances, flows, fits = apparent_conductances(blocks, columns), law_flows(blocks), list[_StepFit]()
-    for growth, probability in _step_growths():
+    for growth, probability in STEP_GROWTHS.items():
         steps = step_shapes(len(blocks), positions, growth)  # (K, o)
-        for law, exponent in enumerate(EXPONENTS):
+        for law, exponent in enumerate(LAWS):
             sizes = step_sizes(leak, onsets, conductances[exponent], growth)
             unit_flow = (weights * flows[exponent]) @ steps / part_after
             fits.append(_StepFit(law, math.log(probability), conductances[exponent], steps, *sizes, unit_flow))
@@ -185,7 +178,7 @@ def fit_rise(
       in the blocks; `weights` (K,): weight of each block in the rise (`excess.block_weights`); `test`: step test
       of the coefficient, None if the leak can only be older than the recording;
     - `rise`: mean rise of the coefficient over the recording [m^3/(s Pa)];
-    - `laws`: for each law of `EXPONENTS` the mean flow of an older leak for a rise of 1, and its log probability, up to
+    - `laws`: for each law of `LAWS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;
     - `max_flow`: mean flow of the pump in motion [m^3/s]; larger leaks are excluded, except an older one under the
       first law.

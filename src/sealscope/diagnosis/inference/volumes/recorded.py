@@ -136,7 +136,7 @@ class RecordedBalance:
 
     @property
     def flow(self) -> Flow:
-        """What shows the flow of the balance."""
+        """Source of the flow in the balance."""
         return self.equations[0].flow
 
     @property

@@ -244,7 +244,8 @@ class VolumeBalance:
             scatter = []
             for valves in (Valves.OPEN, Valves.SHUT):
                 columns = self._columns(channels, valves)
-                values = leak_deviations_from_mean([_sums_from_summary(each, columns) for each in with_rests], columns)
+                sums = [_sums_from_summary(summary, columns) for summary in with_rests]
+                values = leak_deviations_from_mean(sums, columns)
                 scatter.append(max(float(values.std(ddof=1)), np.finfo(float).tiny))
             log_ratio = (len(with_rests) - 1) * float(np.log(scatter[0] / scatter[1]))
         return MachineOdds.from_healthy(summaries, len(equations(self.rig, channels)), log_ratio)

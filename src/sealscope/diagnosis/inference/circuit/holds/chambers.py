@@ -72,7 +72,7 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     estimate_hold_offsets,
     small_difference_factor,
 )
-from sealscope.diagnosis.inference.leak_law import EXPONENTS, growth_priors, law_priors
+from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over
@@ -469,8 +469,8 @@ class HeldChambers:
 
     @cached_property
     def piston_fits(self) -> list[PistonLeak]:
-        """Most probable leak past the piston, without growth, for each exponent of `EXPONENTS`."""
-        return [self._find_piston_fit(exponent) for exponent in EXPONENTS]
+        """Most probable leak past the piston, without growth, for each of the `LAWS`."""
+        return [self._find_piston_fit(exponent) for exponent in LAWS]
 
     @property
     def piston_fit(self) -> PistonLeak:
@@ -515,13 +515,13 @@ class HeldChambers:
     def _laws(self) -> list[tuple[PistonLeak, float, Array]]:
         """Leak past the piston under each law, the law's log prior, and the log posteriors (o,) of all `onsets`.
 
-        A law is an exponent (`law_priors`) and a growth (`growth_priors`), with its own most probable onset. Sensor
+        A law is an exponent (`LAWS`) and a growth (`GROWTHS`), with its own most probable onset. Sensor
         offset and supplies are those of `piston_fits`.
         """
         laws = []
-        for leak, law_prior in zip(self.piston_fits, law_priors(), strict=True):
+        for leak, law_prior in zip(self.piston_fits, LAWS.values(), strict=True):
             unit_leak = self._unit_piston_leak(leak)
-            for growth, growth_prior in growth_priors():
+            for growth, growth_prior in GROWTHS.items():
                 log_prior = math.log(law_prior * growth_prior)
                 posteriors = log_prior + self._onset_posteriors(unit_leak, growth)
                 onset = float(self.onsets[posteriors.argmax()])
@@ -543,7 +543,7 @@ class HeldChambers:
         probability.
         """
         fits, log_weights = list[tuple[LeakFit, int]](), list[float]()
-        for leak, (growth, probability) in itertools.product(leaks, growth_priors()):
+        for leak, (growth, probability) in itertools.product(leaks, GROWTHS.items()):
             index = int(self._onset_posteriors(leak, growth).argmax())
             onset = float(self.onsets[index])
             flows = leak.flows * growth_factor(self._samples.t, growth, onset, self.end)
