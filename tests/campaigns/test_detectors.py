@@ -21,7 +21,7 @@ from sealscope.campaigns.plans.detectors import ALL_CHANNELS, check_detector, pa
 from sealscope.campaigns.plans.reader import load_plan
 from sealscope.campaigns.results import judge_simulated_campaign, write_result
 from sealscope.diagnosis.decision.decide import decide
-from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.diagnose import diagnose

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.live.unwrapping import AngleUnwrapper
+from sealscope.diagnosis.live.joining import AngleUnwrapper
 
 TURN = 2.0 * np.pi
 DRAWS = range(24)

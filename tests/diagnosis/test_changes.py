@@ -11,8 +11,8 @@ import pytest
 from sealscope.diagnosis.decision.case import Case, OtherEvent
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.inference.changes.features import observe_signals
 from sealscope.diagnosis.inference.changes.level_changes import estimate_levels, level_tests
-from sealscope.diagnosis.inference.changes.signal_tests import observe_signals
 from sealscope.recordings.recording import Recording
 from sealscope.simulation.simulate import simulate
 

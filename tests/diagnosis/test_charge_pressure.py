@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     FALL,
     ChargeTrend,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.rows.distribution import PARTS, sorted_part_means
+from sealscope.diagnosis.inference.blocks import PARTS, sorted_part_means
 
 RATE, SECONDS, NOISE = 500.0, 3.0, 7e3
 

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.recordings.recording import Recording

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.inference.balance import flag_lowering
-from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
+from sealscope.diagnosis.inference.changes.healthy_levels import estimate_connected_difference
 from sealscope.diagnosis.inference.equations.signals import LoweringLimits, Signals
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun

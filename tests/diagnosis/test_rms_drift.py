@@ -13,9 +13,8 @@ from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.rms_change.ringing import estimate_rises, subtract_noise
 from sealscope.diagnosis.rms_change.rms_blocks import DUTY, RmsBlocks
-from sealscope.diagnosis.rms_change.rms_detector import RmsChange, observe_within
+from sealscope.diagnosis.rms_change.rms_detector import RmsChange, estimate_rises, observe_within, subtract_noise
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.bench.machines import draw

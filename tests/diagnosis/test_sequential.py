@@ -11,8 +11,7 @@ import pytest
 from sealscope.diagnosis.live.explanation import UNKNOWN
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, BlockConductance, BlockResult, LiveBalance, NotJudged
-from sealscope.diagnosis.live.sequential import StepDetector
-from sealscope.diagnosis.live.step_null import WINDOW, StepNull
+from sealscope.diagnosis.live.sequential import WINDOW, StepDetector, StepNull
 from sealscope.diagnosis.live.watch import Watch
 from sealscope.diagnosis.verdict.evidence import RAREST
 from sealscope.parameters import load_rig

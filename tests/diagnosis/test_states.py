@@ -9,7 +9,7 @@ from typing import get_args
 
 import pytest
 
-from sealscope.diagnosis.decision.events import load_events
+from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import LEAKS, Cause
 from sealscope.diagnosis.verdict.severity import RepairLimit

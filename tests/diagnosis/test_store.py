@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.circuit.store import oil_loss_tests
+from sealscope.diagnosis.inference.circuit.without_position import oil_loss_tests
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.parameters import Rig, load_rig
 from sealscope.units import P_ATM

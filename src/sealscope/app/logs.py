@@ -16,8 +16,8 @@ import numpy as np
 from sealscope.app.session import SessionMachine
 from sealscope.app.tables import Source, cache_folder, reduce_extremes
 from sealscope.diagnosis.channel_checks import ChannelCheck, check_channels
-from sealscope.diagnosis.commissioned.duty import measure_duty
 from sealscope.diagnosis.commissioned.machine import read_by_map
+from sealscope.diagnosis.commissioned.summary import measure_duty
 from sealscope.diagnosis.flow_curves import FlowCurves, compute_flow_curves
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.errors import SealscopeError, UnreadableFile

@@ -10,7 +10,7 @@ from math import floor, isfinite, isnan, log10
 from pathlib import PurePath
 from typing import Any
 
-from sealscope.diagnosis.decision.combination import ORDER
+from sealscope.diagnosis.decision.decide import ORDER
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import LEAKS, RMS_CHANGE, TotalLeakage
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine

@@ -203,8 +203,8 @@ NAMES = {
     "live/explanation.py",
     "live/watch.py",
 }
-#: Files that make evidence: the decision, and what chooses among several.
-MAKERS = {"decision/decide.py", "decision/combination.py"}
+#: Files that make evidence.
+MAKERS = {"decision/decide.py"}
 
 
 @cache

@@ -18,10 +18,9 @@ import pytest
 import sealscope as ss
 from sealscope.diagnosis.detectors.detector import make_observable
 from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
-from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, sensor_features
+from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, observe_signals, sensor_features
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION, ZEROS
 from sealscope.diagnosis.inference.changes.level_changes import PATTERNS
-from sealscope.diagnosis.inference.changes.signal_tests import observe_signals
 from sealscope.diagnosis.inference.changes.volumes import OUTSIDE, SCALE
 from sealscope.diagnosis.inference.delays import DELAYED
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked

@@ -10,10 +10,10 @@ import pytest
 from scipy.stats import t as student
 
 from sealscope.diagnosis.decision.case import Case
-from sealscope.diagnosis.decision.events import load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
     explain,
+    load_events,
     log_bayes_factor,
     probability_against_chance,
     probability_of,

@@ -22,9 +22,9 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, ConfigDict, FailFast, Field, create_model
 
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
+from sealscope.diagnosis.inference.changes.features import SIGNALS
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFT_KEYS, FRICTION_KEYS, ZERO_KEYS
 from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PAIRS, Octaves
-from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.terms import LEAK

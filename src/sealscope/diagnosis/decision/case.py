@@ -12,11 +12,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.diagnosis.decision.events import Event, load_events
 from sealscope.diagnosis.decision.explanations import (
     LEAK_EVENTS,
+    Event,
     Explanation,
     explain,
+    load_events,
     log_bayes_factor,
     probability_against_chance,
     probability_of,

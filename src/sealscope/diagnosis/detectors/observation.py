@@ -21,8 +21,8 @@ from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_
 from sealscope.diagnosis.detectors.detector import Detector, log_failure, unusable_reason, validate_report
 from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.inference.changes.features import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
-from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance

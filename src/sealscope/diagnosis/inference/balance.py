@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from sealscope.control.drive import Drive
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting
+from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, sorted_part_means
 from sealscope.diagnosis.inference.delays import (
     DelayChange,
     DelayTest,
@@ -55,7 +55,6 @@ from sealscope.diagnosis.inference.pressure_offset import (
 )
 from sealscope.diagnosis.inference.regimes import apply_regime, has_rests, shut_odds
 from sealscope.diagnosis.inference.rows import flow_sign
-from sealscope.diagnosis.inference.rows.distribution import sorted_part_means
 from sealscope.diagnosis.inference.rows.row_weights import SD_PER_MEDIAN, SUPPORT
 from sealscope.diagnosis.inference.rows.weak_form import (
     SPAN,

@@ -13,7 +13,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate
 from sealscope.diagnosis.estimate.interval import Interval as EstimatedInterval
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.live.live_rise import LEVEL, LiveRise
+from sealscope.diagnosis.live.sequential import LEVEL, LiveRise
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause
@@ -79,7 +79,7 @@ class WatchedLeak:
     pressure : float
         Mean absolute pressure difference p_A - p_B [Pa].
     test, score, threshold : str, float, float
-        Test that detected the leak, "step" or "level", its score and threshold (`live_rise.LiveRise`).
+        Test that detected the leak, "step" or "level", its score and threshold (`sequential.LiveRise`).
     cause, reason : str
         Path of the leaking oil, and reason for the alarm in one line.
     is_settled : bool
@@ -110,7 +110,7 @@ class WatchedLeak:
 
     @property
     def allowed(self) -> float:
-        """The p-value of the test at its `threshold`: the allowed probability, or less (`step_null.StepNull`)."""
+        """The p-value of the test at its `threshold`: the allowed probability, or less (`sequential.StepNull`)."""
         return LiveRise(self.test, self.threshold).chance
 
     @property

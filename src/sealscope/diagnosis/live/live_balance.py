@@ -45,8 +45,8 @@ from sealscope.diagnosis.live.coefficients import (
     load_block,
     relative_motion,
 )
+from sealscope.diagnosis.live.explanation import MIN_BLOCKS, WINDOW, SignalWindow
 from sealscope.diagnosis.live.joining import SampleRun, format_ways
-from sealscope.diagnosis.live.signal_window import MIN_BLOCKS, WINDOW, SignalWindow
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause

@@ -21,6 +21,11 @@ This is an e-detector for any level and noise: E[M at a stopping time] <= E[bloc
 1/alpha therefore occurs at most once in 1/alpha blocks of a healthy machine. Fewer onsets only make M smaller, and so
 old onsets are thinned out, which bounds the memory.
 
+Starts after a rest, oil that warms and other duties depart from a random walk, and raise M. While the baseline is
+learned, the largest M of each `WINDOW` blocks is therefore stored (`StepNull`). As for healthy recordings, the
+posterior of an inflation (`decision.null`) turns these values into the chance that M rises as high once more, by which
+the threshold is set.
+
 The arithmetic is that of kernels on a record of fixed size (`kernel.step`), which controllers run, too.
 
 Sources: J. Shin, A. Ramdas, A. Rinaldo, arXiv 2203.03532 (e-detectors); A. S. Willsky and H. L. Jones, IEEE Trans.
@@ -30,12 +35,15 @@ Automat. Contr. 21 (1976) 108 (step in a filter).
 from __future__ import annotations
 
 import math
-from typing import Any
+from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.special import LOG_ZERO
+from sealscope.diagnosis.live.explanation import WINDOW
 from sealscope.diagnosis.live.kernel.step import (
     ARRAYS,
     LAYOUT,
@@ -50,10 +58,54 @@ from sealscope.diagnosis.live.kernel.step import (
     take_block,
     weigh_all,
 )
-from sealscope.diagnosis.live.live_rise import STEP, LiveRise
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.errors import InputError
-from sealscope.storage.plain_state import plain_array, require_part, restore_array
+from sealscope.storage.plain_state import SavedAttributes, plain_array, require_part, restore_array
+
+#: Names of the tests: for a step within the stream, and for a level above that of the healthy machine.
+STEP, LEVEL = "step", "level"
+
+
+class LiveRise(NamedTuple):
+    """An increase of a running machine's leakage conductance, with its test; an `observable.DatedTest`."""
+
+    test: str  # `STEP` or `LEVEL`
+    score: float  # score of the test: twice the logarithm of an e-value for a step, a normal quantile for a level
+    interval: Interval = Interval(math.nan, math.nan, math.nan)  # onset with its 95 % interval [s]
+    # the increase and its standard deviation [m^3/(s Pa)]
+    size: float = 0.0
+    deviation: float = math.inf
+
+    @property
+    def log_chance(self) -> float:
+        """Logarithm of the probability that a healthy machine has at least this score in the test.
+
+        For a step the result is an upper bound, -score/2 by Ville's inequality. For a level it follows from the normal
+        distribution.
+        """
+        from scipy.special import log_ndtr
+
+        return -0.5 * max(self.score, 0.0) if self.test == STEP else float(log_ndtr(-self.score))
+
+    @property
+    def chance(self) -> float:
+        """Probability that a healthy machine has at least this score in the test; for a step an upper bound."""
+        return math.exp(self.log_chance)
+
+    def threshold(self, chance: float) -> float:
+        """Return the score that a healthy machine exceeds with the probability `chance`, for a step at most."""
+        from scipy.special import ndtri
+
+        return -2.0 * math.log(chance) if self.test == STEP else -float(ndtri(chance))
+
+    def onset(self) -> Interval:
+        """Return the onset of the increase of the leakage [s] with its 95 % interval."""
+        return self.interval
+
+    def detectable_step(self, chance: float) -> float:
+        """Return infinity: the smallest step that is detectable depends on the conductance's unknown random walk."""
+        return math.inf
+
 
 __all__ = ["RECENT", "StepDetector"]
 
@@ -188,3 +240,55 @@ def _stored_parts(n_stored: int, n_old: int) -> dict[str, tuple[slice, ...]]:
         **{name: (*[slice(None)] * (len(ARRAYS[name]) - 1), size) for name, size in used.items()},
         "blocks": (slice(n_stored),),
     }
+
+
+_MIN_WINDOWS: int = LIVE.step.windows
+_LOG_WINDOW = math.log(WINDOW)
+
+
+class StepNull(SavedAttributes):
+    """Largest evidence of a step in each window of a healthy machine, and the threshold of the alarm that follows.
+
+    If the random walk is right, P(max M > A) <= `WINDOW` / A in a window. The surprisal of a window is therefore u =
+    log max M - log `WINDOW`, or 0 if that is negative.
+    """
+
+    SAVED = ("_count", "_surprisal", "_highest", "_blocks")
+
+    def __init__(self) -> None:
+        self._count, self._surprisal = 0, 0.0  # number of windows, and sum of their surprisals
+        # largest log M, at least 0 (`add_window` counts larger ones only), and number of blocks in the present window
+        self._highest, self._blocks = 0.0, 0
+
+    def add(self, log_e: float) -> None:
+        """Add log M (`log_e`), the evidence of a step after a block of a healthy machine."""
+        self._highest = max(self._highest, log_e)
+        self._blocks += 1
+        if self._blocks == WINDOW:
+            self.add_window(self._highest)
+            self._highest, self._blocks = 0.0, 0
+
+    def add_window(self, log_e: float) -> None:
+        """Add a window of blocks whose largest log M is `log_e`, such as the window of a withdrawn alarm."""
+        self._count += 1
+        self._surprisal += max(log_e - _LOG_WINDOW, 0.0)
+
+    def log_threshold(self, probability: float) -> float:
+        """Compute the threshold of log M, the log e-value of a step, for a false-alarm `probability` per block."""
+        return _find_threshold(self._count, self._surprisal, probability)
+
+
+@lru_cache(maxsize=1024)
+def _find_threshold(count: int, surprisal: float, probability: float) -> float:
+    """Compute the threshold of log M for a false-alarm `probability` per block: at least -log(probability).
+
+    `count` is the number of windows of a healthy machine, and `surprisal` the sum of their surprisals. With fewer than
+    `_MIN_WINDOWS` the threshold is the lower limit, else that of a window with the false-alarm probability `WINDOW` *
+    `probability`.
+    """
+    if count < _MIN_WINDOWS:
+        return -math.log(probability)
+    null = HealthyNull({STEP: [surprisal / count] * count})  # of the surprisals, only sum and number matter
+    # probability of a window, kept below 1 by the limit
+    chance = null.uncalibrated_chance(STEP, min(WINDOW * probability, 0.5))
+    return max(_LOG_WINDOW - math.log(chance), -math.log(probability))

@@ -34,9 +34,7 @@ from sealscope.diagnosis.live.estimates import (
 from sealscope.diagnosis.live.explanation import OUTSIDE, UNKNOWN, RiseExplanation, explain_rise
 from sealscope.diagnosis.live.joining import SampleJoiner, find_way
 from sealscope.diagnosis.live.live_balance import LEARNED, BlockConductance, BlockResult, LiveBalance, NotJudged
-from sealscope.diagnosis.live.live_rise import LEVEL, STEP, LiveRise
-from sealscope.diagnosis.live.sequential import RECENT, StepDetector
-from sealscope.diagnosis.live.step_null import StepNull
+from sealscope.diagnosis.live.sequential import LEVEL, RECENT, STEP, LiveRise, StepDetector, StepNull
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.priors.live import LIVE
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
@@ -298,7 +296,7 @@ class Watch:
     def dismiss(self) -> None:
         """Withdraw the alarm and the level of healthy recordings; restart the tests, but keep the learned baseline.
 
-        A step that was no leak raises the threshold of later steps (`step_null`).
+        A step that was no leak raises the threshold of later steps (`sequential.StepNull`).
         """
         if self.leak is not None and self.leak.test == STEP:
             self._null.add_window(0.5 * self.leak.score)

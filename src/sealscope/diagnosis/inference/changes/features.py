@@ -13,7 +13,8 @@ such a step:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from functools import lru_cache, partial
 
 import numpy as np
@@ -21,12 +22,12 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, motion_speed, top_speed
+from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, level_tests, motion_speed, top_speed
 from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
-from sealscope.diagnosis.inference.observable import Observable
+from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
-from sealscope.recordings.recording import Array, Recording
+from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import TINY, average_over
 
 _PRIORS = CHANGES.features
@@ -261,3 +262,34 @@ def feature_step_test(time: Array, values: Array) -> StepTest | None:
     # independent errors of equal variance, which the test estimates; precision times values are the values
     precision = np.eye(len(values))
     return step_test(Information(time, precision, vector=values, slope=drift, walk=drift), signs=(1.0, -1.0))
+
+
+SIGNALS = "signals"
+
+
+def observe_signals(recording: Recording) -> Observed:
+    """Test command, sensors and mean pressures of a recording for sudden lasting changes that no leak causes."""
+    return compute_once(recording, (SIGNALS,), _test_signals)
+
+
+@np.errstate(all="ignore")
+def _test_signals(recording: Recording) -> Observed:
+    """Test a recording's signals for changes (`observe_signals`); report only a reason if it is too short."""
+    shortest = CHANGES.features.shortest  # length of a block [s]
+    if len(recording) < BLOCKS * max(ORDER + 2, shortest * recording.rate):  # differences of `ORDER` need samples
+        return Observed(SIGNALS, lack="too short to test its signals for changes")
+    observables = run_tests(
+        lambda: observe_duty(recording),
+        lambda: observe_sensors(recording),
+        lambda: level_tests(recording),
+    )
+    return Observed(SIGNALS, observables)
+
+
+def run_tests(*tests: Callable[[], Iterable[Observable]]) -> tuple[Observable, ...]:
+    """Collect what all `tests` yield; a test in which numbers overflow or a matrix is singular ends early."""
+    observables: list[Observable] = []
+    for test in tests:
+        with suppress(ArithmeticError, np.linalg.LinAlgError):
+            observables += test()
+    return tuple(observables)

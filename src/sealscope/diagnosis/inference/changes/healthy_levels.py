@@ -5,7 +5,8 @@
 - A drift of one pressure only is a drift of that sensor's offset; the charge pressure changes both pressures alike. The
   drifts are fitted over the samples in which the piston moves (`motion_fit`), and a second time over the low values of
   each pressure, which also show a loss of oil (`charge_pressure`). From day to day the zeros of both sensors are
-  compared while a valve connects the chambers (`connected`).
+  compared while a valve connects the chambers (`estimate_connected_difference`): the pump rests, the actuator is moved
+  to and fro from outside, and the drop of pressure in the valve changes its sign with the motion.
 - A filter of one sensor changes the ratio and the phase of the spectra of both pressures (`pressure_bands`).
 
 A number is tested against its scatter between healthy recordings (`observable.compare_estimates`). Called for
@@ -22,6 +23,7 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
+from sealscope.diagnosis.inference.balance import flag_lowering, max_rest_rate
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
     PUMP,
@@ -30,7 +32,7 @@ from sealscope.diagnosis.inference.changes.charge_pressure import (
     subtract_drifts,
     turned_angle,
 )
-from sealscope.diagnosis.inference.changes.connected import estimate_connected_difference
+from sealscope.diagnosis.inference.changes.features import SIGNALS
 from sealscope.diagnosis.inference.changes.motion_fit import (
     TIME,
     fit_difference,
@@ -38,13 +40,13 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     select_motion,
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
-from sealscope.diagnosis.inference.changes.signal_tests import SIGNALS
+from sealscope.diagnosis.inference.equations.signals import MIN_REST, Signals
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.channels import flow_source
-from sealscope.recordings.recording import Recording
+from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import TINY
 
 #: Names of the observables: of friction, and of drifts, which are rival descriptions of the same data.
@@ -225,3 +227,33 @@ def _list_drifts(drifts: Mapping[str, Estimate], kind: str) -> dict[str, float]:
     """List drifts and their standard errors for a recording's summary, from which `_read_drifts` reads them."""
     values = {f"{kind}_{side}": drift.value for side, drift in drifts.items()}
     return values | {f"{kind}_{side}_error": drift.deviation for side, drift in drifts.items()}
+
+
+#: Minimum number of strokes in either direction, for a standard error.
+MIN_STROKES = 2
+
+
+def estimate_connected_difference(recording: Recording, turned: Array) -> Estimate | None:
+    """Estimate the mean of p_A - p_B [Pa] of connected chambers.
+
+    `turned` (n - 1,): angle by which the pump turns in each sampling interval [rad]. Strokes are motions of the piston
+    past the resting pump (`flag_lowering`) in one direction. The means over the strokes of either direction are
+    averaged. Return None for fewer than `MIN_STROKES` strokes in a direction, as of a load that is lowered.
+    """
+    signals = Signals(recording.channels, recording.rate)
+    slowest = max_rest_rate(signals.step("x"), recording.rate, fraction=CHANGES.healthy.slowest)
+    speed = signals.speed[1:]
+    rows = np.flatnonzero(flag_lowering(turned, signals) & (np.abs(speed) > slowest))
+    if not rows.size:
+        return None
+    way = np.sign(speed[rows])
+    begins_stroke = (np.diff(way) != 0.0) | (np.diff(rows) > MIN_REST * recording.rate)
+    first = np.concatenate([[0], np.flatnonzero(begins_stroke) + 1])
+    lengths, is_outward = np.diff(np.append(first, len(rows))), way[first] > 0.0
+    if min(is_outward.sum(), (~is_outward).sum()) < MIN_STROKES:
+        return None
+    difference = (recording["p_A"] - recording["p_B"])[1:][rows]
+    means = np.add.reduceat(difference, first) / lengths
+    ways = [means[is_outward], means[~is_outward]]
+    errors = [values.std(ddof=1) / np.sqrt(len(values)) for values in ways]
+    return Estimate(0.5 * float(ways[0].mean() + ways[1].mean()), 0.5 * float(np.hypot(*errors)))

@@ -19,8 +19,7 @@ from sealscope.diagnosis.inference.balance import (
     recorded_blocks,
 )
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.circuit.store import recorded_oil_loss_tests
-from sealscope.diagnosis.inference.circuit.without_position import cycle_balances
+from sealscope.diagnosis.inference.circuit.without_position import cycle_balances, recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
 from sealscope.diagnosis.inference.comparison.excess import motion_change
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
