@@ -15,10 +15,10 @@ from sealscope.diagnosis.inference.circuit.holds.leaks import BOTH, PistonLeak, 
 from sealscope.diagnosis.inference.circuit.holds.onset_sums import score_onsets
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     estimate_hold_offsets,
-    extend_rests,
     find_charge_pressure,
     find_locked_holds,
 )
+from sealscope.diagnosis.inference.machine_states import extend_rests
 from sealscope.diagnosis.inference.volumes.recorded import log_area_ratio
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.recording import Array

@@ -8,9 +8,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.balance import flag_lowering
 from sealscope.diagnosis.inference.changes.healthy_levels import estimate_connected_difference
-from sealscope.diagnosis.inference.equations.signals import LoweringLimits, Signals
+from sealscope.diagnosis.inference.machine_states import LoweringLimits, flag_lowering
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.live_balance import LiveBalance
@@ -54,7 +53,8 @@ def lift(seed: int, leak: float = 0.0, load: float = 50e5) -> Recording:
 def test_only_the_piston_that_moves_while_the_pump_rests_is_lowered() -> None:
     recording = lift(0, leak=2e-12)
     pumped = DISPLACEMENT * recording["omega"][1:] / RATE
-    is_lowering = flag_lowering(pumped, Signals(recording.channels, RATE))
+    load = recording["p_A"] - recording["p_B"]
+    is_lowering = flag_lowering(pumped, recording["x"], load[1:], RATE)
     phase = (recording.t % CYCLE)[1:]
     assert is_lowering[(phase > 24.5) & (phase < 29.5)].all()
     assert not is_lowering[phase < 23.5].any()  # neither the stroke up nor the sinking of the load in a hold
@@ -70,8 +70,7 @@ def test_steps_with_rests_at_a_small_load_are_no_lowering(rest: float) -> None:
     speed = np.where(phase < 1.0, way * SPEED * np.sin(np.pi * phase), 0.0)
     x = np.cumsum(speed) / rate
     p_A = 5e5 + np.where(phase < 1.0, 1e5 * way, 1e3)
-    signals = Signals({"p_A": p_A, "p_B": np.full(t.size, 5e5), "x": np.round(x, 6)}, rate)
-    assert not flag_lowering(AREA_A * np.diff(x), signals).any()
+    assert not flag_lowering(AREA_A * np.diff(x), np.round(x, 6), p_A[1:] - 5e5, rate).any()
 
 
 def test_lowering_changes_nothing_that_the_pump_shows() -> None:

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.estimate.change import Information, step_test
-from sealscope.diagnosis.inference.balance import flag_lowering, largest_before
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.equations.feed import HoldCounts, flag_circulation
-from sealscope.diagnosis.inference.equations.signals import LoweringLimits, RestLimits, Signals
+from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.machine_states import LoweringLimits, RestLimits, flag_lowering, largest_before
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.parameters import load_rig
 
@@ -67,14 +67,11 @@ def test_a_leak_that_equalises_the_pressures_lowers_no_load(seed: int) -> None:
     load = np.where(is_pause, 30e5 * np.exp(-np.maximum(t - 2.0, 0.0) / rng.uniform(0.1, 0.6)), 30e5)
     sinking = np.where(is_pause, rng.uniform(0.1, 0.2) * SPEED * (load / 30e5) ** rng.choice([0.5, 0.75]), 0.0)
     x = np.cumsum(np.where(is_pause, -sinking, SPEED)) / RATE
-    signals = Signals({"p_A": load + 5e5, "p_B": np.full(t.size, 5e5), "x": x}, RATE)
     pumped = np.where(is_pause, 0.0, AREA * SPEED / RATE)[1:]
     limits = LoweringLimits(pump=1e-3 * AREA * SPEED, creep=0.25 * SPEED, load=30e5, noise=1e-4, time=2.0)
-    assert not flag_lowering(pumped, signals, limits).any()
-    fast = Signals(
-        {**{name: signals[name] for name in ("p_A", "p_B")}, "x": -np.cumsum(np.full(t.size, SPEED)) / RATE}, RATE
-    )
-    assert flag_lowering(pumped, fast, limits)[is_pause[1:]].mean() > 0.8
+    assert not flag_lowering(pumped, x, load[1:].copy(), RATE, limits).any()
+    fast = -np.cumsum(np.full(t.size, SPEED)) / RATE
+    assert flag_lowering(pumped, fast, load[1:].copy(), RATE, limits)[is_pause[1:]].mean() > 0.8
 
 
 @pytest.mark.parametrize("length", [1, 2, 5, 8])

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.balance import max_rest_rate, recorded_blocks
+from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.comparison.rise import Rise
-from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, find_rests
 from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.hypotheses import MachineOdds, Valves
+from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, find_rests, rest_limit
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
@@ -348,7 +348,7 @@ def test_means_of_neighbouring_samples_do_not_hide_the_noise_of_a_resting_pump()
     """The volume of an interval is the mean of two samples of the speed, and half of its noise the next one's."""
     rate, random = 50.0, np.random.default_rng(2)
     speed = np.where(np.arange(6000) < 600, 1.0, 0.0) + 0.1 * random.standard_normal(6000)
-    limit = max_rest_rate(0.5 * (speed[1:] + speed[:-1]) / rate, rate, fraction=0.0)
+    limit = rest_limit(0.5 * (speed[1:] + speed[:-1]) / rate, rate, fraction=0.0)
     averaged = np.convolve(speed[600:], np.ones(round(AVERAGING_TIME * rate)) / round(AVERAGING_TIME * rate), "valid")
     assert 2.0 * averaged.std() < limit < 5.0 * averaged.std()
 

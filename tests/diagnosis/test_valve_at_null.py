@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.inference.balance import BlockStream, bridged_samples
+from sealscope.diagnosis.inference.balance_samples import bridged_samples
+from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.excess import estimate_leak_excess
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest

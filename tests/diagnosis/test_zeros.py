@@ -9,7 +9,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.diagnosis.diagnose import diagnose
-from sealscope.diagnosis.inference.balance import BlockStream
+from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import ColumnRoles, offset_cost, offset_penalty
 from sealscope.diagnosis.inference.equations.balances import equations
 from sealscope.diagnosis.inference.pressure_offset import area_mismatch

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.flow_curves import FlowCurves
-from sealscope.diagnosis.inference.balance import max_rest_rate
-from sealscope.diagnosis.inference.equations.signals import Signals, find_rests
+from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import flow_source
@@ -128,7 +128,7 @@ def _make_cloud(name: str, x: Array, y: Array) -> CheckCurve:
 def _find_rests(recording: Recording) -> NDArray[np.bool_]:
     """Flag the samples (n,) at which the piston rests."""
     steps = np.diff(recording["x"])
-    rests = find_rests(steps, recording.rate, max_rest_rate(steps, recording.rate))
+    rests = find_rests(steps, recording.rate)
     return np.append(rests, rests[-1:])
 
 

@@ -195,7 +195,7 @@ DECISION = {"verdict/evidence.py", "decision/decide.py", "decision/case.py"}
 NAMES = {
     "decision/decide.py",
     "decision/reasons.py",
-    "inference/balance.py",
+    "inference/block_stream.py",
     "inference/blocks.py",
     "inference/comparison/excess.py",
     "inference/equations/balances.py",

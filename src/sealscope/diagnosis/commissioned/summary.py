@@ -13,9 +13,9 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
-from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
-from sealscope.diagnosis.inference.equations.signals import Signals, find_rests
+from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import Inspection
 from sealscope.diagnosis.priors.commissioned import COMMISSIONED
@@ -371,7 +371,7 @@ def measure_duty(recording: Recording) -> MachineDuty:
         if values is not None and increments is not None and len(values) > 2:
             mean_square = _mean(values**2)
             speed = None if mean_square is None else scale * float(np.sqrt(mean_square))
-            rests = find_rests(increments, recording.rate, max_rest_rate(increments, recording.rate))
+            rests = find_rests(increments, recording.rate)
             moving = float(1.0 - rests.mean())
     return MachineDuty(oil_temperature(recording), load, speed, unit, moving, recording.duration / 60.0)
 

@@ -12,6 +12,8 @@ LOG_ZERO = -1e30
 _FAR = 37.0
 #: Standard deviations from which on the tail of the normal distribution is a continued fraction.
 _FRACTION_FROM = 7.07106781186547
+#: Standard deviation of normal values over the median of their magnitudes.
+SD_PER_MEDIAN = 1.4826
 ROOT_TWO_PI = math.sqrt(2.0 * math.pi)
 #: Argument from which Stirling's series for the logarithm of the gamma function is exact to 1e-15.
 _STIRLING_FROM = 16.0

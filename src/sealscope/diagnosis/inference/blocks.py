@@ -7,7 +7,7 @@ several blocks add up, so that a stream and a recording of hours are handled ali
 block is closed (`row_weights`).
 
 All samples of the balance's channels count, also those that bridge a short gap. A row with a clipped sample does not
-count, and one beside a long gap by its share outside of the gap (`balance.BlockStream`).
+count, and one beside a long gap by its share outside of the gap (`block_stream.BlockStream`).
 
 To estimate one coefficient g in each block, all other coefficients are eliminated (`information`). Each of them has a
 level and a slow drift, c_j(t) = sum_p c_jp P_p(t) with polynomials P_p, and a normal prior on its size (`priors.toml`).

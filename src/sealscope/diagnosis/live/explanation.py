@@ -17,12 +17,10 @@ from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.inference.changes.features import (
     SENSOR_FEATURES,
     duty_observables,
-    is_in_motion,
     log_amplitudes,
     run_tests,
     sensor_features,
     sensor_observables,
-    time_in_motion,
 )
 from sealscope.diagnosis.inference.changes.level_changes import (
     fit_pressure_levels,
@@ -31,6 +29,7 @@ from sealscope.diagnosis.inference.changes.level_changes import (
     pressure_level_rows,
     top_speed,
 )
+from sealscope.diagnosis.inference.machine_states import is_in_motion, time_in_motion
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.diagnosis.priors.decision import DECISION

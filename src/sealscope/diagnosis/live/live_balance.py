@@ -1,6 +1,6 @@
 """The volume balance of a running machine: the leakage conductance in each block of a few seconds.
 
-The blocks are cut as in a recording (`inference.balance.BlockStream`). All coefficients of the balance but the leak's
+The blocks are cut as in a recording (`block_stream.BlockStream`). All coefficients of the balance but the leak's
 are estimated recursively from the last blocks (`coefficients`). The conductance is the sum of piston and pump, which
 lie in parallel; `sequential` tests it for a step. In an open circuit valves cut the pump off at rest (`regimes`): the
 pump's own leakage is free in each block, and the conductance is that of the piston, from rests under load; a flow whose
@@ -18,7 +18,7 @@ import numpy as np
 
 from sealscope.compiled import kernel
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.balance import BlockStream
+from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES, volume_observables
 from sealscope.diagnosis.inference.equations.balances import equations, shut_at_rest

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.estimate.change import ChangeScores, ChangeSums, filter_changes, score_in_time
 from sealscope.diagnosis.estimate.interval import Interval
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.special import SD_PER_MEDIAN
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import IntArray
@@ -41,8 +42,6 @@ _WIDE = 1e2
 _JITTER, _ROUNDING = 1e-10, 1e-13
 #: Draws from a posterior: the ends of a 95 % interval then have a relative error of a few per cent.
 _N_DRAWS = 4000
-#: Standard deviation of a normal number over its median size.
-_SD_PER_MEDIAN = 1.4826
 #: Most recordings of an episode that count for the next one's prior, as the machine may scatter otherwise then.
 _MAX_FREEDOM = 20
 
@@ -92,7 +91,7 @@ class Levels:
         # a change between neighbours has twice the variance of a level
         changes = np.abs(np.diff(self.value))[np.diff(self.group) == 0] / math.sqrt(2.0)
         prior_variance = prior.scale**2 + (float(np.mean(self.error**2)) if len(self) else 0.0)
-        measured_variance = (_SD_PER_MEDIAN * float(np.median(changes))) ** 2 if changes.size else 0.0
+        measured_variance = (SD_PER_MEDIAN * float(np.median(changes))) ** 2 if changes.size else 0.0
         weights = prior.freedom, changes.size
         return math.sqrt(float(np.average([prior_variance, measured_variance], weights=weights)))
 

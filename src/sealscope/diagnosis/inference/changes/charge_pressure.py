@@ -26,7 +26,6 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior
-from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.motion_fit import (
     GROUPS,
     equal_parts,
@@ -36,7 +35,7 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     solve_weighted,
     stack_equations,
 )
-from sealscope.diagnosis.inference.equations.signals import find_rests
+from sealscope.diagnosis.inference.machine_states import find_rests
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.channels import flow_source
@@ -91,7 +90,7 @@ def _estimate_low_drifts(recording: Recording) -> dict[str, Estimate]:
     prior, regressors = CHANGES.charge, _regressors(recording, flow_channel)
     rate, turned = recording.rate, turned_angle(recording, flow_channel)
     # one flag for each sample, that of the interval after it; none follows the last sample
-    is_turning = np.append(~find_rests(turned, rate, max_rest_rate(turned, rate)), False)
+    is_turning = np.append(~find_rests(turned, rate), False)
     is_known = np.isfinite(regressors).all(axis=1) & is_turning
     pressures = [average_over(prior.seconds, recording[name], rate) for name in ("p_A", "p_B")]
     lowest = [float(np.nanquantile(p[is_known], LOWEST)) if is_known.any() else np.nan for p in pressures]

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.inference.changes.level_changes import MOTIONS, level_tests, motion_speed, top_speed
-from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME
+from sealscope.diagnosis.inference.machine_states import is_in_motion, time_in_motion
 from sealscope.diagnosis.inference.observable import Observable, Observed
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.recording import Array, Recording, compute_once
-from sealscope.signals.smoothing import TINY, average_over
+from sealscope.signals.smoothing import TINY
 
 _PRIORS = CHANGES.features
 BLOCKS, ORDER = _PRIORS.blocks, _PRIORS.order
@@ -57,24 +57,6 @@ def observe_duty(recording: Recording) -> Iterator[Observable]:
     time, blocks, is_moving = _split_blocks(recording, length)
     amplitudes = {name: values[is_moving] for name, values in log_amplitudes(blocks)}
     return duty_observables(time[is_moving], amplitudes)
-
-
-def time_in_motion(speeds: Array, max_speed: float, rate: float) -> Array:
-    """Compute the fraction of each block's samples in which the piston moves, (K,).
-
-    `speeds` (K, length): speeds of K blocks at the sampling `rate` [Hz], in any unit, NaN where missing. The speed,
-    averaged over `AVERAGING_TIME`, must exceed the fraction `levels.slowest` (`priors.toml`) of `max_speed`.
-    """
-    mean_speeds = average_over(AVERAGING_TIME, speeds, rate)
-    return np.asarray((np.abs(mean_speeds) > CHANGES.levels.slowest * max_speed).mean(axis=1))
-
-
-def is_in_motion(fractions: Array) -> NDArray[np.bool_]:
-    """Flag the blocks (K,) in motion for at least the fraction `features.busy` (`priors.toml`) of the busiest's time.
-
-    All are flagged if none moves. `fractions` (K,): fraction of each block's samples in motion (`time_in_motion`).
-    """
-    return np.asarray(fractions >= _PRIORS.busy * fractions.max(initial=0.0))
 
 
 def log_amplitudes(blocks: Mapping[str, Array]) -> Iterator[tuple[str, Array]]:

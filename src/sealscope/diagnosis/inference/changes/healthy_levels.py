@@ -23,7 +23,6 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.balance import flag_lowering, max_rest_rate
 from sealscope.diagnosis.inference.changes.charge_pressure import (
     DRIFT,
     PUMP,
@@ -40,7 +39,8 @@ from sealscope.diagnosis.inference.changes.motion_fit import (
     select_motion,
 )
 from sealscope.diagnosis.inference.changes.pressure_bands import PAIRS, Octaves, compare_spectra, compute_all_octaves
-from sealscope.diagnosis.inference.equations.signals import MIN_REST, Signals
+from sealscope.diagnosis.inference.equations.signals import Signals
+from sealscope.diagnosis.inference.machine_states import MIN_REST, flag_lowering, number_strokes, rest_limit
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
@@ -241,15 +241,15 @@ def estimate_connected_difference(recording: Recording, turned: Array) -> Estima
     averaged. Return None for fewer than `MIN_STROKES` strokes in a direction, as of a load that is lowered.
     """
     signals = Signals(recording.channels, recording.rate)
-    slowest = max_rest_rate(signals.step("x"), recording.rate, fraction=CHANGES.healthy.slowest)
+    slowest = rest_limit(signals.step("x"), recording.rate, fraction=CHANGES.healthy.slowest)
     speed = signals.speed[1:]
-    rows = np.flatnonzero(flag_lowering(turned, signals) & (np.abs(speed) > slowest))
+    is_lowered = flag_lowering(turned, signals["x"], signals.compute_pressure_difference(), recording.rate)
+    rows = np.flatnonzero(is_lowered & (np.abs(speed) > slowest))
     if not rows.size:
         return None
-    way = np.sign(speed[rows])
-    begins_stroke = (np.diff(way) != 0.0) | (np.diff(rows) > MIN_REST * recording.rate)
-    first = np.concatenate([[0], np.flatnonzero(begins_stroke) + 1])
-    lengths, is_outward = np.diff(np.append(first, len(rows))), way[first] > 0.0
+    strokes = number_strokes(speed[rows], rows, longest_gap=MIN_REST * recording.rate)
+    first, lengths = np.unique(strokes, return_index=True, return_counts=True)[1:]
+    is_outward = speed[rows[first]] > 0.0
     if min(is_outward.sum(), (~is_outward).sum()) < MIN_STROKES:
         return None
     difference = (recording["p_A"] - recording["p_B"])[1:][rows]

@@ -25,10 +25,9 @@ from scipy.linalg.lapack import dpotrf, dpotrs
 
 from sealscope.compiled import kernel
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.inference.balance import max_rest_rate
 from sealscope.diagnosis.inference.changes.level_changes import find_motion_channel
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
-from sealscope.diagnosis.inference.equations.signals import AVERAGING_TIME, MIN_REST
+from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, number_strokes, rest_limit
 from sealscope.diagnosis.priors.changes import CHANGES
 from sealscope.recordings.chambers import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once
@@ -71,7 +70,7 @@ def select_motion(recording: Recording) -> Motion | None:
     """Select the samples in which the piston moves, and build the design matrix of their fit.
 
     The piston moves if the speed, averaged over `AVERAGING_TIME`, exceeds both three standard deviations of its noise
-    and the fraction `healthy.slowest` (`priors.toml`) of the mean speed (`max_rest_rate`). Samples at rest are left
+    and the fraction `healthy.slowest` (`priors.toml`) of the mean speed (`rest_limit`). Samples at rest are left
     out, since friction may then have any value between those of both directions. Samples in motion are thinned out if
     they are many. Return None if a chamber pressure or the motion is not recorded, or if the piston moves in fewer than
     `MIN_ROWS` samples.
@@ -82,7 +81,7 @@ def select_motion(recording: Recording) -> Motion | None:
     values, rate = recording[name], recording.rate
     is_position = name in ("x", "theta")
     increments = np.diff(values) if is_position else values / rate  # changes of the position between samples
-    slowest = max_rest_rate(increments, rate, fraction=CHANGES.healthy.slowest)
+    slowest = rest_limit(increments, rate, fraction=CHANGES.healthy.slowest)
     del increments
     speed = average_over(AVERAGING_TIME, rate * np.gradient(values) if is_position else values, rate)
     acceleration = average_over(AVERAGING_TIME, rate * np.gradient(speed), rate)
@@ -106,9 +105,7 @@ def select_motion(recording: Recording) -> Motion | None:
             _hat_functions(position, min(KNOTS, len(rows) // ROWS_PER_KNOT)),
         ]
     )
-    begins_stroke = (np.diff(np.sign(speed[rows])) != 0) | (np.diff(recording.t[rows]) > MIN_REST)
-    strokes = np.concatenate([[0], np.cumsum(begins_stroke)])
-    return Motion(rows, design, strokes, top_speed)
+    return Motion(rows, design, number_strokes(speed[rows], recording.t[rows]), top_speed)
 
 
 def _hat_functions(position: Array, n_knots: int) -> Array:

@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sealscope.diagnosis.inference.balance import find_rest_limits
-from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.equations.balances import equations, find_rest_limits
 from sealscope.diagnosis.inference.equations.feed import FeedSums, feed_one_chamber, motions_of_side
 from sealscope.diagnosis.inference.equations.signals import Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import BIAS, CYLINDER, LAG, LEAK, MOTIONS, Equation

@@ -36,11 +36,13 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import MIN_BLOCKS, Information, StepTest, step_test
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.inference.balance import MAX_BLOCK_TIME, READ, derive_drive_signals, samples_without_holes
+from sealscope.diagnosis.inference.balance_samples import READ, derive_drive_signals, samples_without_holes
+from sealscope.diagnosis.inference.block_stream import MAX_BLOCK_TIME
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, Weighting, sorted_part_means
 from sealscope.diagnosis.inference.equations.balances import circulation, locked
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.equations.terms import LEAK, ORIFICE, Equation, Flow
+from sealscope.diagnosis.inference.machine_states import find_holds
 from sealscope.diagnosis.inference.rows.weak_form import Rows
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.cycle import estimate_period, fundamental_frequency
@@ -103,7 +105,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
     # fastest flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
     max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
-    is_held = is_known & _find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
+    is_held = is_known & find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
     if is_locked and "u" not in channels and not is_held.all():
         first_motion = int(np.argmin(is_held))
         is_held[:first_motion] = False  # the machine may be off before the first motion
@@ -118,22 +120,6 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
             oil_loss = {} if is_locked else oil_loss_tests(signals, rig, cycle, begin)
             balances.append(CycleBalance(blocks, equation, ColumnRoles(equation), oil_loss))
     return balances
-
-
-def _find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
-    """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
-
-    The flow is averaged over `held.averaged` (`priors.toml`). It is near zero up to the fraction `held.slow` of its
-    largest value, or up to `min_limit` [m^3/s] if this is larger. The settling time is `held.settles`; before the first
-    sample the piston counts as held. `flow` (n,): flow [m^3/s], infinite where the piston is surely not held.
-    """
-    window, settling = max(1, round(_PRIORS.averaged * rate)), max(1, round(_PRIORS.settles * rate))  # [samples]
-    mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
-    is_finite = np.isfinite(mean_flow)
-    limit = max(_PRIORS.slow * mean_flow[is_finite].max(initial=0.0), min_limit)
-    is_moving = ~is_finite | (mean_flow > limit)
-    n_moving = np.convolve(is_moving, np.ones(settling))[: flow.size]  # among the last `settling` samples
-    return np.asarray(n_moving == 0)
 
 
 def _build_blocks(

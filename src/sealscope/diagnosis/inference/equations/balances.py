@@ -6,7 +6,7 @@ chamber behind a servo valve; and one of a pump, or of a held load, while the pi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container
+from collections.abc import Callable, Container, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Literal
 
@@ -49,6 +49,7 @@ from sealscope.diagnosis.inference.equations.terms import (
     metering_edge_terms,
     motion_term,
 )
+from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, NEVER, RestLimits, rest_limit
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.recordings.channels import METERS, flow_source
 from sealscope.recordings.recording import Array
@@ -86,7 +87,7 @@ def _separate_at_rest(equation: Equation, null_sign: Callable[[Signals], Array])
     return by edges whose small openings follow no law of the command. A leak past the piston then moves the spool, but
     hardly changes the flow. The balance gets two terms at rest with unknown coefficients: a flow with the sign that
     `null_sign` computes, (n - 1,), and one in proportion to p_A - p_B. `Signals.holding` flags all rests of the piston
-    here, since the flow of such a balance never counts as resting (`balance.find_rest_limits`). The terms of `equation`
+    here, since the flow of such a balance never counts as resting (`find_rest_limits`). The terms of `equation`
     must end with `LEAKS`.
     """
     left = equation.left
@@ -255,8 +256,8 @@ def circulation(rig: Rig, channels: frozenset[str]) -> Equation | None:
     """Return the volume balance of a pump over whole cycles or at standstill; None if circuit or channels allow none.
 
     The piston then displaces no net volume, so that the position need not be known. The signals must contain `START`
-    (`balance.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a steady
-    load, is assumed to be zero.
+    (`balance_samples.derive_drive_signals`). The offset of the flow, which cannot be separated from leakage under a
+    steady load, is assumed to be zero.
     """
     left = pump_volume(rig, channels)
     if not rig.circuit.pump_feeds_chambers or left is None or not channels.issuperset(PRESSURES):
@@ -308,8 +309,8 @@ def pump_volume(rig: Rig, channels: frozenset[str]) -> Callable[[Signals], Array
     """Return a function that computes from `Signals` the volume [m^3] that the pump delivers in each sampling interval.
 
     The volume follows from the best recorded channel (`flow_source`): the pump's angle, its speed, a flow meter, or the
-    command, from which the speed has been derived (`balance.derive_drive_signals`). Return None if none of them is
-    recorded, or only the command of a pump that does not feed the chambers.
+    command, from which the speed has been derived (`balance_samples.derive_drive_signals`). Return None if none of them
+    is recorded, or only the command of a pump that does not feed the chambers.
     """
     source = flow_source(channels)
     if source == "q_supply":
@@ -391,3 +392,26 @@ def _insert_before_leaks(equation: Equation, *terms: Term) -> Equation:
 def _select_recorded_terms(equation: Equation, channels: frozenset[str]) -> Equation:
     """Return a volume balance without the terms that need a channel outside of `channels`."""
     return equation._replace(terms=tuple(term for term in equation.terms if channels.issuperset(term.needs)))
+
+
+def find_rest_limits(samples: Mapping[str, Array], rate: float, balance: Equation) -> RestLimits:
+    """Compute the flow of the pump and the speed of the piston below which they count as resting.
+
+    Both are those of `rest_limit`, with two exceptions:
+
+    - A balance with terms of its own at rest (`is_separate_at_rest`) needs the stops of the piston only. The flow never
+      counts as resting (`NEVER`), so that a stop of the piston is `holding`. The piston's limit is the fraction
+      `rest.motion_fraction` (`priors.toml`) of its mean speed in motion, and stops shorter than `MIN_REST` count.
+    - If the flow is that of a meter (`q_pump`), it alone decides. Below the same fraction of its mean in motion, the
+      valves are taken as shut, and a piston that still moves creeps by a leak: it never counts as resting.
+
+    `samples`: arrays by channel name at the `rate` [Hz]; `balance`: volume balance, whose left side is the pump's flow.
+    """
+    signals = Signals(samples, rate)
+    if is_separate_at_rest(balance):
+        max_speed = rest_limit(signals.step("x"), rate, fraction=INFERENCE.rest.motion_fraction)
+        return RestLimits(pump=NEVER, piston=max_speed, shortest=AVERAGING_TIME)
+    if flow_source(samples) == "q_pump":  # no angle or speed of the pump is recorded
+        max_flow = rest_limit(balance.left(signals), rate, fraction=INFERENCE.rest.motion_fraction)
+        return RestLimits(pump=max_flow, piston=NEVER)
+    return RestLimits(pump=rest_limit(balance.left(signals), rate), piston=rest_limit(signals.step("x"), rate))

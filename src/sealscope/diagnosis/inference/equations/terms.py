@@ -87,9 +87,9 @@ class Flow(Enum):
     """Source of the flow in a volume balance.
 
     `PUMP`: the pump's angle or speed; `METER`: a flow meter between pump and cylinder; `SUPPLY`: one in the supply line
-    of a valve; `COMMAND`: the command u, from which a speed is computed (`balance.derive_drive_signals`); `VALVE`: the
-    opening of a servo valve, with one balance for each chamber; `CREEP`: nothing but the creep of a load that valves
-    hold.
+    of a valve; `COMMAND`: the command u, from which a speed is computed (`balance_samples.derive_drive_signals`);
+    `VALVE`: the opening of a servo valve, with one balance for each chamber; `CREEP`: nothing but the creep of a load
+    that valves hold.
     """
 
     PUMP = "pump"

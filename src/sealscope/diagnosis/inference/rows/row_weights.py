@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from sealscope.compiled import large_law, law
 from sealscope.diagnosis.estimate.linear import RIDGE
+from sealscope.diagnosis.estimate.special import SD_PER_MEDIAN
 from sealscope.recordings.recording import Array
 
 #: Number of blocks whose rows are weighted together at the beginning of a stream. Later the prior from all earlier
@@ -27,8 +28,6 @@ SUPPORT = 5
 HUBER = 1.345
 #: Maximum number of iterations to a fixed point, and the mean relative change of the weights that ends them.
 MAX_ITERATIONS, TOLERANCE = 50, 1e-2
-#: Standard deviation of normal values over the median of their magnitudes.
-SD_PER_MEDIAN = 1.4826
 _Indices = NDArray[np.intp]
 
 

@@ -19,13 +19,8 @@ from sealscope.diagnosis.estimate.change import (
 )
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.balance import (
-    RegimeBlocks,
-    derive_drive_signals,
-    find_rest_limits,
-    flag_lowering,
-    max_rest_rate,
-)
+from sealscope.diagnosis.inference.balance import RegimeBlocks
+from sealscope.diagnosis.inference.balance_samples import derive_drive_signals
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
     ColumnRoles,
@@ -42,23 +37,19 @@ from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import CylinderSides
 from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     LockedHold,
-    extend_rests,
     find_charge_pressure,
     find_locked_holds,
 )
 from sealscope.diagnosis.inference.comparison.excess import block_weights
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
+from sealscope.diagnosis.inference.equations.balances import find_rest_limits
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
-from sealscope.diagnosis.inference.equations.signals import (
-    MIN_ABSOLUTE_PRESSURE,
-    Signals,
-    find_rests,
-    interval_means,
-)
+from sealscope.diagnosis.inference.equations.signals import MIN_ABSOLUTE_PRESSURE, Signals, interval_means
 from sealscope.diagnosis.inference.equations.terms import CYLINDER, LAG, LINES, TURNING, Equation, Flow
 from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
+from sealscope.diagnosis.inference.machine_states import extend_rests, find_rests, flag_lowering
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
@@ -160,7 +151,7 @@ class RecordedBalance:
         first = int(np.argmax(self.blocks.is_moving))
         if self.has_position_and_flow:
             rate = self.recording.rate
-            rests = find_rests(self._pumped, rate, max_rest_rate(self._pumped, rate))
+            rests = find_rests(self._pumped, rate)
             begin = float(self.recording.t[0]) + int(np.argmin(rests)) / rate
             starts = self.blocks.start - half_width(rate)  # of the first test functions
             first = max(first, int(np.searchsorted(starts, begin)))
@@ -269,7 +260,7 @@ class RecordedBalance:
             return None
         recording, pumped = self.recording, self._pumped
         pressures = {name: recording[name] for name in ("p_A", "p_B")}
-        rests = find_rests(pumped, recording.rate, max_rest_rate(pumped, recording.rate))
+        rests = find_rests(pumped, recording.rate)
         lower_pressure = np.minimum(pressures["p_A"], pressures["p_B"])
         charge = find_charge_pressure(lower_pressure, rests, recording.rate)
         # absolute minus gauge pressure; larger if sensor offsets would make the least pressure too low
@@ -310,8 +301,9 @@ class RecordedBalance:
             channels = derive_drive_signals(channels, self.rig, rate)
         signals = Signals(channels, rate)
         pumped = self.equations[0].left(signals)
-        is_lowering = flag_lowering(pumped, signals)
+        difference = signals.compute_pressure_difference()
         del signals  # its arrays are as long as the recording
+        is_lowering = flag_lowering(pumped, channels["x"], difference, rate)
         return np.where(is_lowering, np.nan, pumped)
 
     def _lost_flow(self, sides: CylinderSides) -> Array:

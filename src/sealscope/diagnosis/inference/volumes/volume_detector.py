@@ -11,13 +11,9 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.balance import (
-    READ,
-    RecordedBlocks,
-    RegimeBlocks,
-    min_samples_for_step,
-    recorded_blocks,
-)
+from sealscope.diagnosis.inference.balance import RecordedBlocks, RegimeBlocks, recorded_blocks
+from sealscope.diagnosis.inference.balance_samples import READ
+from sealscope.diagnosis.inference.block_stream import min_samples_for_step
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.without_position import cycle_balances, recorded_oil_loss_tests
 from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions

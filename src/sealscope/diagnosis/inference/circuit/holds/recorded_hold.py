@@ -120,26 +120,6 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
     return min(lowest, float(np.nanmedian(turning))) if np.isfinite(turning).any() else lowest
 
 
-def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
-    """Extend each rest of the pump back to the time at which its flow has fallen to half of its earlier level.
-
-    Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
-    most this time. `rests` (n,): flags of the sampling intervals in which the pump rests; `flow` (n,): flow of the pump
-    without the part that moves the piston [m^3/s], since valves do not hold a moving piston, NaN counting as 0; `rate`:
-    sampling rate [Hz].
-    """
-    window = max(1, round(INFERENCE.rest.averaged * rate))
-    magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
-    for first, _ in find_runs(rests).tolist():
-        earliest = max(first - window, 0)
-        level = float(np.median(magnitude[max(earliest - window, 0) : earliest + 1]))  # before the flow falls
-        is_above_half = magnitude[earliest:first] > 0.5 * level
-        # samples up to the last one above half; the others are added to the rest
-        n_above = int(np.flatnonzero(is_above_half)[-1]) + 1 if is_above_half.any() else 0
-        extended[earliest + n_above : first] = True
-    return extended
-
-
 def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate: float) -> list[LockedHold]:
     """Find the holds of a recording, i.e. the rests of the pump during which shut valves hold the load.
 
