@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig, parse_overrides
-from sealscope.parameters.drive import Motor
 from sealscope.parameters.fields import choices_of, unit_of
+from sealscope.parameters.parts import Motor
 from sealscope.parameters.rig import declared_fields
 
 from ..refusals import mentions, refusal

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sealscope.recordings.corrections.samples import correct_samples
-from sealscope.recordings.corrections.stale import flag_frozen_rows, flag_stuck_rows
+from sealscope.recordings.corrections.samples import correct_samples, flag_frozen_rows, flag_stuck_rows
 from sealscope.recordings.recording import Recording
 
 from ..diagnosis.balance_machine import machine

@@ -15,7 +15,7 @@ import pytest
 
 from sealscope.errors import UnreadableFile
 from sealscope.recordings import read
-from sealscope.storage.unpacking import max_unpacked_size
+from sealscope.storage.opening import max_unpacked_size
 
 from ..refusals import refusal
 from .refusals import refused

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from sealscope.recordings.corrections.spikes import find_spikes
+from sealscope.recordings.corrections.samples import find_spikes
 
 T = np.arange(2000) / 20.0
 #: A pressure [Pa] that reverses by 75 bar within a sample or two, as an actuator's does at 20 Hz.

@@ -7,7 +7,7 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import OUTPUTS
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.signals.details import details
 from sealscope.simulation.experiment import FILTER_REACH, Experiment
 from sealscope.simulation.instruments import decimate, record

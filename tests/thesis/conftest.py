@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.appendix_c_runs import COLUMNS, make_row

@@ -7,7 +7,7 @@ import itertools
 import numpy as np
 import pytest
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters import appendix_c
 from sealscope.thesis.chapters import appendix_c_runs as simulation

@@ -11,7 +11,7 @@ import pytest
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.chapters.chapter4 import figures as chapter4
 from sealscope.thesis.chapters.chapter4.cases import (

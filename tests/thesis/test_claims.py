@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters.chapter5 import TESTS, LeakTestMeasures
 from sealscope.thesis.claims import detection as claims

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sealscope.parameters import load_rig
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.signals.details import QUANTITIES, details
 from sealscope.simulation.experiment import throttle_values
 from sealscope.thesis.identification import (

@@ -9,7 +9,7 @@ import pytest
 
 from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import clopper_pearson
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.thesis.chapters.success_rates import (
     CLAIMED,
     RATES,

@@ -14,8 +14,7 @@ from typing import NamedTuple
 
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
 from sealscope.paragraphs import join_names
-from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import CHANNEL_UNITS, SLOW
+from sealscope.recordings.channels import CHANNEL_UNITS, SLOW, chambers_of
 from sealscope.recordings.corrections.samples import correct_samples
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import find_name_and_unit, suggest_map_entry

@@ -14,12 +14,10 @@ from pydantic.fields import FieldInfo
 
 from sealscope.calls import suggestion
 from sealscope.errors import InputError
-from sealscope.parameters.actuator import Cylinder, Friction
 from sealscope.parameters.circuit import CIRCUITS, HydraulicCircuit
-from sealscope.parameters.drive import Fluid, HydraulicLine, MakeUp, Motor, Pump
 from sealscope.parameters.fields import Part, PartsDisagreeError, absent_of, choices_of, iter_fields, unit_of, with_unit
 from sealscope.parameters.instruments import Daq, Sensors
-from sealscope.parameters.valve import ServoValve, Supply
+from sealscope.parameters.parts import Cylinder, Fluid, Friction, HydraulicLine, MakeUp, Motor, Pump, ServoValve, Supply
 from sealscope.units import parse_quantity, to_si
 
 Value = float | int | str

@@ -1,4 +1,4 @@
-"""The channels of a recording: their names, which are the thesis's symbols, SI units, meanings and quantisation."""
+"""The channels of a recording: names, which are the thesis's symbols, SI units, meanings and quantisation."""
 
 from __future__ import annotations
 
@@ -62,3 +62,16 @@ def smallest_step(values: Array) -> float:
 def estimate_quantum(values: Array) -> float:
     """Estimate the quantisation step of finite values (n > 0,), thinned if they are many; 0 if all are equal."""
     return smallest_step(np.unique(values[:: max(1, values.size // _QUANTUM_SAMPLES)]))
+
+
+CHAMBERS = ("p_A", "p_B")
+#: The pump's ports and the chambers, in the order of the instruments.
+PRESSURES = ("p_1", "p_2", *CHAMBERS)
+
+#: Units in which pressures are displayed.
+DISPLAY_UNITS = ("bar", "MPa", "kPa", "psi")
+
+
+def chambers_of(recording: Container[str]) -> tuple[str, ...]:
+    """List the names of the chamber pressures that a recording contains, p_A before p_B."""
+    return tuple(name for name in CHAMBERS if name in recording)

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import Array, chambers_of
 from sealscope.recordings.motion import is_moving
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording, compute_once

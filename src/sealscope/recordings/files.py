@@ -23,8 +23,7 @@ from sealscope.recordings.formats.text_layout import SNIFF, detect_encoding
 from sealscope.recordings.recording import Recording, make_recording
 from sealscope.recordings.subprocesses import run_on_file
 from sealscope.storage.atomic import atomic_write
-from sealscope.storage.opening import open_regular, raising_unreadable
-from sealscope.storage.unpacking import max_unpacked_size
+from sealscope.storage.opening import max_unpacked_size, open_regular, raising_unreadable
 
 #: `formats.toml`: formats that are read, and formats that are recognised by first bytes or suffix but not read.
 _TABLES: dict[str, dict[str, Any]] = tomllib.loads(Path(__file__).with_name("formats.toml").read_text("utf-8"))

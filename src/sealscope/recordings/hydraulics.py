@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.channels import COUNTS, UNUSED, Array
+from sealscope.recordings.channels import CHAMBERS, COUNTS, UNUSED, Array, chambers_of
 from sealscope.recordings.formats.headings.labels import Label
 from sealscope.recordings.formats.headings.proposal import is_pressure
 from sealscope.recordings.motion import is_constant

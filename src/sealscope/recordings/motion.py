@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import ROUNDING, Array, smallest_step
+from sealscope.recordings.channels import ROUNDING, Array, chambers_of, smallest_step
 from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.recording import Recording
 

@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 from sealscope.calls import checked_call
 from sealscope.errors import InputError, MissingExtra, UnreadableFile
 from sealscope.paragraphs import format_count
-from sealscope.recordings.chambers import DISPLAY_UNITS
-from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, LONG_NAMES, Array
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, DISPLAY_UNITS, LONG_NAMES, Array
 from sealscope.recordings.formats.columns import ChannelMap, Request
 from sealscope.recordings.formats.headings.preamble import collect_remarks
 from sealscope.storage.opening import raising_unreadable

@@ -21,7 +21,7 @@ from threading import BoundedSemaphore, Timer
 from typing import Any, TypeVar
 
 from sealscope.errors import SealscopeError, UnreadableFile
-from sealscope.storage.unpacking import MAX_UNPACKED
+from sealscope.storage.opening import MAX_UNPACKED
 
 T = TypeVar("T")
 _MAX_START_TIME = 30.0  # time that starting a process may take in addition to the work [s]

@@ -17,7 +17,7 @@ from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.machine_sizes import states_rig
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig, rig_names
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.reporting import charts, features, messages, printing, template
 from sealscope.reporting.charts import Mark

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from sealscope.errors import InputError
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array
 from sealscope.simulation.changes import (
     MAX_RELATIVE_CHANGE,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.physics.solvers.loop import quantize
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.signals.recursion import filter_recursively
 from sealscope.simulation.changes import apply_effects

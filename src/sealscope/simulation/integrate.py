@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.simulation.changes import Schedule
 from sealscope.simulation.closed_loop import Feedback, outputs_per_sample

@@ -14,7 +14,7 @@ import numpy as np
 
 from sealscope.calls import checked_call, take_fields_of
 from sealscope.errors import InputError, SimulationFailed
-from sealscope.recordings.chambers import CHAMBERS, PRESSURES
+from sealscope.recordings.channels import CHAMBERS, PRESSURES
 from sealscope.recordings.recording import CHANNEL_UNITS, Array, Recording
 from sealscope.simulation.arguments import Arguments
 from sealscope.simulation.changes import ParameterDrift

@@ -17,7 +17,7 @@ from typing import Literal
 import numpy as np
 
 from sealscope.parameters import Rig, load_rig
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.simulation.experiment import Experiment, throttle_values

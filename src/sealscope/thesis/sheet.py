@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from sealscope.errors import InputError, UnreadableFile
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 

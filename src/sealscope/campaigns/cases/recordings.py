@@ -19,7 +19,7 @@ from sealscope.diagnosis.assumed_rig import assumed_rig
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.errors import InputError, SealscopeError
 from sealscope.recordings import read
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Recording
 from sealscope.storage.folders import iter_inner_files, numeric_sort_key
 

@@ -14,7 +14,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.signals.filters import IntArray, reach

@@ -48,7 +48,7 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import estimate_h
 from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.diagnosis.priors.inference import INFERENCE
-from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.channels import chambers_of
 from sealscope.recordings.quality import Finding
 from sealscope.recordings.recording import Array, Recording
 from sealscope.units import BAR, ML_PER_MINUTE, MM_PER_MINUTE, P_ATM

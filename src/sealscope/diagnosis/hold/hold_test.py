@@ -21,8 +21,7 @@ from sealscope.diagnosis.hold.set_up import SetUp, parse_set_up
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.channels import COUNTS, FLOW_SOURCES
+from sealscope.recordings.channels import CHAMBERS, COUNTS, FLOW_SOURCES
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import inspect

@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.recordings.chambers import CHAMBERS, chambers_of
-from sealscope.recordings.channels import ROUNDING
+from sealscope.recordings.channels import CHAMBERS, ROUNDING, chambers_of
 from sealscope.recordings.corrections.gaps import flag_bridged
 from sealscope.recordings.cycle import find_cycle
 from sealscope.recordings.quality import is_mostly_clipped

@@ -41,7 +41,7 @@ from sealscope.diagnosis.rms_change.rms_blocks import (
     measure_levels,
 )
 from sealscope.diagnosis.verdict.evidence import RMS_CHANGE
-from sealscope.recordings.chambers import chambers_of
+from sealscope.recordings.channels import chambers_of
 from sealscope.recordings.hydraulics import describe_missing_chambers
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant

@@ -37,7 +37,7 @@ from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig
-from sealscope.recordings.chambers import CHAMBERS, chambers_of
+from sealscope.recordings.channels import CHAMBERS, chambers_of
 from sealscope.recordings.formats.times.timebase import parse_epoch
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature

@@ -17,8 +17,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.chambers import chambers_of
-from sealscope.recordings.channels import Array
+from sealscope.recordings.channels import Array, chambers_of
 from sealscope.recordings.corrections.clock import MAX_INTERVAL
 from sealscope.recordings.cycle import duty_signal, find_cycle
 from sealscope.recordings.motion import find_runs

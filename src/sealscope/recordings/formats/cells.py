@@ -16,8 +16,7 @@ import numpy as np
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import Array
-from sealscope.recordings.formats.headings.labels import Label, is_unit
-from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.headings.labels import WORDS, Label, is_unit
 from sealscope.recordings.formats.times.timebase import is_stamp
 from sealscope.units import parse_unit
 

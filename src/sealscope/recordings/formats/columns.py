@@ -16,7 +16,7 @@ from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS, UNUSED
 from sealscope.recordings.formats.headings.actuators import find_actuators
 from sealscope.recordings.formats.headings.formula import Formula, is_pure_number, parse_formula
-from sealscope.recordings.formats.headings.labels import Label, split_square_brackets
+from sealscope.recordings.formats.headings.labels import WORDS, Label, split_square_brackets
 from sealscope.recordings.formats.headings.proposal import (
     ends_in,
     format_map,
@@ -28,8 +28,7 @@ from sealscope.recordings.formats.headings.proposal import (
     split_unit,
     unit_of_time,
 )
-from sealscope.recordings.formats.headings.split_time import find_time_parts
-from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.times.timebase import find_time_parts
 from sealscope.units import same_dimension, to_si
 
 

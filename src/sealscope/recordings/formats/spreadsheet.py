@@ -20,7 +20,7 @@ from sealscope.recordings.formats.columns import Request
 from sealscope.recordings.formats.libraries import import_library
 from sealscope.recordings.formats.table import RecordingFields, check_size
 from sealscope.recordings.formats.text import read_text
-from sealscope.storage.unpacking import check_unpacked, max_unpacked_size
+from sealscope.storage.opening import check_unpacked, max_unpacked_size
 
 _CHUNK = 2**20
 _N_ROWS = 500  # rows from which texts that are numbers with a decimal comma are detected

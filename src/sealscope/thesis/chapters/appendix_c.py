@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from sealscope.evaluation.binomial import clopper_pearson
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.details import QUANTITIES
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet

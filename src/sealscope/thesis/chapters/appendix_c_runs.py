@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, details, mean_squares
 from sealscope.signals.filters import reach

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.signals.filters import discrete_wavelet
 from sealscope.simulation.experiment import Experiment

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.details import QUANTITIES, details
 from sealscope.signals.windows import WINDOW_SIZE, rms, windowed_rms

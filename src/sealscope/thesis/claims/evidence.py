@@ -13,7 +13,7 @@ from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import clopper_pearson
 from sealscope.evaluation.roc import auc
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array
 from sealscope.thesis.chapters.appendix_c_runs import simulated_sheet
 from sealscope.thesis.chapters.chapter5 import TESTS, LeakTestMeasures, measure_test

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from sealscope.parameters import load_rig
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.signals.filters import decomposition_filters, reach
 from sealscope.signals.windows import WINDOW_SIZE
 from sealscope.thesis.chapters.appendix_c_runs import column

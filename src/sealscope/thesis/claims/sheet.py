@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.errors import MissingExtra
 from sealscope.evaluation.binomial import upper_tail
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.thesis.chapters.chapter5 import NOMINAL_LPM, TESTS, PrintedTest
 from sealscope.thesis.chapters.success_rates import (
     CLAIMED,

@@ -44,8 +44,7 @@ from sealscope.diagnosis.inference.machine_states import MIN_REST, flag_lowering
 from sealscope.diagnosis.inference.observable import Observable, compare_estimates
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import CHAMBERS, flow_source
 from sealscope.recordings.recording import Array, Recording
 from sealscope.signals.smoothing import TINY
 

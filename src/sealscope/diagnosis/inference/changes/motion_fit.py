@@ -29,7 +29,7 @@ from sealscope.diagnosis.inference.changes.level_changes import find_motion_chan
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, number_strokes, rest_limit
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording, compute_once
 from sealscope.signals.smoothing import TINY, average_over
 

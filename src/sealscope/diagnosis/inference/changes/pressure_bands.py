@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from sealscope.diagnosis.estimate.population import MIN_HEALTHY, ScatterPrior, estimate_variance
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.recordings.chambers import CHAMBERS
+from sealscope.recordings.channels import CHAMBERS
 from sealscope.recordings.recording import Array, Recording
 
 #: `Observable.data` of the comparison of spectra.

@@ -33,8 +33,7 @@ from sealscope.diagnosis.inference.volumes.rivals import rival_rises
 from sealscope.diagnosis.learnt import learn_once
 from sealscope.diagnosis.priors.inference import INFERENCE
 from sealscope.diagnosis.verdict.evidence import VOLUME_BALANCE
-from sealscope.recordings.chambers import CHAMBERS
-from sealscope.recordings.channels import flow_source
+from sealscope.recordings.channels import CHAMBERS, flow_source
 from sealscope.recordings.recording import Recording, compute_once
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
-from sealscope.recordings.formats.headings.labels import Label
+from sealscope.recordings.formats.headings.labels import WORDS, Label
 from sealscope.recordings.formats.headings.proposal import (
     find_name_and_unit,
     find_sides,
@@ -25,7 +25,6 @@ from sealscope.recordings.formats.headings.proposal import (
     iter_tokens,
     strip_accents,
 )
-from sealscope.recordings.formats.headings.words import WORDS
 
 _MACHINE = {kind: frozenset(words) for kind, words in WORDS["machine"].items()}
 #: Spelling of an adjective -> its usual form, as `l` -> `left`.

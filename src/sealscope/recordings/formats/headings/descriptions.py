@@ -6,8 +6,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.headings.labels import WORDS, Label
 from sealscope.units import same_dimension
 
 _ROW = WORDS["row"]

@@ -3,12 +3,27 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
 
 from sealscope.errors import InputError
 from sealscope.recordings.channels import CHANNEL_UNITS
-from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.units import parse_unit, same_dimension
+
+
+def _split_lists(tree: Any) -> Any:
+    """Convert the comma-separated texts in nested tables, at any depth, to tuples of words."""
+    if isinstance(tree, str):
+        return tuple(tree.replace("\n", "").split(", "))
+    return {key: _split_lists(value) for key, value in tree.items()}
+
+
+_tree = tomllib.loads(files(__package__).joinpath("words.toml").read_text(encoding="utf-8"))
+#: Meaning, or table of meanings -> words; the entries of `time`, `channel` and `stated` stay texts.
+WORDS: dict[str, Any] = {**_split_lists(_tree), **{name: _tree[name] for name in ("time", "channel", "stated")}}
+
 
 #: Full-width brackets of Chinese and Japanese text -> brackets.
 _WIDE_BRACKETS = str.maketrans("\uff08\uff09\uff3b\uff3d\u3010\u3011", "()[][]")

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from sealscope.errors import InputError, printable
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.headings.labels import WORDS, Label
 from sealscope.units import parse_unit, to_si
 
 #: Most remarks that are read, and the longest name and text of each.

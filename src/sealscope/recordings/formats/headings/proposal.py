@@ -9,8 +9,7 @@ from itertools import repeat
 from typing import NamedTuple
 
 from sealscope.recordings.channels import CHANNEL_UNITS
-from sealscope.recordings.formats.headings.labels import Label
-from sealscope.recordings.formats.headings.words import WORDS
+from sealscope.recordings.formats.headings.labels import WORDS, Label
 from sealscope.units import is_familiar, same_dimension
 
 #: Words of a heading by the quantity, the side of the machine or another kind that they mean, from `words.toml`.

@@ -18,8 +18,7 @@ from typing import IO, Any, TypeVar
 from sealscope.errors import UnreadableFile
 from sealscope.recordings.formats.libraries import import_library
 from sealscope.recordings.subprocesses import run_on_file
-from sealscope.storage.opening import raising_unreadable
-from sealscope.storage.unpacking import check_unpacked
+from sealscope.storage.opening import check_unpacked, raising_unreadable
 
 T = TypeVar("T")
 _SUFFIXES = (".gz", ".bz2", ".xz", ".zst", ".zip", ".tar", ".tgz")

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from sealscope.errors import InputError
+from sealscope.recordings.formats.headings.labels import WORDS
 from sealscope.recordings.formats.headings.preamble import scope_start
-from sealscope.recordings.formats.headings.words import WORDS
 from sealscope.recordings.formats.times.timebase import explicit_order, iso_moment, parse_epoch, parse_stamps
 from sealscope.storage.opening import open_regular
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from sealscope.parameters import load_rig
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.recordings.recording import Array
 from sealscope.simulation.experiment import Experiment
 from sealscope.thesis.engine.context import Context, SimulatedRun

@@ -17,7 +17,7 @@ import numpy as np
 
 from sealscope.parameters import load_rig
 from sealscope.physics.rig import throttle_coefficients
-from sealscope.recordings.chambers import CHAMBERS, PRESSURES
+from sealscope.recordings.channels import CHAMBERS, PRESSURES
 from sealscope.signals.windows import rms
 from sealscope.simulation.commands import Sine, parse_command
 from sealscope.thesis.chapters.chapter4 import cases

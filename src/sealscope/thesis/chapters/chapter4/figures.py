@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sealscope.recordings.chambers import PRESSURES
+from sealscope.recordings.channels import PRESSURES
 from sealscope.simulation.commands import parse_command
 from sealscope.thesis.chapters.chapter4 import cases
 from sealscope.thesis.engine.context import Context, SimulatedRun

@@ -1,10 +1,12 @@
-"""Parameters of the electric and hydraulic drive: servo motor, pump, lines with throttles, fluid."""
+"""Parameters of a rig's parts: servo motor, pump, lines with throttles, fluid, cylinder, servo valve and its supply."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal, Self
 
-from sealscope.parameters.fields import Part, choice, conductance, quantity
+from pydantic import model_validator
+
+from sealscope.parameters.fields import Part, choice, conductance, quantity, with_unit
 
 
 class Motor(Part):
@@ -119,3 +121,125 @@ class MakeUp(Part):
         "pressure above the accumulator's that opens a relief valve", "Pa", absent=2e7, gt=0, le=1e9
     )
     G_relief: float = conductance("conductance of a relief valve above its pressure", absent=0)
+
+
+#: Largest difference of a double-rod cylinder's areas, divided by their mean: makers' tolerances.
+_MAX_DOUBLE_ROD_UNEVENNESS = 0.1
+
+
+class Cylinder(Part):
+    """Parameters of the cylinder, its end stops and its load, eqs. (4.13)-(4.15), (4.18), (4.19) of the thesis.
+
+    The position x is 0 at mid-stroke. The areas A_A and A_B of a double-rod cylinder are equal to within makers'
+    tolerances; those of a single-rod cylinder differ by more (`single_rod`).
+    """
+
+    A_A: float = quantity("piston area on side A", "m^2", gt=0, le=10)
+    A_B: float = quantity("piston area on side B", "m^2", gt=0, le=10)
+    L: float = quantity("stroke", "m", gt=0, le=100)
+    M_eq: float = quantity("moving mass", "kg", gt=0, le=1e6)
+    V: float = quantity("volume of each side at mid-stroke", "m^3", gt=0, le=100)
+    V_rod: float = quantity("rod in side B at mid-stroke: V less this is left", "m^3", absent=0, ge=0, le=100)
+    volumes: Literal["fixed", "position"] = choice("chamber volumes: constant V, or V + A_A x and V - A_B x")
+    balance: Literal["mass", "volume"] = choice(
+        "what chambers balance where volumes move with the piston", absent="mass"
+    )
+    k_stop: float = quantity("stiffness of the end stop", "N/m", gt=0, le=1e12)
+    d_stop: float = quantity("damping of the end stop", "N s/m", ge=0, le=1e9)
+    V_hose_A: float = quantity("hose on side A: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)
+    V_hose_B: float = quantity("hose on side B: volume beside the chamber's", "m^3", absent=0, ge=0, le=1)
+    k_load: float = quantity("spring of the load about mid-stroke", "N/m", absent=0, ge=0, le=1e9)
+    d_load: float = quantity("damper of the load", "N s/m", absent=0, ge=0, le=1e9)
+    A_opp: float = quantity("piston area of an opposing cylinder (0: none)", "m^2", absent=0, ge=0, le=10)
+    p_opp: float = quantity("pressure that feeds the opposing cylinder", "Pa", absent=0, ge=0, le=1e9)
+    C_opp: float = quantity("coefficient of the orifice in that feed", "m^3/(s Pa^0.5)", absent=1, gt=0, le=1)
+    F_l: float = quantity("constant external load", "N", ge=-1e8, le=1e8)
+    G_ext_A: float = conductance("leakage conductance of the rod seal of A")
+    G_ext_B: float = conductance("leakage conductance of the rod seal of B")
+
+    @property
+    def single_rod(self) -> bool:
+        """True if the piston areas differ by more than makers' tolerances, 10 % of their mean."""
+        return abs(self.A_A - self.A_B) / (0.5 * (self.A_A + self.A_B)) > _MAX_DOUBLE_ROD_UNEVENNESS
+
+
+class Friction(Part):
+    """Coulomb, Stribeck and viscous friction of the piston, eqs. (4.20)-(4.22) of the thesis.
+
+    `law` may select another law near standstill, which uses the same forces while the piston slides.
+    """
+
+    F_pr: float = quantity("preload force of the seals", "N", ge=0, le=1e7)
+    F_cfr: float = quantity("Coulomb friction per pressure", "N/Pa", ge=0, le=1)
+    C_c: float = quantity("transition coefficient", "s/m", gt=0, le=1e6)
+    K_brk: float = quantity("breakaway force over Coulomb force", "1", ge=1, le=100)
+    F_v: float = quantity("viscous friction coefficient", "N s/m", ge=0, le=1e8)
+    v_th: float = quantity("velocity below which friction is linear", "m/s", gt=0, le=10)
+    coulomb_pressure: Literal["sum", "difference"] = choice("pressure in the Coulomb force, eq. (4.20)")
+    law: Literal["stribeck", "karnopp", "lugre"] = choice("law of friction near standstill", absent="stribeck")
+    sigma_0: float = quantity("stiffness of the contact, LuGre", "N/m", absent=1e6, gt=0, le=1e12)
+    sigma_1: float = quantity("damping of the contact, LuGre", "N s/m", absent=1e3, ge=0, le=1e9)
+    backward: float = quantity("friction of motion towards -x over that towards +x", "1", absent=1, gt=0, le=100)
+    bracket: Literal["continuous", "literal"] = choice("bracketing of the linear part, eq. (4.22)")
+
+
+def _overlap(edge: str) -> Any:
+    """Declare the parameter for the overlap [m] of a metering edge of the valve; `edge`: name, such as "P to A"."""
+    return quantity(f"overlap of the edge from {edge} (< 0: underlap)", "m", absent=0, ge=-0.1, le=0.1)
+
+
+class ServoValve(Part):
+    """Servo valve with four metering edges between supply (P), return (T) and the chambers A and B.
+
+    With `spool = "absent"` the rig has no servo valve. The spool follows the command as a second-order system with
+    limited speed. An edge is an orifice whose area grows linearly with the spool's travel beyond the overlap.
+    """
+
+    spool: Literal["absent", "present"] = choice("servo valve between supply and cylinder", absent="absent")
+    Q_N: float = quantity("rated flow of an edge at full stroke", "m^3/s", absent=1.6e-4, gt=0, le=1)
+    dp_N: float = quantity("pressure drop of an edge at its rated flow", "Pa", absent=3.5e6, gt=0, le=1e9)
+    dp_lam: float = quantity(
+        "pressure difference below which an edge of the valve is laminar", "Pa", absent=5e4, gt=0, le=1e7
+    )
+    u_N: float = quantity("command at full stroke of the spool", "V", absent=10, gt=0, le=1e3)
+    x_max: float = quantity("stroke of the spool, either way", "m", absent=5e-4, gt=0, le=0.1)
+    o_PA: float = _overlap("P to A")
+    o_AT: float = _overlap("A to T")
+    o_PB: float = _overlap("P to B")
+    o_BT: float = _overlap("B to T")
+    omega_s: float = quantity("natural frequency of the spool", "rad/s", absent=600, gt=0, le=1e5)
+    zeta_s: float = quantity("damping ratio of the spool", "1", absent=0.7, gt=0, le=100)
+    v_max: float = quantity("largest speed of the spool", "m/s", absent=0.1, gt=0, le=1e3)
+
+    @model_validator(mode="after")
+    def _check_overlaps(self) -> Self:
+        """Raise ValueError, as pydantic requires, unless the overlap of each edge is within +- the spool's stroke."""
+        for name in ("o_PA", "o_AT", "o_PB", "o_BT"):
+            overlap = getattr(self, name)
+            if not abs(overlap) < self.x_max:
+                raise ValueError(
+                    f"valve.{name} must be within the spool's stroke, +-{with_unit(self.x_max, 'm')} (valve.x_max), "
+                    f"got {with_unit(overlap, 'm')}"
+                )
+        return self
+
+
+class Supply(Part):
+    """Supply of a servo valve: a pump driven at constant speed, with a relief valve that limits the pressure.
+
+    With `drive = "absent"` the rig has no such supply. The rig's motor turns the pump, which draws from the return
+    line and feeds the line of volume V_1, to which an accumulator is connected.
+    """
+
+    drive: Literal["absent", "constant-speed"] = choice(
+        "drive of the pump that supplies a servo valve", absent="absent"
+    )
+    omega_P: float = quantity("speed of the supply's pump", "rad/s", absent=157, gt=0, le=1e4)
+    p_set: float = quantity("pressure above the return that opens the relief valve", "Pa", absent=7e6, gt=0, le=1e9)
+    G_set: float = quantity(
+        "conductance of the supply's relief valve above its pressure", "m^3/(s Pa)", absent=5e-10, gt=0, le=1e-6
+    )
+    p_return: float = quantity("pressure of the return line", "Pa", absent=0, ge=0, le=1e8)
+    V_acc: float = quantity("gas in the accumulator at p_pre (0: none)", "m^3", absent=0, ge=0, le=10)
+    p_pre: float = quantity("pressure of the gas in the empty accumulator", "Pa", absent=5e6, ge=0, le=1e9)
+    n_acc: float = quantity("polytropic exponent of the gas in the supply's accumulator", "1", absent=1, ge=1, le=2)
