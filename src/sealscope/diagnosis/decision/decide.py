@@ -172,10 +172,10 @@ def _size_fields(leak: LeakMeasure, flow: Estimate | None) -> dict[str, Any]:
 
 
 def _leak_bound(case: Case, alarm: LeakTest | None) -> float:
-    """Compute the 95 % upper bound of a leak's mean flow [m^3/s], infinite ("any size") if it is of no use.
+    """Compute the 95 % upper bound of a leak's mean flow [m^3/s]; infinite if the recording excludes no size of a leak.
 
-    If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. A bound is
-    of no use without measured leakage, or if it is not below the pump's mean flow, unless that is 0 or unknown.
+    If a leak may have caused the `alarm`, the bound is at least the upper end of this leak's 95 % interval. It is
+    infinite without measured leakage, and if it is not below the pump's mean flow, unless that is 0 or unknown.
     """
     leak = case.leak
     if leak is None:

@@ -195,7 +195,10 @@ class StepTest:
         return float((threshold_z + NormalDist().inv_cdf(power)) * np.median(self.deviation))
 
     def threshold(self, chance: float) -> float:
-        """Compute the score that a coefficient without a step exceeds with the probability `chance`, at most 10 000."""
+        """Compute the threshold of the score that is exceeded with the probability `chance` if there is no step.
+
+        It is at most 10 000.
+        """
         max_score = 1e4  # upper end of the search; such a score has practically no probability
         if self.law.chance(0.0) <= chance:
             return 0.0
@@ -518,7 +521,7 @@ class _Whitening:
 
     @cached_property
     def transform(self) -> Array:
-        """Matrix (n, K) from the coefficient in the blocks to z, without level, slope and further change."""
+        """Matrix (n, K) that gives z from the coefficients of K blocks, free of level, slope and nuisances."""
         return -np.diff(self.increments, axis=1, append=0.0)
 
     @cached_property
@@ -675,12 +678,12 @@ def _build_whitening(
 
 @kernel
 def _project_out(precision: Array, changes: Array, priors: Array, floor: float, sums: Array, gains: Array) -> int:
-    """Project m `changes` (m, K) with prior precisions `priors` (m,) out of a coefficient's `precision` (K, K).
+    """Eliminate m nuisance `changes` (m, K) from the `precision` (K, K) of a coefficient in K blocks, one by one.
 
-    They are eliminated one after the other. A change x that the data cannot show, with x' Lambda x at most `floor` x' x
-    beside the earlier ones, stays. Writes L' Lambda L of the remaining precision to `sums` (K, K), where L sums up the
-    increments of the coefficient, and to `gains` (m, K) that of each change, with which its elimination subtracts
-    gain x' vector from the vector of the likelihood. Returns the number of values that are lost.
+    `priors` (m,): prior precisions of their sizes. A change x that the data cannot show, with x' Lambda x at most
+    `floor` x' x beside the earlier ones, stays. Writes L' Lambda L of the remaining precision to `sums` (K, K), where L
+    sums up the increments of the coefficient, and to `gains` (m, K) that of each change, with which its elimination
+    subtracts gain x' vector from the vector of the likelihood. Returns the number of values that are lost.
     """
     n_changes, count = changes.shape
     products, n_removed = np.empty(count), 0

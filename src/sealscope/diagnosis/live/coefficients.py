@@ -115,10 +115,11 @@ def add_block(model: Any, rows: float, weight: float, has_stepped: bool) -> None
 
 @large_law
 def _solve(model: Any) -> None:
-    """Solve the normal equations C c = m of the nuisances, and C x = r for two further right-hand sides r.
+    """Estimate the coefficients of all columns but the leak's by least squares, and solve for two further right sides.
 
-    `model` is a `Coefficients`, whose `matrix[:, n:]` (n, 3) receives c, the least-squares estimate, and holds the two
-    r, which are replaced by the solutions. C and m are computed from the sums (module's docstring).
+    With the normal equations C c = m of these n nuisances, computed from the sums (module's docstring), the columns n
+    to n + 2 of `model.matrix` receive c and the two solutions x of C x = r. The right sides r stand in the last two
+    columns before.
     """
     sums, n = model.sums, len(model.matrix)
     leak, left_side = n, n + 1  # indices of these columns, after those of the n unknowns

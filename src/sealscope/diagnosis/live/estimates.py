@@ -225,7 +225,7 @@ def _unexplained_scatter(healthy: HealthyLevel, short_term_deviation: float, max
 
 
 def level_before_leak(leak: WatchedLeak, t: float) -> EstimatedInterval:
-    """Return the conductance before a leak began, and its range at time `t` [s] if only the oil's warmth had changed.
+    """Estimate the conductance without the leak at time `t` [s]: that before its onset, with limits for other oil.
 
     Warming of the oil raises a conductance by the factor `warmest` at most, which takes the time `shift` [h] (table
     `oil` of `priors.toml`); cooling lowers it as much. A negative conductance is an error of the estimate: the limits

@@ -135,7 +135,7 @@ def _fit_to_blocks(model: Coefficients, grams: Any, column_order: Any, rows: Any
 def _estimate_leak(
     model: Coefficients, gram: Any, column_order: Any, n_equations: float, updates_model: bool
 ) -> tuple[float, float, float, float]:
-    """Estimate the leak's coefficient in one block, whose columns have the products `gram`, by `estimate_leak`."""
+    """Estimate the leak's coefficient in one block, of the Gram matrix `gram`; results as of `estimate_leak`."""
     load_block(model, gram, column_order)
     return estimate_leak(model, n_equations, updates_model)  # type: ignore[no-any-return]
 

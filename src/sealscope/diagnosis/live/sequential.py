@@ -149,7 +149,7 @@ class StepDetector:
         forget_steps(self._memory)
 
     def _number(self, name: str) -> float:
-        """Return a number of the record."""
+        """Return the number that the kernel's record stores as `name`."""
         return float(self._memory[name][0])
 
     def is_representable(self, g: float, deviation: float) -> bool:

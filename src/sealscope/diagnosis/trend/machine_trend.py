@@ -356,7 +356,7 @@ def _add_episodes(trend: Trend) -> Trend:
 
 
 def _add_values(trend: Trend, levels: Levels) -> tuple[tuple[TrendPoint, ...], tuple[Finding, ...]]:
-    """Make a trend's points with values and 95 % intervals from `levels`, and its findings with outliers."""
+    """Add the values and 95 % intervals of `levels` to the points of a trend, and a finding if there are outliers."""
     points, findings = [*trend.points], [*trend.findings]
     _, excess = outlier_excess(levels)  # a level that the next one confirms is a change of the machine and no outlier
     outliers = np.flatnonzero(excess)

@@ -134,7 +134,7 @@ class Rise(NamedTuple):
 
     @property
     def normal_deviation(self) -> float:
-        """Standard deviation of a normal distribution with a 95 % interval of the same width as the true rise's."""
+        """Standard error of the rise: that of a normal distribution whose 95 % interval has the width of `interval`."""
         return Interval(self.value, *self.interval()).deviation
 
 

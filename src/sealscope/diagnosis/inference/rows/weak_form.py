@@ -78,7 +78,7 @@ def peak_weight(rate: float) -> float:
 
 @law
 def row_weight(interval: int, n_stride: int, peak: float) -> float:
-    """Compute the test function phi [1/s] in the middle of a sampling interval, counted from the function's begin."""
+    """Compute the value of the test function phi [1/s] in the middle of its sampling interval number `interval`."""
     s = (interval + 0.5) * 2.0 / (SPAN * n_stride) - 1.0  # -1 to 1 over the support
     return peak * (1.0 - s * s) ** 4
 

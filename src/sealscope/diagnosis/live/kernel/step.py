@@ -302,7 +302,7 @@ def _add_innovation(d: Any) -> None:
 
 @law
 def _add_first(d: Any, variance: float) -> None:
-    """Move the innovation of the newest stored block, whose estimate has this `variance`, to `firsts`."""
+    """Set the newest block aside in `firsts`: a step may begin within it; `variance`: that of its estimate."""
     b, recent = int(d.n_stored) - 1, int(d.n_stored - d.n_old) - 1
     d.variances[recent] = variance
     for q in range(_N_WALKS):
@@ -407,7 +407,7 @@ def weigh_onset(d: Any, j: int) -> None:
 
 @law
 def _add_posterior(d: Any, j: int, log_density: float, size: float, square: float) -> None:
-    """Add onset j, of this posterior `log_density` and mean and mean `square` of the size, to the sums over onsets."""
+    """Add onset j to the sums for means over onsets; `size`, `square`: mean of the step's size, and of its square."""
     d.posteriors[j] = log_density + math.log(_spacing(d, j))
     if d.posteriors[j] > d.reference:
         shrink = math.exp(d.reference - d.posteriors[j]) if d.reference > LOG_ZERO else 0.0
@@ -515,13 +515,13 @@ def forget_steps(memory: Any) -> None:
 
 @kernel
 def take_block(memory: Any, elapsed: float, begin: float, end: float, g: float, deviation: float) -> None:
-    """Add the estimate of a block."""
+    """Add the estimate of a block to the record `memory` (1,) of a detector (`take_estimate`)."""
     take_estimate(memory[0], elapsed, begin, end, g, deviation)
 
 
 @large_law
 def weigh_onsets(d: Any) -> None:
-    """Weigh all onsets."""
+    """Compute the likelihood ratio of a step at each stored onset, and their sum, the evidence (`weigh_onset`)."""
     start_evidence(d)
     for j in range(int(d.n_onsets)):
         weigh_onset(d, j)

@@ -513,10 +513,10 @@ class HeldChambers:
 
     @cached_property
     def _laws(self) -> list[tuple[PistonLeak, float, Array]]:
-        """Leak past the piston under each law, the law's log prior, and the log posteriors (o,) of all `onsets`.
+        """Leaks past the piston, one for each law; with each its log prior and its log posteriors (o,) over `onsets`.
 
-        A law is an exponent (`LAWS`) and a growth (`GROWTHS`), with its own most probable onset. Sensor
-        offset and supplies are those of `piston_fits`.
+        A law states the exponent of the pressure (`LAWS`) and the growth of the leak (`GROWTHS`). The leak begins at
+        the most probable onset under its law; sensor offset and supplies are those of `piston_fits`.
         """
         laws = []
         for leak, law_prior in zip(self.piston_fits, LAWS.values(), strict=True):
