@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis import inspection
 from sealscope.diagnosis.inference.changes import healthy_levels
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.learnt import learn_once
@@ -137,4 +138,44 @@ def test_a_verdict_beside_recordings_that_were_learnt_before_is_the_same(
     monkeypatch.setattr(VolumeBalance, "_summarise", fail)
     monkeypatch.setattr(healthy_levels, "_estimate_levels", fail)
     monkeypatch.setattr("sealscope.diagnosis.detectors.observation._compute_surprisals", fail)
+    inspect, inspected = inspection._inspect, list[ss.Recording]()
+    monkeypatch.setattr(
+        inspection, "_inspect", lambda *arguments: inspected.append(arguments[0]) or inspect(*arguments)
+    )
     assert ss.diagnose(replace(judged), baseline=[replace(entry) for entry in healthy]).as_dict() == first
+    assert len(inspected) == 1  # the judged one
+
+
+@pytest.mark.parametrize("fault", ["none", "spikes and gaps", "late samples"])
+def test_the_inspection_of_a_healthy_recording_is_restored_with_its_corrections(
+    fault: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recording = ss.simulate(command="3 sin(4t)", duration="20 s", seed=1)
+    t, x, p_A = recording.t.copy(), recording["x"].copy(), recording["p_A"].copy()
+    if fault == "spikes and gaps":
+        x[[1000, 3000]] += 1.0
+        p_A[5000:5003] = np.nan
+    if fault == "late samples":
+        t[::3] += 0.0009
+    recording = replace(recording, t=t, channels={**recording.channels, "x": x, "p_A": p_A})
+    expected = inspection.inspect_recording(replace(recording))
+    assert_inspections_equal(inspection.inspect_healthy(replace(recording)), expected)
+    assert (expected.part.t == t).all() == (fault != "late samples")
+    if fault != "late samples":  # samples that move in time are corrected anew
+        monkeypatch.setattr(inspection, "_inspect", None)
+    assert_inspections_equal(inspection.inspect_healthy(replace(recording)), expected)
+    assert (expected.part["x"] == x).all() == (fault == "none")
+
+
+def assert_inspections_equal(found: inspection.Inspection, expected: inspection.Inspection) -> None:
+    """Check that two inspections have the same samples, bit by bit, findings and numbers."""
+    for name in ("t", *expected.part.channels):
+        parts = [entry.part.t if name == "t" else entry.part[name] for entry in (found, expected)]
+        assert parts[0].tobytes() == parts[1].tobytes()
+    assert list(found.part.channels) == list(expected.part.channels)
+    assert (found.part.history, found.part.bridged is None) == (expected.part.history, expected.part.bridged is None)
+    assert np.array_equal(found.part.bridged, expected.part.bridged)
+    assert found.findings == expected.findings
+    assert [finding.places for finding in found.findings] == [finding.places for finding in expected.findings]
+    for name in ("distrust", "share", "judged_from", "judged_until", "digest"):
+        assert getattr(found, name) == getattr(expected, name)

@@ -10,9 +10,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from hashlib import sha256
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from sealscope.diagnosis.healthy import Healthy, SummarisedRecording
+from sealscope.diagnosis.learnt import learn_once
 from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHANNEL_UNITS, SLOW, chambers_of
 from sealscope.recordings.corrections.samples import correct_samples
@@ -24,6 +27,9 @@ from sealscope.recordings.priors import RECORDINGS
 from sealscope.recordings.quality import MISSING_CHANNEL, SHORTEST, Finding, Severity, inspect
 from sealscope.recordings.recording import Recording, compute_once
 from sealscope.units import same_dimension
+
+#: Most corrected samples of a healthy recording that are kept on disk.
+_MAX_CORRECTED = 10_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +79,65 @@ def inspect_recording(recording: Recording, channels: Iterable[str] | None = Non
     """Correct a recording and look for defects of its `channels`, by default of all; the result is cached with it."""
     names = tuple(name for name in recording.channels if channels is None or name in channels)
     return compute_once(recording, ("inspection", names), lambda samples: _inspect(samples, names))
+
+
+def inspect_healthy(recording: Recording) -> Inspection:
+    """Inspect all channels of a healthy recording; the result is kept on disk by its content (`learn_once`).
+
+    An inspection that moves samples in time, or corrects more than `_MAX_CORRECTED` of them, is computed anew.
+    """
+
+    def restore_or_inspect(samples: Recording) -> Inspection:
+        """Restore the inspection from its description on disk, or compute it and keep the description."""
+        computed = list[Inspection]()
+
+        def inspect_and_describe(samples: Recording) -> dict[str, Any] | None:
+            """Inspect the recording and describe the result."""
+            computed.append(_inspect(samples, tuple(samples.channels)))
+            return _describe_inspection(computed[0], samples)
+
+        kept = learn_once(samples, ("kept inspection",), inspect_and_describe)
+        if computed:
+            return computed[0]
+        return _inspect(samples, tuple(samples.channels)) if kept is None else _restore_inspection(kept, samples)
+
+    return compute_once(recording, ("inspection", tuple(recording.channels)), restore_or_inspect)
+
+
+def _describe_inspection(inspection: Inspection, recording: Recording) -> dict[str, Any] | None:
+    """Describe an inspection by plain values, with the samples that it corrected; None if these are too many."""
+    part = inspection.part
+    same = (part.rate, part.units, part.provenance) == (recording.rate, recording.units, recording.provenance)
+    if not same or not np.array_equal(part.t, recording.t):
+        return None
+    bridged = None if part.bridged is None else np.flatnonzero(part.bridged)
+    corrected, count = dict[str, Any](), 0 if bridged is None else bridged.size
+    for name, values in part.channels.items():
+        # bit by bit, as missing values are not equal to themselves
+        rows = np.flatnonzero(values.view(np.int64) != recording[name].view(np.int64))
+        corrected[name], count = (rows, values[rows]), count + rows.size
+    if count > _MAX_CORRECTED:
+        return None
+    return {
+        "corrected": corrected,
+        "bridged": bridged,
+        "history": part.history,
+        "findings": [tuple(vars(finding).values()) for finding in inspection.findings],
+        "numbers": (inspection.distrust, inspection.share, inspection.judged_from, inspection.judged_until),
+    }
+
+
+def _restore_inspection(kept: Mapping[str, Any], recording: Recording) -> Inspection:
+    """Restore the inspection of a recording from its description (`_describe_inspection`)."""
+    channels = dict[str, Any]()
+    for name, (rows, values) in kept["corrected"].items():
+        channels[name] = recording[name]
+        if rows.size:
+            channels[name] = recording[name].copy()
+            channels[name][rows] = values
+    bridged = None if kept["bridged"] is None else np.isin(np.arange(len(recording)), kept["bridged"])
+    part = replace(recording, channels=channels, history=kept["history"], bridged=bridged)
+    return Inspection(part, tuple(Finding(*values) for values in kept["findings"]), *kept["numbers"])
 
 
 def _inspect(recording: Recording, names: Sequence[str]) -> Inspection:
@@ -135,7 +200,7 @@ def select_comparable(judged: Inspection, baseline: Sequence[Healthy]) -> Baseli
     baseline has are left out, unless they change slowly, such as the oil temperature: estimates from different channels
     would not be comparable.
     """
-    healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_recording(entry) for entry in baseline]
+    healthy = [entry if isinstance(entry, SummarisedRecording) else inspect_healthy(entry) for entry in baseline]
     index_of_digest: dict[str, int] = {}  # index of each comparable recording, by its digest
     left_out: dict[tuple[Severity, str], list[int]] = {}  # indices of the other recordings, by severity and reason
     for k in sorted(range(len(healthy)), key=lambda k: -len(healthy[k].units)):  # most channels first
