@@ -508,8 +508,7 @@ def _transform_at(bins: NDArray[np.intp], values: Array, trend: tuple[float, flo
     n, (mean, slope) = values.size, trend
     n_parts = next(number for number in count(1) if n_fft % number == 0 and n_fft // number <= _LONGEST_TRANSFORM)
     length = n_fft // n_parts
-    rows = np.arange(0, n, n_parts)
-    turn = np.exp(2j * np.pi / (n - 1) * rows)  # of the window, which turns once over the n values
+    rows, turn = np.arange(0, n, n_parts), _turn_window(n, n_parts)
     step, phase = np.exp(-2j * np.pi / n_fft * bins), np.ones(bins.size, dtype=complex)
     places = bins % length
     is_mirrored = places > length // 2  # a transform of real values states only one half
@@ -524,6 +523,12 @@ def _transform_at(bins: NDArray[np.intp], values: Array, trend: tuple[float, flo
         total += phase * np.where(is_mirrored, transform.conj(), transform)
         phase *= step
     return total
+
+
+@lru_cache(maxsize=1)
+def _turn_window(n: int, step: int) -> NDArray[Any]:
+    """Compute exp(2 pi i k / (n - 1)), whose real part makes a Hann window, for k = 0, `step`, ... below n."""
+    return np.asarray(np.exp(2j * np.pi / (n - 1) * np.arange(0, n, step)))
 
 
 def _fast_power(values: Array, trend: tuple[float, float], rate: float, n_fft: int) -> float:

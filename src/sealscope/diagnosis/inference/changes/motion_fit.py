@@ -45,6 +45,8 @@ MIN_RESIDUAL = 1.0
 GROUPS = 20
 #: Eigenvalue of a normalised normal matrix, over the largest one, below which a combination of coefficients is free.
 FREE = 1e-10
+#: Condition of normal matrices below which their inverses serve, and no combination of coefficients is free.
+MAX_CONDITION = 1e6
 #: Smallest diagonal element of the Cholesky factor of normalised normal equations that are solved directly.
 MIN_PIVOT = 1e-3
 #: Index of the column t/T in the design matrix of a motion, and of sign(v) and v in that without t/T.
@@ -134,11 +136,23 @@ class Equations(NamedTuple):
 def stack_equations(design: Array, values: Array) -> Equations:
     """Make the rows of a regression of `values` (n,) on the columns of `design` (n, m), for `solve_weighted`."""
     rows = np.column_stack([design, values])
-    is_stored = rows != 0.0
-    n_stored = int(is_stored.sum(axis=1).max(initial=1))
-    # a stable sort keeps the order of the columns within the stored elements of a row, which come first
-    columns = np.sort(np.argsort(~is_stored, axis=1, kind="stable")[:, :n_stored], axis=1)
-    return Equations(np.take_along_axis(rows, columns, axis=1), columns, rows.shape[1])
+    counts = np.count_nonzero(rows, axis=1)
+    n_stored = int(counts.max(initial=1))
+    stored, columns = np.empty((len(rows), n_stored)), np.empty((len(rows), n_stored), dtype=np.intp)
+    _store_rows(rows, n_stored - counts, stored, columns)
+    return Equations(stored, columns, rows.shape[1])
+
+
+@kernel
+def _store_rows(rows: Any, n_missing: Any, stored: Any, columns: Any) -> None:
+    """Write the elements of `rows` (n, m) that are not 0, and the first `n_missing` (n,) others, to `stored` (n, k)."""
+    for row in range(len(rows)):
+        k, n_left = 0, n_missing[row]
+        for column in range(rows.shape[1]):
+            if rows[row, column] != 0.0 or n_left > 0:
+                n_left -= 1 if rows[row, column] == 0.0 else 0
+                stored[row, k], columns[row, k] = rows[row, column], column
+                k += 1
 
 
 @kernel
@@ -274,6 +288,10 @@ def jackknife_errors(equations: Equations, weight: Array, columns: Sequence[int]
     total = products.sum(axis=0)
     without_group = np.concatenate([total - products, total[None]])
     matrices, moments = without_group[:, :-1, :-1], without_group[:, :-1, -1]
+    inverses = _invert_regular(matrices)
+    if inverses is not None:
+        values = (inverses @ moments[:, :, None])[:, :, 0] / scale[:-1]
+        return np.asarray(_scatter(values, n_groups)[list(columns)])
     eigenvalues, vectors = np.linalg.eigh(matrices)
     is_free = eigenvalues < FREE * eigenvalues[:, -1:]  # combinations of coefficients that the rows do not determine
     inverse = np.where(is_free, 0.0, 1.0 / np.where(is_free, 1.0, eigenvalues))
@@ -281,8 +299,26 @@ def jackknife_errors(equations: Equations, weight: Array, columns: Sequence[int]
     coefficients = (vectors @ rotated[:, :, None])[:, :, 0] / scale[:-1]
     # a coefficient is undetermined if it takes part, beyond rounding, in a free combination
     is_undetermined = np.einsum("kij,kj->ki", vectors**2, is_free.astype(float)).max(axis=0) > np.sqrt(FREE)
-    errors = np.sqrt((n_groups - 1.0) / n_groups * ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0))
-    return np.asarray(np.where(is_undetermined, np.inf, errors)[list(columns)])
+    return np.asarray(np.where(is_undetermined, np.inf, _scatter(coefficients, n_groups))[list(columns)])
+
+
+def _scatter(coefficients: Array, n_groups: int) -> Array:
+    """Compute the errors (m,) of a jackknife from `coefficients` (P + 1, m) without each of P groups, and of all."""
+    squares = ((coefficients[:-1] - coefficients[-1]) ** 2).sum(axis=0)
+    return np.asarray(np.sqrt((n_groups - 1.0) / n_groups * squares))
+
+
+def _invert_regular(matrices: Array) -> Array | None:
+    """Invert symmetric matrices (k, m, m); return None unless the condition of each is below `MAX_CONDITION`.
+
+    The condition is at most the product of the Frobenius norms of a matrix and its inverse.
+    """
+    try:
+        inverses = np.linalg.inv(matrices)
+    except np.linalg.LinAlgError:
+        return None
+    condition = np.linalg.norm(matrices, axis=(1, 2)) * np.linalg.norm(inverses, axis=(1, 2))
+    return np.asarray(inverses) if (condition < MAX_CONDITION).all() else None
 
 
 def fit_difference(recording: Recording) -> Resistance | None:

@@ -128,8 +128,8 @@ class Workspace(NamedTuple):
     - `integrals` (8, N + 1): volumes of these flows since the beginning of a hold, and the sums of these volumes.
     - `columns` (2, N): readings of one side; `later`, `here` (2, 9): products (`_add_products`).
     - `sums` (o, 8), `squares` (o,): results for each onset; `per_leak` (o, 4), `with_column` (o, 5), `energies` (o,).
-    - `basis` (7, 5), `gram` (5, 5), `masked`, `factor` (4, 4), `scale`, `lowest`, `limits`, `remainder` (5,),
-      `without_leak` (4,): parts of a fit; `is_solved` (o,): flags of onsets whose least squares are found;
+    - `basis` (7, 5), `gram` (5, 5), `masked`, `factor`, `inverse` (4, 4), `scale`, `limits`, `remainder`,
+      `without_leak`, `slope_without` (4,): parts of a fit; `unsolved` (o,): onsets whose least squares are not found;
       `cases`, `n_solved` (16,): cases of properties at their limits, in the order in which they are tried, and the
       number of onsets whose least squares each has found.
     """
@@ -148,12 +148,13 @@ class Workspace(NamedTuple):
     gram: Any
     masked: Any
     factor: Any
+    inverse: Any
     scale: Any
-    lowest: Any
     limits: Any
     remainder: Any
     without_leak: Any
-    is_solved: Any
+    slope_without: Any
+    unsolved: Any
     cases: Any
     n_solved: Any
 
@@ -163,9 +164,9 @@ class Workspace(NamedTuple):
         n, k = N_OIL, N_OIL + 1
         shapes: list[tuple[int, ...]] = [(4, n_samples), (8, n_samples + 1), (2, n_samples)]
         shapes += [(2, N_REGRESSORS + 2)] * 2 + [(n_onsets, N_REGRESSORS + 1), (n_onsets,), (n_onsets, n)]
-        shapes += [(n_onsets, k), (n_onsets,), (N_REGRESSORS, k), (k, k), (n, n), (n, n), *[(k,)] * 4, (n,)]
+        shapes += [(n_onsets, k), (n_onsets,), (N_REGRESSORS, k), (k, k), *[(n, n)] * 3, *[(n,)] * 5]
         cases, n_solved = np.arange(len(_FREE)), np.zeros(len(_FREE), dtype=np.intp)
-        return cls._make([*map(np.empty, shapes), np.empty(n_onsets, dtype=bool), cases, n_solved])
+        return cls._make([*map(np.empty, shapes), np.empty(n_onsets, dtype=np.intp), cases, n_solved])
 
 
 @large_law
@@ -240,13 +241,17 @@ def _add_products(
         for j in range(n_flows):
             flow = 2 * (2 * j + side)
             _fill_column(samples, hold, integrals[flow], integrals[flow + 1], onset, side == 0, columns[j])
-        for k in range(n_readings):
-            for j in range(n_flows):
-                value = columns[j, k]
-                for i in range(N_REGRESSORS):
-                    products[j, i] += value * regressors[row + k, i]
-                for i in range(n_flows):
-                    products[j, N_REGRESSORS + i] += value * columns[i, k]
+        for j in range(n_flows):
+            for i in range(N_REGRESSORS):
+                product = 0.0
+                for k in range(n_readings):
+                    product += columns[j, k] * regressors[row + k, i]
+                products[j, i] += product
+            for i in range(n_flows):
+                product = 0.0
+                for k in range(n_readings):
+                    product += columns[j, k] * columns[i, k]
+                products[j, N_REGRESSORS + i] += product
 
 
 @large_law
@@ -361,65 +366,68 @@ def _solve(factor: Any, values: Any) -> None:
 def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> None:
     """Write the residual sum of squares of the fit of a leak since each of o onsets to `work.squares` (o,).
 
-    `sums` (o, 8): products by `_sum_over_onsets`; `variance`: variance of a reading, which weights the priors. The
-    least squares within the limits of the properties are the smallest of 16 cases: some properties are at their limits,
-    and the others are free and within them. If the squares do not fall either where a property leaves its limit, no
-    other case has less, as the squares are convex. The case that ends the search at the most onsets is the first of the
-    next fit.
+    `sums` (o, 8): products by `_sum_over_onsets`, of which `work.with_column` holds those with the combinations
+    `work.basis` (`_fill_basis`); `variance`: variance of a reading, which weights the priors. The least squares within
+    the limits of the properties are the smallest of 16 cases: some properties are at their limits, and the others are
+    free and within them. If the squares do not fall either where a property leaves its limit, no other case has less,
+    as the squares are convex. The case that ends the search at the most onsets is the first of the next fit.
     """
-    n_onsets = len(sums)
     basis, gram, masked, factor, squares = work.basis, work.gram, work.masked, work.factor, work.squares
-    scale, lowest, limits, remainder = work.scale, work.lowest, work.limits, work.remainder
+    scale, limits, remainder = work.scale, work.limits, work.remainder
     without_leak, per_leak, with_column, energies = work.without_leak, work.per_leak, work.with_column, work.energies
-    is_solved = work.is_solved
-    for a in range(N_OIL + 1):
-        limits[a], scale[a] = 0.0, 1.0
-    _fill_basis(limits, limits, 0, basis)  # `limits`: at first no changes, and no fixed properties
-    _transform(priors.products, basis, gram)
+    inverse, slope_without, unsolved = work.inverse, work.slope_without, work.unsolved
+    _transform(priors.products, basis, gram)  # its last column is the lost volume
     for a in range(N_OIL):
         gram[a, a] += variance * priors.precisions[a]
-        scale[a] = math.sqrt(gram[a, a])  # from here on the properties are measured in units of 1 / scale
-        lowest[a] = scale[a] * priors.lowest[a]
-    for a in range(N_OIL + 1):  # the last column is the lost volume
-        for b in range(N_OIL + 1):
-            gram[a, b] /= scale[a] * scale[b]
-        for o in range(n_onsets):
-            with_column[o, a] = 0.0
-            for i in range(N_REGRESSORS):
-                with_column[o, a] += sums[o, i] * basis[i, a] / scale[a]
-    for o in range(n_onsets):
-        squares[o], is_solved[o] = np.inf, False
-    largest, n_left = 0.0, n_onsets  # the largest energy so far, and the number of onsets with other cases to try
+        scale[a] = math.sqrt(gram[a, a])
+    n_left = len(sums)  # number of onsets with other cases to try, the first of `unsolved`
+    for o in range(n_left):
+        squares[o], unsolved[o] = np.inf, o
+    largest = 0.0  # the largest energy so far
     for k in range(len(_FREE)):
         if n_left == 0:
             break
         case, n_before = work.cases[k], n_left
         total = gram[N_OIL, N_OIL]
         for a in range(N_OIL):
-            limits[a] = 0.0 if _FREE[case, a] else lowest[a]
+            limits[a] = 0.0 if _FREE[case, a] else priors.lowest[a]
         for a in range(N_OIL):
             remainder[a] = gram[a, N_OIL]  # products with the lost volume beyond the limits' contribution
             for b in range(N_OIL):
                 remainder[a] -= limits[b] * gram[b, a]
-                masked[a, b] = gram[a, b] if _FREE[case, a] and _FREE[case, b] else (1.0 if a == b else 0.0)
-            without_leak[a] = remainder[a] if _FREE[case, a] else 0.0
+                masked[a, b] = 1.0 if a == b else 0.0
+                if a != b and _FREE[case, a] and _FREE[case, b]:
+                    masked[a, b] = gram[a, b] / (scale[a] * scale[b])
+                inverse[a, b] = 1.0 if a == b and _FREE[case, a] else 0.0
         _factorise(masked, factor)
-        _solve(factor, without_leak)  # changes of the free properties without a leak
+        for a in range(N_OIL):
+            _solve(factor, inverse[a])  # 0 for properties at their limits
+            for b in range(N_OIL):
+                inverse[a, b] /= scale[a] * scale[b]
+        for a in range(N_OIL):
+            without_leak[a] = 0.0  # changes of the free properties without a leak
+            for b in range(N_OIL):
+                without_leak[a] += inverse[a, b] * remainder[b]
         for a in range(N_OIL):
             total -= limits[a] * (gram[a, N_OIL] + remainder[a]) + remainder[a] * without_leak[a]
-        for o in range(n_onsets):
-            if is_solved[o]:
-                continue
-            energies[o] = sums[o, N_REGRESSORS]
+            # half the derivative of the squares by a property at its limit, without a leak
+            slope_without[a] = -remainder[a]
+            for b in range(N_OIL):
+                slope_without[a] += gram[a, b] * without_leak[b]
+        for k_left in range(n_left):
+            o = unsolved[k_left]
+            energy = sums[o, N_REGRESSORS]
             for a in range(N_OIL):
-                per_leak[o, a] = with_column[o, a] if _FREE[case, a] else 0.0
-            _solve(factor, per_leak[o])  # decrease of these changes for a leak with a coefficient of 1
-            for a in range(N_OIL):
-                energies[o] -= with_column[o, a] * per_leak[o, a]
-            largest = max(largest, energies[o])
-        for o in range(n_onsets):
-            if is_solved[o]:
-                continue
+                change = 0.0  # decrease of this change for a leak with a coefficient of 1
+                for b in range(N_OIL):
+                    change += inverse[a, b] * with_column[o, b]
+                per_leak[o, a] = change
+                energy -= with_column[o, a] * change
+            energies[o] = energy
+            largest = max(largest, energy)
+        n_left = 0
+        for k_left in range(n_before):
+            o = unsolved[k_left]
             moment = with_column[o, N_OIL]
             for a in range(N_OIL):
                 moment -= limits[a] * with_column[o, a] + remainder[a] * per_leak[o, a]
@@ -429,18 +437,19 @@ def _residual_squares(priors: Any, sums: Any, variance: float, work: Any) -> Non
             is_within, is_least = True, True
             for a in range(N_OIL):
                 if _FREE[case, a]:
-                    is_within = is_within and without_leak[a] - leak * per_leak[o, a] >= (1.0 + ROUNDING) * lowest[a]
+                    is_within = (
+                        is_within and without_leak[a] - leak * per_leak[o, a] >= (1.0 + ROUNDING) * priors.lowest[a]
+                    )
                 else:  # half the derivative of the squares by this property, at its limit
-                    slope = leak * with_column[o, a] - remainder[a]
+                    slope = with_column[o, a]
                     for b in range(N_OIL):
-                        if _FREE[case, b]:
-                            slope += gram[a, b] * (without_leak[b] - leak * per_leak[o, b])
-                    is_least = is_least and slope >= 0.0
+                        slope -= gram[a, b] * per_leak[o, b]
+                    is_least = is_least and slope_without[a] + leak * slope >= 0.0
             if is_within:
                 squares[o] = min(squares[o], max(total - leak * moment, 0.0))
-            if is_within and is_least:
-                is_solved[o] = True
-                n_left -= 1
+            if not (is_within and is_least):
+                unsolved[n_left] = o
+                n_left += 1
         n_solved = n_before - n_left
         rank = k  # among the cases tried so far, by the number of onsets
         while rank > 0 and work.n_solved[rank - 1] < n_solved:
@@ -455,6 +464,15 @@ def _score(priors: Any, sums: Any, work: Any, log_likelihoods: Any) -> None:
 
     The variance of the readings weights the priors: first that without a leak, then that of the most probable onset.
     """
+    for a in range(N_OIL):
+        work.limits[a] = 0.0  # no changes, and no fixed properties
+    _fill_basis(work.limits, work.limits, 0, work.basis)
+    for o in range(len(sums)):
+        for a in range(N_OIL + 1):
+            value = 0.0
+            for i in range(N_REGRESSORS):
+                value += sums[o, i] * work.basis[i, a]
+            work.with_column[o, a] = value
     variance = priors.variance
     for _ in range(2):
         _residual_squares(priors, sums, variance, work)
