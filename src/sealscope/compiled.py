@@ -276,18 +276,13 @@ def make_record(layout: np.dtype[Any], source: object = None, **values: Any) -> 
 
 def record_view(layout: Any) -> Callable[[Any], Any]:
     """Build a compiled function that views the doubles at a pointer as a record of the dtype `layout`."""
-    record_pointer = numba.types.CPointer(numba.from_dtype(layout))
+    record_type = numba.from_dtype(layout)
 
     @intrinsic  # type: ignore[misc]
-    def cast_pointer(context: Any, pointer: Any) -> Any:
-        """Cast a pointer to doubles to a pointer to the record, in compiled code only; numba passes `context`."""
-        return record_pointer(pointer), lambda target, builder, signature, values: builder.bitcast(
-            values[0], target.get_value_type(record_pointer)
+    def record(context: Any, pointer: Any) -> Any:
+        """View the doubles at a pointer as the record, whose value is its address; numba passes `context`."""
+        return record_type(pointer), lambda target, builder, signature, values: builder.bitcast(
+            values[0], target.get_value_type(record_type)
         )
-
-    @law
-    def record(pointer: Any) -> Any:
-        """View the doubles at a pointer as the record."""
-        return numba.carray(cast_pointer(pointer), 1)[0]
 
     return record  # type: ignore[no-any-return]

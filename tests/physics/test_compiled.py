@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import shutil
@@ -269,6 +270,23 @@ def test_a_law_is_the_same_from_python_as_within_compiled_code():
 
     assert within(3.0) == doubled(3.0) + 1.0 == doubled(x=3.0) + 1.0 == 7.0
     assert doubled(np.float32(0.25)) == 0.5  # of another type than within
+
+
+def test_a_law_returns_no_array_to_which_it_would_count_no_reference():
+    @compiled.law
+    def same(values):
+        return values
+
+    with pytest.raises(TypeError, match="numbers"):
+        numba.njit(lambda values: same(values)[0])(np.zeros(2))
+
+
+def test_garbage_is_collected_again_after_a_compilation():
+    @compiled.kernel
+    def one():
+        return 1
+
+    assert gc.isenabled() and one() == 1 and gc.isenabled()
 
 
 def test_a_law_that_a_rig_leaves_out_is_not_compiled():

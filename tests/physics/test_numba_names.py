@@ -33,8 +33,10 @@ ATTRIBUTES = {
         *("load_overload", "_load_overload", "_guard_against_spurious_io_errors"),
         *("save_overload", "flush", "cache_path"),
     ),
-    "numba.core.codegen:JITCodeLibrary": ("_finalize_final_module", "get_pointer_to_function"),
-    "numba.core.compiler:CompilerBase": ("define_pipelines",),
+    "numba.core.codegen:JITCodeLibrary": (
+        *("_finalize_final_module", "_optimize_functions", "get_pointer_to_function"),
+    ),
+    "numba.core.compiler:CompilerBase": ("compile_extra", "define_pipelines"),
     "numba.core.compiler_machinery:PassManager": ("add_pass", "finalize"),
     "numba.core.registry:CPUDispatcher": ("add_overload", "compile"),
     "numba.core.runtime:rtsys": ("initialize",),

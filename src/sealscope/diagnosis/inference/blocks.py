@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sealscope.compiled import kernel, large_law, law
+from sealscope.compiled import kernel, law
 from sealscope.diagnosis.estimate.change import History, Information
 from sealscope.diagnosis.estimate.linear import MAX_PRIOR, RIDGE, Gaussian, solve, solve_in_place
 from sealscope.diagnosis.inference.equations.terms import BIAS, HOLDING, LAG, LEAK, MOVING_BIAS, TURNING, Equation
@@ -520,7 +520,8 @@ def _build_normal_equations(
     `test`, `left`: indices of the nuisance columns, of the tested one and of the left side.
     """
     sums, size = _Sums.allocate(len(gram), (len(nuisance) + 1) * polynomials.shape[1]), polynomials.shape[1]
-    _sum_products(gram, polynomials, np.array(nuisance, np.int64), (test, left, -1), 0.0, np.zeros(len(gram)), 0, sums)
+    blocks, factors = np.ascontiguousarray(gram), np.ascontiguousarray(polynomials)  # as in `_fit_equation_once`
+    _sum_products(blocks, factors, np.array(nuisance, np.int64), (test, left, -1), 0.0, np.zeros(len(gram)), 0, sums)
     normal = sums.normal_equations(gram, left)  # last are the columns of the offset, which are zero
     nuisance_sums = Gaussian(
         normal.nuisance.precision[:-size, :-size], normal.nuisance.moment[:-size], normal.nuisance.square
@@ -548,7 +549,7 @@ class _Sums(NamedTuple):
         return _NormalEquations(nuisance, self.coupling, self.energy, self.tested_moment)
 
 
-@large_law
+@kernel
 def _sum_products(
     gram: Any,
     polynomials: Any,
@@ -766,7 +767,15 @@ def _fit_equation_once(blocks: Blocks, equation: int, roles: ColumnRoles, test: 
     sums, fitted = _Sums.allocate(len(gram), deviations.size), np.empty((3, deviations.size))
     columns, places = (test, roles.left, -1 if roles.bias is None else roles.bias), np.array(nuisance, np.int64)
     offset, variance = _fit_regression(
-        gram, polynomials, places, columns, deviations.ravel(), offset_deviation, n_rows, sums, fitted
+        np.ascontiguousarray(gram),  # numba compiles a function once for each layout of its arrays
+        np.ascontiguousarray(polynomials),
+        places,
+        columns,
+        deviations.ravel(),
+        offset_deviation,
+        n_rows,
+        sums,
+        fitted,
     )
     normal = sums.normal_equations(gram, roles.left)
     if not 0.0 < normal.nuisance.square < np.inf:  # no row, or an overflow: nothing is known
