@@ -6,12 +6,15 @@ import numpy as np
 import pytest
 
 import sealscope as ss
+from sealscope.diagnosis.commissioned.machine import summarise_healthy
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import LiveBalance, NotJudged
 from sealscope.diagnosis.live.sequential import StepDetector
+from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.compiler import find_compiler
+from sealscope.emit.export import controller_inputs, controller_rig
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.single_precision import iter_blocks
 from sealscope.emit.st_export import render_st
@@ -24,6 +27,7 @@ from ..diagnosis.balance_machine import machine, step
 from .st_evaluator import Program
 
 RIG = ss.load_rig("thesis")
+ASYMMETRIC = ss.load_rig("single-rod-eha").with_overrides({"pump.circuit": "asymmetric"})
 WORDS = {"prefix": "leak", "title": "a machine", "origin": "a test", "alarm_rate": 1000.0}
 
 
@@ -92,11 +96,13 @@ def test_structured_text_computes_what_c_computes():
         pytest.param("thesis", "omega", 22.0, marks=pytest.mark.slow),
         pytest.param("thesis", "q_pump", 25.0, marks=pytest.mark.slow),
         pytest.param("single-rod-eha", "theta", 25.0, marks=pytest.mark.slow),
+        pytest.param("asymmetric pump", "omega", 20.0, marks=pytest.mark.slow),
     ],
 )
 def test_a_watch_and_a_controller_state_the_same_bits(rig, flow, rate):
     """Conductance, deviation and score of each block, with lost readings and an encoder the other way round."""
-    rig, recording = ss.load_rig(rig), machine(3, G=step(0.0, 4e-13, at=75.0), duration=100.0, rate=rate)
+    rig = ASYMMETRIC if rig == "asymmetric pump" else ss.load_rig(rig)
+    recording = machine(3, G=step(0.0, 4e-13, at=75.0), duration=100.0, rate=rate)
     speed = np.gradient(recording["theta"], 1.0 / rate)
     flows = {"theta": -recording["theta"], "omega": speed, "q_pump": speed * rig.pump.q_b / (2.0 * np.pi)}
     names = ("p_A", "p_B", flow, "x")
@@ -155,8 +161,11 @@ def test_recordings_that_a_controller_would_misread_are_refused(tmp_path):
     damped, two_way = lowered_loads.flight(2), machine(1, duration=120.0, rate=100.0)
     speed = np.abs(np.gradient(two_way["theta"], 0.01))
     unsigned = Recording(two_way.t, {**two_way.channels, "omega": speed}, {**two_way.units, "omega": "rad/s"}, 100.0)
-    for machine_rig, recording, reason in ((rig, damped, "its load is lowered"), (RIG, unsigned, "omega has no sign")):
-        with pytest.raises(InputError, match=f"blocks that differ in number 1: .*{reason}"):
+    short = unsigned.between(0.0, 66.0)  # too short for the monitor, which begins anew when it sees that signs lack
+    no_sign = "a flow with a sign, got omega in number 1"
+    cases = (rig, damped, "blocks that differ in number 1: its load is lowered"), (RIG, unsigned, no_sign)
+    for machine_rig, recording, reason in (*cases, (RIG, short, no_sign)):
+        with pytest.raises(InputError, match=reason):
             ss.export_controller(
                 tmp_path, rig=machine_rig, rate=recording.rate, flow="omega", learn=[recording],
                 false_alarms_per_1000_h=1e-3,
@@ -240,12 +249,31 @@ def test_what_was_learned_outlasts_a_power_cut_and_damage_is_refused():
 
 
 def test_machines_without_such_a_balance_are_refused():
-    with pytest.raises(InputError, match="valve-controlled"):
-        StreamSettings.from_rig(ss.load_rig("servo-valve"), 100.0)
-    with pytest.raises(InputError, match="rate"):
-        StreamSettings.from_rig(RIG, 5.0)
-    with pytest.raises(InputError, match="balance"):
-        StreamSettings.from_rig(RIG, 100.0, "x")
+    cases = (
+        (ss.load_rig("servo-valve"), 100.0, "theta", "q_pump.*valve-controlled"),
+        (RIG.with_overrides({"pump.circuit": "open"}), 100.0, "q_pump", "open circuit.*rests"),
+        (RIG, 5.0, "theta", "rate"),
+        (RIG, 100.0, "x", "theta, omega, q_pump, got 'x'"),
+        (RIG.as_assumed("no rig was stated"), 100.0, "omega", "displacement.*stated"),
+    )
+    for rig, rate, flow, reason in cases:
+        with pytest.raises(InputError, match=reason):
+            StreamSettings.from_rig(rig, rate, flow)
+    assert StreamSettings.from_rig(RIG.as_assumed("no rig was stated"), 100.0, "q_pump").displacement == 1.0
+
+
+def test_a_controller_takes_inputs_and_displacement_from_the_machines_file(tmp_path):
+    """The displacement is that which the healthy recordings show by the piston's stated areas."""
+    recording = machine(1, duration=60.0, rate=50.0)
+    rig = unstated_rig().with_areas(RIG.cylinder.A_A, RIG.cylinder.A_B, source="nameplate")
+    rig = rig.with_overrides({"pump.q_b": 2.0 * RIG.pump.q_b}, source=rig.entry("pump.q_b").source)
+    known = ss.CommissionedMachine("m", (summarise_healthy(recording, rig, "a"),), rig)
+    assert controller_rig(known).pump.q_b == pytest.approx(RIG.pump.q_b, rel=0.02)
+    assert controller_rig(known).states("pump.q_b") and not rig.states("pump.q_b")
+    assert controller_inputs(recording) == controller_inputs(known.healthy[0]) == (50.0, "theta")
+    in_counts = Recording(recording.t, recording.channels, {**recording.units, "p_B": "count"}, 50.0)
+    with pytest.raises(InputError, match="raw counts of p_B"):
+        ss.export_controller(tmp_path, rate=50.0, learn=[in_counts])
 
 
 def test_a_long_loss_of_readings_is_no_standstill():

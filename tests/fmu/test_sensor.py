@@ -150,7 +150,9 @@ def test_the_code_has_the_terms_of_the_balance_and_a_bounded_memory(rig, rate):
         ({"sensor": "wavelet"}, "sensor, 'wavelet'"),
         ({"rate": 10.0}, "rate, 16 Hz, 10"),
         ({"fmi": 1}, "fmi, 2, 3"),
-        ({"rig": "servo-valve"}, "unit, servo-valve"),
+        ({"rig": "servo-valve"}, "q_pump, valve-controlled"),
+        ({"rig": RIG.as_assumed("no rig was stated")}, "displacement, theta, stated"),
+        ({"flow": "u"}, "theta, omega, q_pump, 'u'"),
     ],
 )
 def test_wrong_arguments_are_refused_and_nothing_is_written(given, words, tmp_path):

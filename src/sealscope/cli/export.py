@@ -11,8 +11,8 @@ from sealscope.cli.options import say
 from sealscope.errors import InputError
 
 _LANGUAGE = "c: C99; st: Structured Text (IEC 61131-3) as .st, PLCopen XML and .scl."
-_RATE = "Samples a second of the controller, '100 Hz'; by default those of the recordings to learn from."
-_FLOW = "Channel of the pump's flow: theta, omega or q_pump; by default that of the recordings to learn from."
+_RATE = "Samples a second of the controller, '100 Hz'; by default those of the healthy recordings."
+_FLOW = "Channel of the pump's flow: theta, omega or q_pump; by default that of the healthy recordings."
 _LEARN = "Healthy recording from which the program begins to know the machine; repeat."
 
 
@@ -33,7 +33,7 @@ def export(
     It estimates leakage and leak in m^3/s with 95 % intervals from chamber pressures, the pump's flow and the position.
     """
     from sealscope.diagnosis.commissioned.machine_file import read_machine
-    from sealscope.emit.export import export_controller
+    from sealscope.emit.export import controller_inputs, controller_rig, export_controller
     from sealscope.parameters import load_rig
     from sealscope.recordings import read
     from sealscope.units import parse_quantity
@@ -41,17 +41,18 @@ def export(
     if machine is not None and rig is not None:
         raise InputError("--rig cannot be combined with --machine, whose file states the sizes")
     known = None if machine is None else read_machine(machine)
-    sizes = load_rig(rig or "thesis") if known is None else known.rig
-    if sizes is None:
-        raise InputError(f"a controller needs the pump's displacement, got none in {machine}: state it in [pump]")
+    sizes = load_rig(rig or "thesis") if known is None else controller_rig(known)
     paths = learn or []
     recordings = [read(path, map="auto") if known is None else known.read(path) for path in paths]
+    learned_rate, learned_flow = None, None
+    if known is not None and known.healthy and not paths:
+        learned_rate, learned_flow = controller_inputs(known.healthy[-1])
     written = export_controller(
         output,
         language=language,  # type: ignore[arg-type]
         rig=sizes,
-        rate=None if rate is None else parse_quantity(rate, "Hz", name="rate"),
-        flow=flow,
+        rate=learned_rate if rate is None else parse_quantity(rate, "Hz", name="rate"),
+        flow=flow or learned_flow,
         false_alarms_per_1000_h=alarms,
         learn=recordings,
         precision=precision,  # type: ignore[arg-type]

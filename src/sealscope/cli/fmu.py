@@ -16,8 +16,8 @@ _PLATFORM = (
 )
 _ERROR = "Error that a pressure may have, by which the solver's step is chosen (1 Pa)."
 _SENSOR = (
-    "Write a soft sensor of leakage instead: volume, which reads the chamber pressures, the pump's angle and the "
-    "piston's position."
+    "Write a soft sensor of leakage instead: volume, which reads the chamber pressures, the pump's flow and the "
+    "piston's position. --rig takes a machine's file, too."
 )
 
 
@@ -31,6 +31,7 @@ def fmu(
     step: Annotated[str | None, declared_option("step")] = None,
     sensor: Annotated[str | None, Option(help=_SENSOR)] = None,
     rate: Annotated[str | None, Option(help="Sampling rate of the soft sensor (500 Hz).")] = None,
+    flow: Annotated[str | None, Option(help="Its channel of the pump's flow: theta (default), omega, q_pump.")] = None,
 ) -> None:
     """Write a rig, or a soft sensor of its leakage, as an FMU for co-simulation that runs without Python.
 
@@ -43,8 +44,9 @@ def fmu(
     check_folder(output)
     options: dict[str, Any] = {"rig": load_rig_with(rig, overrides), "fmi": version, "platforms": platforms or None}
     if sensor is None:
-        if rate is not None:
-            raise InputError("--rate is the sampling rate of a soft sensor and needs --sensor")
+        for name, value in (("--rate", rate), ("--flow", flow)):
+            if value is not None:
+                raise InputError(f"{name} is for a soft sensor and needs --sensor")
         max_step = None if step is None else parse_quantity(step, "s", name="step")
         max_error = ERROR if error is None else parse_quantity(error, "Pa", name="error")
         variables = write_fmu(output, **options, error=max_error, step=max_step)
@@ -55,8 +57,9 @@ def fmu(
             if value is not None:
                 raise InputError(f"{name} is for the solver of a rig, and not allowed with --sensor")
         rate_hz = 500.0 if rate is None else parse_quantity(rate, "Hz", name="rate")
-        variables = write_sensor_fmu(output, **options, sensor=sensor, rate=rate_hz)  # type: ignore[arg-type]
-        timing = f"samples at {rate_hz:g} Hz"
+        options |= {"sensor": sensor, "rate": rate_hz, "flow": flow or "theta"}
+        variables = write_sensor_fmu(output, **options)
+        timing = f"samples at {rate_hz:g} Hz, for {Path(rig).name}"
     kinds = ("input", "parameter", "output")
     counts = ", ".join(f"{sum(variable.causality == kind for variable in variables)} {kind}s" for kind in kinds)
     echo(f"{output}: FMI {version} for co-simulation,\n{counts}, {timing}")

@@ -11,9 +11,14 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from sealscope.calls import checked_call
+from sealscope.diagnosis.commissioned.machine import CommissionedMachine
+from sealscope.diagnosis.healthy import Healthy
+from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
+from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
 from sealscope.diagnosis.live.live_balance import BLOCK_SECONDS, LiveBalance, NotJudged
+from sealscope.diagnosis.verdict.machine_sizes import measures_flow, unstated_rig
 from sealscope.emit.c99 import Precision
 from sealscope.emit.c_export import parts_a_sample, render_c, render_vectors
 from sealscope.emit.run_program import CompiledStream
@@ -22,6 +27,7 @@ from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
+from sealscope.recordings.channels import COUNTS
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.atomic import atomic_write
 
@@ -30,8 +36,6 @@ Language = Literal["c", "st"]
 _PREFIX = re.compile(r"[A-Za-z](?:_?[A-Za-z0-9])*")
 #: Longest test vectors [s].
 _VECTOR_SECONDS = 90.0
-#: Channels that give a controller the pump's flow, the best first.
-_FLOWS = ("theta", "omega", "q_pump")
 
 
 class Export(NamedTuple):
@@ -98,9 +102,9 @@ def export_controller(
     Raises
     ------
     InputError
-        The machine's balance needs terms that no stream computes, a recording lacks a channel or has another rate, or
-        the monitor estimates otherwise from it, single precision errs too much, or learning needs a C compiler and
-        there is none.
+        The machine's balance needs what no controller computes, its displacement is not stated, a recording lacks a
+        channel or has another rate, or the monitor estimates otherwise from it, single precision errs too much, or
+        learning needs a C compiler and there is none.
 
     Examples
     --------
@@ -119,11 +123,10 @@ def export_controller(
     if not _PREFIX.fullmatch(prefix) or len(prefix) > 16:
         raise InputError(f"prefix must be a name of at most 16 letters and digits, got {prefix!r}")
     machine = load_rig(rig)
-    if rate is None:
-        rate = float(round(learn[0].rate, 3)) if learn else 100.0
-    if flow is None:
-        flow = (_flow_source(learn[0].channels) if learn else None) or "theta"
-    unit = stream_program(StreamSettings.from_rig(machine, float(rate), flow, false_alarms_per_1000_h))
+    healthy_rate, healthy_flow = controller_inputs(learn[0]) if learn else (100.0, "theta")
+    rate = float(healthy_rate if rate is None else rate)
+    flow = healthy_flow if flow is None else flow
+    unit = stream_program(StreamSettings.from_rig(machine, rate, flow, false_alarms_per_1000_h))
     words: dict[str, Any] = {
         "prefix": prefix,
         "title": machine.title,
@@ -160,7 +163,34 @@ def export_controller(
 
 def _flow_source(channels: Container[str]) -> str | None:
     """Choose the best of the channels that give a controller the pump's flow; None if all are absent."""
-    return next((name for name in _FLOWS if name in channels), None)
+    return next((name for name in PUMP_VOLUMES if name in channels), None)
+
+
+def controller_rig(machine: CommissionedMachine) -> Rig:
+    """Return the rig of a machine; if its displacement is not stated, with the one that healthy recordings show.
+
+    Where the piston's areas are stated, the balance of each recording shows the displacement as a multiple of the
+    assumed one (`scale` of `VolumeBalance.learn`); here the median counts.
+    """
+    rig = machine.rig or unstated_rig()
+    summaries = [own.summaries.get(VolumeBalance.name, {}) for own in machine.healthy if not measures_flow(own.units)]
+    scales = [float(summary["scale"]) for summary in summaries if summary.get("scale", 0.0) > 0.0]
+    if rig.states("pump.q_b") or not scales:
+        return rig
+    return rig.with_overrides({"pump.q_b": rig.pump.q_b * float(np.median(scales))}, source="by the piston's areas")
+
+
+def controller_inputs(recording: Healthy) -> tuple[float, str]:
+    """Return the rate [Hz] and the channel of the pump's flow that a controller has in common with a recording.
+
+    Raises InputError if the recording has none of these channels.
+    """
+    if (flow := _flow_source(recording.units)) is None:
+        got = ", ".join(recording.units)
+        raise InputError(
+            f"a controller must have the pump's angle, speed or flow ({', '.join(PUMP_VOLUMES)}), got {got}"
+        )
+    return float(round(recording.rate, 3)), flow
 
 
 def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
@@ -169,11 +199,11 @@ def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
     lacking = [name for name in settings.channels if name not in recording]
     if lacking:
         source, rule = _flow_source(recording.channels), f"must have {', '.join(lacking)}"
-        if source is None:
-            rule = f"must have the pump's angle, speed or flow ({', '.join(_FLOWS)})"
-        elif lacking == [settings.channels[2]]:
+        if source and lacking == [settings.channels[2]]:
             rule += f"; its flow is {source}: state it as the flow"
         raise InputError(f"a recording to learn from {rule}, got {', '.join(recording.channels)}")
+    if raw := [name for name in settings.channels if recording.units[name] == COUNTS]:
+        raise InputError(f"a recording to learn from must have channels in units, got raw counts of {', '.join(raw)}")
     if abs(recording.rate / settings.rate - 1.0) > 1e-3:
         raise InputError(f"a recording to learn from must have the rate {settings.rate:g} Hz, got {recording.rate:g}")
     return np.stack([recording[name] for name in settings.channels], axis=1)
@@ -197,7 +227,7 @@ def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str,
                     raise InputError(
                         f"a controller must raise no alarm on a healthy recording, got one in number {k + 1}: its "
                         f"leakage rises {stream.state.n_ended * BLOCK_SECONDS - seconds:.0f} s after its beginning "
-                        f"with a score over {limit:.1f}"
+                        f"with a score over {limit:.1f}, and a controller weighs no other cause than a leak"
                     )
             stream.acknowledge()
             blocks += 0 if is_known else int(stream.state.n_estimated)
@@ -232,21 +262,16 @@ def _check_against_watch(stream: CompiledStream, recordings: Sequence[Array], ri
             or number not in watched
             or not np.abs(np.subtract(stated[number], watched[number])).max() <= MOST_ERROR * watched[number][1]
         ]
-        if differing:
-            got = f"{len(differing)} of {len(numbers)} blocks that differ in number {k}"
+        if balance.is_unsigned:  # also where it waits for blocks to learn from
             raise InputError(
-                f"a controller must estimate from a recording what the monitor does, got {got}{_reason(balance)}"
+                f"a controller must read a flow with a sign, got {settings.channels[2]} in number {k}, which is never "
+                "below zero though x moves both ways: the monitor restores its sign, a controller cannot"
             )
-
-
-def _reason(balance: LiveBalance) -> str:
-    """Format the reason why a controller estimates otherwise than a live balance; "" if none is known."""
-    if balance.is_unsigned:
-        name = _flow_source(balance.names)
-        return f": its {name} has no sign, which a controller cannot restore (below zero never, but x moves both ways)"
-    if balance.has_lowered:
-        return ": its load is lowered past the resting pump, which a controller does not tell from a leak"
-    return ""
+        if differing:
+            lowered = "its load is lowered past the resting pump, which a controller does not tell from a leak"
+            reason = f": {lowered}" if balance.has_lowered else ""
+            got = f"{len(differing)} of {len(numbers)} blocks that differ in number {k}{reason}"
+            raise InputError(f"a controller must estimate from a recording what the monitor does, got {got}")
 
 
 def _prove_single(

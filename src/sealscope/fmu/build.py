@@ -225,7 +225,8 @@ def write_fmu(
     """
     path = Path(path)
     chosen_platforms = _choose_platforms(path, fmi, platforms)
-    machine = _load_pump_controlled_rig(rig)
+    machine = load_rig(rig)
+    check_circuit_property("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
     if step is None:
         step, found_error = choose_step(machine, error)
         accuracy = f"steps of at most {step:.3g} s, by which pressures are off by {found_error:.2g} Pa rms"
@@ -255,13 +256,14 @@ def write_sensor_fmu(
     sensor: Sensor = "volume",
     rig: Rig | str | os.PathLike[str] = "thesis",
     rate: float = 500.0,
+    flow: str = "theta",
     fmi: Version = 2,
     platforms: Sequence[str] | None = None,
 ) -> tuple[Variable, ...]:
     """Write a functional mock-up unit (FMU) that estimates the leakage from measurements, a soft sensor.
 
-    From measured pressures, angle and position, it estimates the leakage of pump and piston together in blocks of 3 s.
-    The FMU contains the C99 that controllers run, too (`export_controller`), and needs no Python. Its outputs are
+    From measured pressures, pump's flow and position, it estimates the leakage of pump and piston together in blocks
+    of 3 s. The FMU contains the C99 that controllers run, too (`export_controller`). It needs no Python. Its outputs:
 
     - the mean leakage of the last blocks, at most 20, with a 95 % interval [m^3/s];
     - an alarm at one false alarm in 1000 h, the leak since its onset with a 95 % interval, and without an alarm the
@@ -273,11 +275,13 @@ def write_sensor_fmu(
     path : str or path-like
         File to write (.fmu).
     sensor : {"volume"}, optional
-        Method: the volume balance, which reads chamber pressures, the pump's angle and the piston's position.
+        Method: the volume balance, which reads chamber pressures, the pump's flow and the piston's position.
     rig : Rig, str or path-like, optional
         The assumed machine: a rig, the name of a packaged one, or the path of a TOML file.
     rate : float, optional
         Sampling rate of the inputs [Hz], at least 16; it does not depend on the communication steps.
+    flow : {"theta", "omega", "q_pump"}, optional
+        Channel that gives the pump's flow: its angle, its speed, or a flow meter.
     fmi : {2, 3}, optional
         Version of the Functional Mock-up Interface.
     platforms : sequence of str, optional
@@ -291,7 +295,8 @@ def write_sensor_fmu(
     Raises
     ------
     InputError
-        An argument breaks a rule, the rig is not pump-controlled, or there is no compiler.
+        An argument breaks a rule, no controller computes the rig's balance, the pump's displacement is not stated, or
+        there is no compiler.
 
     Examples
     --------
@@ -307,10 +312,10 @@ def write_sensor_fmu(
     chosen_platforms = _choose_platforms(path, fmi, platforms)
     if sensor != "volume":
         raise InputError(f"sensor must be volume, got {sensor!r}")
-    machine = _load_pump_controlled_rig(rig)
-    program = stream_program(StreamSettings.from_rig(machine, float(rate)))
+    machine = load_rig(rig)
+    program = stream_program(StreamSettings.from_rig(machine, float(rate), flow))
     unit = MockUp(
-        summary=f"soft sensor of leakage (volume balance of angle and position at {rate:g} Hz) for {machine.title}",
+        summary=f"soft sensor of leakage (volume balance of {flow} and x at {rate:g} Hz) for {machine.title}",
         modules=sensor_sources(program, machine.title),
         variable_list=tuple(sensor_variables(machine, program.settings.channels)),
         values=parameter_values(machine),
@@ -322,13 +327,6 @@ def write_sensor_fmu(
     )
     unit.write(path, fmi, chosen_platforms)
     return unit.variable_list
-
-
-def _load_pump_controlled_rig(rig: Rig | str | os.PathLike[str]) -> Rig:
-    """Load a rig; raise InputError if it is not pump-controlled."""
-    machine = load_rig(rig)
-    check_circuit_property("a unit", machine.name, machine.circuit, "pump_feeds_chambers")
-    return machine
 
 
 def _choose_platforms(path: str | os.PathLike[str], fmi: int, platforms: Sequence[str] | None) -> tuple[str, ...]:

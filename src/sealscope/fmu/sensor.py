@@ -14,14 +14,15 @@ from sealscope.recordings.channels import CHANNEL_UNITS, LONG_NAMES
 
 #: Failures of the unit's functions: code and message.
 FAILURES: Mapping[int, str] = {1: "pump.q_b must be > 0 m^3/rev"}
-#: The only parameter of the rig that the balance reads: the pump's displacement [m^3/rev].
+#: The only parameter of the rig that the balance reads, without a meter of its flow: the pump's displacement [m^3/rev].
 DISPLACEMENT = "pump.q_b"
 
 
 def variables(rig: Rig, channels: tuple[str, ...]) -> Iterator[Variable]:
-    """Yield the variables of a soft sensor's FMU: measurements, the pump's displacement and the estimated leakage."""
+    """Yield the variables of a soft sensor's FMU: measurements, displacement but with a flow meter, and leakage."""
     yield from input_variables({name: (CHANNEL_UNITS[name], f"reading: {LONG_NAMES[name]}") for name in channels})
-    yield from filter(None, [rig_variable(rig, DISPLACEMENT, "fixed")])
+    if "q_pump" not in channels:
+        yield from filter(None, [rig_variable(rig, DISPLACEMENT, "fixed")])
     yield from output_variables(SENSOR_RESULTS)
 
 
@@ -37,6 +38,7 @@ def sensor_sources(unit: StreamProgram, title: str) -> dict[str, str]:
         .get_template("sensor.c.j2")
         .render(
             index=VALUES.index(DISPLACEMENT),
+            has_meter="q_pump" in unit.settings.channels,
             full_turn=2.0 * math.pi,
             interval=interval,
             tolerance=1e-6 * interval,

@@ -113,13 +113,9 @@ def _scale_to_side_A(equation: Equation) -> Equation:
     While B carries the load, the pump moves less oil, in the ratio of the areas, so that all terms but the offset of
     the flow sensor take a larger part of the left side.
     """
-
-    def factor(s: Signals) -> Array:
-        """Compute the displacement of side A over that of the side that carries the load, in each interval."""
-        by_A = interval_means(s.carried_by_A)
-        return by_A + (1.0 - by_A) / equation.area_ratio
-
-    terms = tuple(term if term.name == BIAS else _mask_term(term, factor) for term in equation.terms)
+    # displacement of side A over that of the side that carries the load
+    factor = f"out_A + in_A + (out_B + in_B) / {equation.area_ratio!r}"
+    terms = tuple(term if term.name == BIAS else term.scaled_by(factor) for term in equation.terms)
     return equation._replace(terms=terms)
 
 

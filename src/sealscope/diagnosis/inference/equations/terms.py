@@ -72,6 +72,12 @@ class Term(NamedTuple):
         """Return the term with other increments, which only files compute."""
         return self._replace(increments=increments, expression="")
 
+    def scaled_by(self, expression: str) -> Term:
+        """Return the term with increments times an `expression`, which streams compute, too, if they do the term's."""
+        factor = increments_of(expression)
+        scaled = self.with_increments(lambda s: np.asarray(factor(s) * self.increments(s)))
+        return scaled._replace(expression=f"({expression}) * ({self.expression})" if self.expression else "")
+
     @property
     def is_fitted(self) -> bool:
         """True if the coefficient is fitted in every recording, since it is unknown even in a healthy machine."""

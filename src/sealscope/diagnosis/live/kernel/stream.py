@@ -35,6 +35,7 @@ from sealscope.compiled import large_law, law, record_dtype
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
 from sealscope.diagnosis.inference.blocks import ColumnRoles
+from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
 from sealscope.diagnosis.inference.equations.expressions import build_increments, channels_of
 from sealscope.diagnosis.inference.equations.signals import HALF_DIFFERENCE
 from sealscope.diagnosis.inference.rows import flow_sign
@@ -214,18 +215,28 @@ class StreamSettings(NamedTuple):
         """
         if not MIN_STRIDE / STRIDE <= rate < math.inf:
             raise InputError(f"rate of a stream must be >= {MIN_STRIDE / STRIDE:g} Hz, got {rate:g}")
-        channels = ("p_A", "p_B", flow, "x")
-        balances = live_equations(rig, channels)
-        if len(balances) != 1:
-            circuit = rig.circuit.name
-            raise InputError(f"a stream on a controller must have one volume balance, got {len(balances)} ({circuit})")
-        (balance,) = balances
+        circuit, channels = rig.circuit, ("p_A", "p_B", flow, "x")
+        if flow not in PUMP_VOLUMES:
+            raise InputError(f"a controller must have the pump's flow as {', '.join(PUMP_VOLUMES)}, got {flow!r}")
+        if circuit.feeds_one_chamber:
+            raise InputError(
+                f"a controller must have a pump that feeds both chambers, got {circuit}: the piston's leakage is told "
+                "from the pump's by rests under load, which a controller does not find"
+            )
+        if flow != "q_pump" and not circuit.pump_moves_piston:
+            raise InputError(
+                f"a controller must have a pump that moves the piston, or a meter (q_pump), got {circuit}: the "
+                "balances of two chambers, by a valve's flow, are not computed on a controller"
+            )
+        if flow != "q_pump" and not rig.states(*circuit.size_parameters):
+            raise InputError(
+                f"a controller must have the pump's displacement to compute a flow from {flow}, got none that is "
+                "stated: state it to commission (--displacement), or in [pump] of the machine's file"
+            )
+        (balance,) = live_equations(rig, channels)
         unknown = [term.name for term in balance.terms if not term.expression]
-        has_flow = rig.circuit.pump_moves_piston or flow == "q_pump"
-        if not has_flow or rig.circuit.feeds_one_chamber or not balance.left_expression:
-            raise InputError(f"a stream on a controller must have a pump between the chambers, got {rig.circuit}")
         if unknown:
-            raise InputError(f"a stream on a controller must have terms that are expressions, got {', '.join(unknown)}")
+            raise InputError(f"a controller must have terms that are expressions, got {', '.join(unknown)}")
         columns = ColumnRoles(balance)
         fast = columns.fast
         expressions = (*(term.expression for term in balance.terms), balance.left_expression)
