@@ -16,6 +16,12 @@ import pytest
         (("--false-alarm", "0.7"), "false-alarm probability must be"),
         (("--command", "11 sin(4t)"), "the usual duty must give a volume balance"),
         (("--rig", "nowhere"), "nowhere"),
+        (("--hold", "20 kN", "--area", "3117 m^2"), "area must be 1e-05 to 1 m^2, got 3117 m^2"),
+        (("--hold", "20 kN", "--area", "3117 mm^2", "--drift", "3 degC"), "--drift must be 0 to 100 K, got 276.15 K"),
+        (
+            ("--hold", "20 kN", "--area", "3117 mm^2", "--resolution", "0.1"),
+            "--resolution must be 0 to 10 mm, got 100 mm",
+        ),
     ],
 )
 def test_wrong_options_are_refused_in_a_line(call, words: tuple[str, ...], complaint: str) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 import sealscope as ss
 from sealscope.campaigns.smallest import DetectableLeak, PlannedDuty, RecordingPlan, has_shut_off
-from sealscope.diagnosis.hold.plan import plan_hold
+from sealscope.diagnosis.hold.plan import HOLD_MINUTES, plan_hold
 from sealscope.errors import InputError
 from sealscope.parameters import load_rig
 
@@ -31,6 +31,8 @@ def test_a_longer_hold_shows_less_and_drift_more():
     planned = plan_hold(2e4, AREA, 0.65, 1e-4)
     longer = plan_hold(2e4, AREA, 0.65, 1e-4, find=0.3 * planned.leak)
     assert longer.minutes > planned.minutes and longer.leak <= 0.3 * planned.leak
+    unseen = plan_hold(2e4, AREA, 0.65, 1e-4, find=1e-3 * planned.leak)
+    assert unseen.minutes == HOLD_MINUTES[-1] and "no hold" in unseen.text() and "no hold" not in longer.text()
     drifting = [plan_hold(2e4, AREA, 0.65, 1e-4, warming=warming).leak for warming in (0.0, 1.0, 3.0)]
     assert drifting == sorted(drifting) and drifting[-1] > 2.0 * drifting[0]
     assert plan_hold(4e4, AREA, 0.65, 1e-4).pressure == pytest.approx(2.0 * planned.pressure)
@@ -46,7 +48,7 @@ def test_a_plan_names_the_hold():
     found = DetectableLeak(PlannedDuty("3 sin(4t)"), 60.0, 1e-14, 1e-13, 1e5)
     hold = plan_hold(2e4, AREA, 0.65, 1e-4)
     plan = RecordingPlan("bench", None, found, found, (found,), 1e5, 0.01, 0.9, hold)
-    assert "hold the load for 10 min" in plan.text()
+    assert "hold 20 kN for 10 min" in plan.text()
     assert plan.as_dict()["hold"]["minutes"] == 10.0
     assert "hold" not in plan._replace(hold=None).text()
     assert not has_shut_off(load_rig("thesis"))

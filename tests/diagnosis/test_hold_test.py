@@ -275,6 +275,41 @@ def test_a_commissioned_machine_and_its_monitor_take_hold_tests(tmp_path):
         assert factor != 1.0 or diagnosis.verdict != "leak"
 
 
+def write_results(path, recordings):
+    """Write results of hold tests as `sealscope hold --format jsonl` does."""
+    results = [result for recording in recordings for result in ss.hold_test(recording, area=AREAS)]
+    path.write_text("".join(json.dumps(result.as_dict()) + "\n" for result in results))
+    return path
+
+
+def date_holds(factors, months):
+    """Holds on the first of the `months` with 0.3 mm/min of creep times the `factors`."""
+    return [
+        replace(
+            record_hold(0.3 * factor, minutes=1.0, seed=month, p_B=tank, log_T=True),
+            provenance={"start": f"2024-{month:02d}-01T08:00"},
+        )
+        for factor, month in zip(factors, months, strict=True)
+    ]
+
+
+def test_a_machine_is_commissioned_by_results_of_hold_tests(tmp_path):
+    healthy = write_results(tmp_path / "healthy.jsonl", date_holds([1.0, 1.02, 0.98], [1, 2, 3]))
+    machine = ss.commission([healthy], rig=RIG, name="boom")
+    assert len(machine.healthy) == 3 and "3 healthy" in str(machine)
+    ss.write_machine(machine, tmp_path / "boom.toml")
+    machine = ss.read_machine(tmp_path / "boom.toml")
+    (later,) = date_holds([2.0], [4])
+    diagnosis = machine.diagnose(later)
+    assert "times that of 3 healthy holds" in diagnosis.reason
+    assert "baseline_left_out" not in [finding.code for finding in diagnosis.quality]
+    with refusal("healthy recording", "new"):
+        machine.with_holds(healthy)
+    (tmp_path / "bare.jsonl").write_text(json.dumps(ss.hold_test(later)[0].as_dict()) + "\n")
+    with refusal("leak", "pressure", "--area"):
+        ss.commission([tmp_path / "bare.jsonl"])
+
+
 def shuffle(t):
     """Put times into disorder."""
     return np.random.default_rng(1).permutation(t)

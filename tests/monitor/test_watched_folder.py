@@ -33,6 +33,7 @@ from sealscope.monitor.verdicts import RecordingVerdict
 from sealscope.reporting import messages
 
 from ..diagnosis.balance_machine import machine, step
+from ..diagnosis.test_hold_test import AREAS, RIG, date_holds, write_results
 from ..refusals import refusal
 from .plant import MAP, log, served
 
@@ -86,6 +87,24 @@ def test_a_machine_of_areas_alone_is_watched_in_the_litres_of_a_diagnosis(commis
     assert summary["why_no_litres"] == ""
     course = [row["leak_lpm"] for row in service.store.history("press")]
     assert course[0] is None and course[-1] == same(diagnosis.leak_lpm)
+
+
+def test_results_of_hold_tests_are_judged_by_their_trend(tmp_path):
+    healthy, factors = [1.0, 1.02, 0.98], [1.0, 1.02, 0.98, 2.0, 3.0, 4.0, 5.0, 6.0]
+    boom = ss.commission(write_results(tmp_path / "healthy.jsonl", date_holds(healthy, [1, 2, 3])), rig=RIG)
+    ss.write_machine(replace(boom, limit="6 mL/min"), tmp_path / "boom.toml")
+    (tmp_path / "incoming").mkdir()
+    holds = date_holds(factors, range(1, 9))
+    path = write_results(tmp_path / "incoming/holds.jsonl", holds)
+    service, _ = served(watching(tmp_path, tmp_path / "boom.toml"))
+    summary, (last,) = service.summaries()["press"], ss.hold_test(holds[-1], area=AREAS)
+    verdict = summary["recording"]
+    assert verdict["verdict"] == "leak" and "a month" in verdict["reason"] and "reached" in verdict["reason"]
+    assert summary["total_lpm"] == pytest.approx(last.leak_lpm, rel=0.1)
+    path.write_text(path.read_text().replace('"start": "2024', '"start": null, "was": "2024'))
+    again, _ = served(watching(tmp_path, tmp_path / "boom.toml"))
+    (refused,) = again.store.refused()
+    assert "dates" in refused["message"]
 
 
 def same(figures):

@@ -11,7 +11,7 @@ from typer import Argument, Option
 from sealscope.cli.options import StatedMachine, check_folder, say, with_machine_options
 from sealscope.errors import InputError
 
-_FILES = "Healthy recordings of the machine, or a folder of them."
+_FILES = "Healthy recordings of the machine, or a folder of them; or results of `hold --format jsonl`."
 _ADD = "Add recordings that are confirmed healthy to the machine's file; the old one is kept (.bak)."
 _KEEP = "Keep recordings that look leaking compared with the others; else they are left out."
 _SINCE = "With --add: forget recordings before DATE, as after a repair."
@@ -33,6 +33,7 @@ def commission(
     from sealscope.diagnosis.commissioned.machine import CommissionedMachine, JudgedAlarm, recordings_in
     from sealscope.diagnosis.commissioned.machine import commission as learn_machine
     from sealscope.diagnosis.commissioned.machine_file import update_machine, write_machine
+    from sealscope.diagnosis.hold.recorded_holds import is_hold_results
 
     if output.suffix.lower() != ".toml":
         raise InputError(f"a machine's file must end in .toml, got {output}")
@@ -56,7 +57,10 @@ def commission(
                 repair_mark = JudgedAlarm(alarm="", mark="repaired", date_s=repair_s, onset_s=repair_s)
                 machine = replace(machine, alarms=(*machine.alarms, repair_mark))
             for path in paths:
-                machine = machine.with_healthy(machine.read(path), file=path.name)
+                if is_hold_results(path):
+                    machine = machine.with_holds(path)
+                else:
+                    machine = machine.with_healthy(machine.read(path), file=path.name)
             undated = [recording.file for recording in machine.healthy if recording.start_s is None]
             if repair_s is not None and (lost := [path.name for path in paths if path.name in undated]):
                 raise InputError(f"a recording added with --since must have a date, got none of {lost[0]}")

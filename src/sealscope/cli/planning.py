@@ -91,7 +91,8 @@ def _plan_hold_alone(
     length = set_up.volumes[0] / set_up.areas[0] if set_up.volumes else HOLD.column.unknown
     step = parse_quantity(resolution, "m", name="--resolution")
     warming = parse_quantity(drift, "K", name="--drift")
-    if step < 0.0 or warming < 0.0:
-        raise InputError(f"--resolution and --drift must be 0 or more, got {resolution} and {drift}")
+    for name, number, most, unit in (("resolution", 1e3 * step, 10.0, "mm"), ("drift", warming, 100.0, "K")):
+        if not 0.0 <= number <= most:
+            raise InputError(f"--{name} must be 0 to {most:g} {unit}, got {number:g} {unit}: is its unit right?")
     planned = plan_hold(force, set_up.areas[0], length, step, warming=warming, find=find, detection=detection)
     echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())

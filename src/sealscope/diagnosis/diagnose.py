@@ -229,7 +229,10 @@ def diagnose(
     stated_areas = machine.areas if machine.area_stated else None
     with limit_threads():
         inspection = inspect_recording(recording)
-        comparable = select_comparable(inspection, healthy)
+        recorded = [
+            entry for entry in healthy if isinstance(entry, Recording) or entry.units
+        ]  # no result of a hold test
+        comparable = select_comparable(inspection, recorded)
         holds = judge_held_recording(recording, stated_areas, limit)
         growth = estimate_growth(summarise_hold(holds), _summarise_holds(healthy, stated_areas)) if holds else None
         examination = Examination(

@@ -8,6 +8,7 @@ present from the first sample on, which a watch that learns from the same sample
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,16 +16,21 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.watched import WatchedMachine
 from sealscope.diagnosis.diagnose import diagnose
+from sealscope.diagnosis.hold.recorded_holds import date_hold
+from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.live.estimates import BlockEstimate, Interval
 from sealscope.diagnosis.live.joining import find_way
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.diagnosis.priors.live import LIVE
+from sealscope.diagnosis.trend.machine_trend import Trend, trend
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
 from sealscope.diagnosis.verdict.evidence import CANNOT_TELL, LEAK, NO_LEAK
 from sealscope.diagnosis.verdict.states import state_of
 from sealscope.recordings.formats.times.timebase import clock_text
 from sealscope.recordings.recording import Recording
 from sealscope.reporting.messages import how_much
+from sealscope.reporting.trend.text import figures
+from sealscope.units import DAY
 
 _FALSE_ALARM = DECISION.false_alarm
 #: Fraction of an actuator's allowed false alarms that the recordings of its stream get; its blocks get the others.
@@ -84,6 +90,34 @@ class RecordingVerdict:
             leak_interval_lpm=_parse_interval(plain["leak_interval_lpm"]) if leaks else None,
             total_lpm=total.get("lpm"),
             total_interval_lpm=_parse_interval(total.get("interval_lpm")),
+            bound_lpm=plain["bound_lpm"],
+            chance=plain["chance"],
+        )
+
+    @classmethod
+    def from_trend(cls, trend: Trend, file: str) -> RecordingVerdict:
+        """Convert the trend of dated recordings to the verdict on the last one, with growth and date of the limit."""
+        plain, texts, leaks = trend.as_dict(), figures(trend), trend.verdict == LEAK
+        first, last, wear = trend.points[0], trend.points[-1], trend.wear
+        onsets = None if wear is None or wear.onset is None else [first.start + day * DAY for day in wear.onset]
+        total = trend.total
+        outlook = [f"{name} {texts[name]}" for name in ("growth", "limit") if texts[name]]
+        return cls(
+            file=file,
+            verdict=trend.verdict,
+            summary=trend.decision.summary,
+            size=texts["leak"] or texts["total"],
+            reason="; ".join([trend.reason, *outlook]),
+            cause=trend.decision.cause or "",
+            state={**trend.state.as_dict(), "since_s": onsets[0] if leaks and onsets else None},
+            start_s=last.start,
+            end_s=last.start + last.duration,
+            onset_s=onsets[0] if leaks and onsets else None,
+            onset_interval_s=(onsets[1], onsets[2]) if leaks and onsets else None,
+            leak_lpm=plain["leak_lpm"] if leaks else None,
+            leak_interval_lpm=_parse_interval(plain["leak_interval_lpm"]) if leaks else None,
+            total_lpm=None if total is None else total.value,
+            total_interval_lpm=None if total is None else (total.low, total.high),
             bound_lpm=plain["bound_lpm"],
             chance=plain["chance"],
         )
@@ -187,13 +221,9 @@ def judge_recording(
     position is not judged, as its blocks are: the result is None. One without a position is judged like `sealscope
     diagnose`.
     """
-    machine = watched.machine
-    limit = None if limit_lpm is None else f"{limit_lpm:.12g} L/min"
+    machine, limit = watched.machine, _state_limit(watched, limit_lpm)
     if machine is not None:
-        # the limit in the machine's file is used in its own unit: a limit of creep is compared with the creep
-        if limit_lpm not in (None, watched.limit_lpm):
-            machine = replace(machine, limit=limit)
-        diagnosis = machine.diagnose(recording)
+        diagnosis = replace(machine, limit=limit).diagnose(recording)
     elif find_way(watched.rig.circuit.watched_by, recording.channels):
         return None
     else:
@@ -202,6 +232,28 @@ def judge_recording(
     times = recording.t[np.isfinite(recording.t)]
     start_s, end_s = (float(times[0]), float(times[-1])) if times.size else (0.0, 0.0)
     return RecordingVerdict.from_diagnosis(diagnosis, start_s + shift, end_s + shift, shift)
+
+
+def _state_limit(watched: WatchedMachine, limit_lpm: float | None) -> str | None:
+    """State the repair limit: `limit_lpm` [L/min] or, if that is None or the same, the machine's in its own unit."""
+    if watched.machine is not None and limit_lpm in (None, watched.limit_lpm):
+        return watched.machine.limit  # a limit of creep is compared with the creep
+    return None if limit_lpm is None else f"{limit_lpm:.12g} L/min"
+
+
+def judge_hold_results(
+    watched: WatchedMachine, results: Sequence[HoldResult], file: str, *, limit_lpm: float | None = None
+) -> RecordingVerdict:
+    """Judge dated results of hold tests by their trend.
+
+    `file`, `limit_lpm`: as of `judge_recording`. The first test is taken as healthy, and those after it that the
+    machine's file lists. Raises InputError for a result without a date.
+    """
+    known = set() if watched.machine is None else {entry.start_s for entry in watched.machine.healthy}
+    dates = sorted({date_hold(result) or 0.0 for result in results})
+    n_known = next((k for k, date in enumerate(dates) if date not in known), len(dates))
+    judged = trend(results, healthy=max(1, n_known), limit=_state_limit(watched, limit_lpm))
+    return RecordingVerdict.from_trend(judged, file)
 
 
 def judge_stream(

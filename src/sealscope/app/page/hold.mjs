@@ -1,12 +1,20 @@
 // The screen of the hold test: a clock, what is stated, the result against the limit, and its page.
 import { app, ask, attempt, ensureMachine, fillSelect, go, machineNow, make, tell } from "./main.mjs";
 import { Linked, Trace } from "./charts.mjs";
-let link = new Linked(), ticking = 0, withoutLog = false;
+let link = new Linked(), ticking = 0, withoutLog = false, filled = "";
 
 export async function show() {
   const machine = await ensureMachine();
-  for (const input of byId("hold-form").querySelectorAll("input")) input.value = machine.hold[input.name] || "";
+  if (machine.name !== filled) for (const input of byId("hold-form").querySelectorAll("input")) input.value = machine.hold[input.name] || "";
+  filled = machine.name; // another log keeps what was typed
   update();
+}
+
+function clear() {
+  link.close();
+  link = new Linked();
+  byId("hold-results").replaceChildren();
+  byId("hold-state").textContent = "";
 }
 
 export function update() { fillSelect(byId("hold-file"), [["", "no log"], ...app.keys.map((key) => [key, app.rows.get(key)?.name || key])], withoutLog ? "" : app.file); }
@@ -15,10 +23,8 @@ async function judge(again) {
   const file = byId("hold-file").value;
   const machine = machineNow();
   const { results } = await ask("hold", { machine: machine.name, file });
-  link.close();
-  link = new Linked();
+  clear();
   const place = byId("hold-results");
-  place.replaceChildren();
   for (const result of results) {
     const words = { pass: "passes", fail: "fails", undecided: "undecided" }[result.result] || "no limit stated";
     const page = make("p", { role: "status" });
@@ -35,14 +41,17 @@ async function judge(again) {
     const lines = [["read", "--total"], ["fit", "--leak"], ["lower bound", "--quiet"], ["upper bound", "--quiet"]].map(([name, tone], column) => ({ name, colour: tone, column, dash: column > 1 ? [3, 3] : undefined }));
     link.charts.push(new Trace(place, held, { title: `${channel === "x" ? "Travel of the held load, positive as it sinks" : `${channel} of the held load`}, and its fit`, unit, lines, fetch: async () => ({ t, lines: [values, fit, low, high], first: held.first, last: held.last, complete: true }) }));
   }
-  byId("hold-state").textContent = again ? "Judged again while the log grows." : `${results.length} ${results.length === 1 ? "hold" : "holds"} judged.`;
+  const lacksArea = results.some((result) => result.leak_lpm === null && result.creep_mm_per_min !== null);
+  const done = again ? "Judged again while the log grows." : `${results.length} ${results.length === 1 ? "hold" : "holds"} judged.`;
+  byId("hold-state").textContent = done + (lacksArea ? " For mL/min state the piston's area, on the screen Channels." : "");
 }
 byId("hold-form").addEventListener("submit", (event) => {
   event.preventDefault();
+  clear(); // an error must not stand above the result of another log
   const hold = Object.fromEntries([...byId("hold-form").querySelectorAll("input")].map((input) => [input.name, input.value]));
   attempt(async () => { await tell("machine", { machine: app.machine, values: { hold } }); await judge(false); });
 });
-byId("hold-file").addEventListener("change", ({ target }) => { withoutLog = !target.value; if (target.value) go("hold", target.value); });
+byId("hold-file").addEventListener("change", ({ target }) => { clear(); withoutLog = !target.value; if (target.value) go("hold", target.value); });
 byId("hold-start").addEventListener("click", () => {
   clearInterval(ticking);
   const end = Date.now() + 60000 * (Number(byId("hold-minutes").value.replace(",", ".")) || 10);

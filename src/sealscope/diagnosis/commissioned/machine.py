@@ -24,7 +24,13 @@ from sealscope.diagnosis.detectors.registry import detectors
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
-from sealscope.diagnosis.hold.recorded_holds import HOLD_SUMMARY, summarise_hold
+from sealscope.diagnosis.hold.recorded_holds import (
+    HOLD_SUMMARY,
+    is_hold_results,
+    read_hold_results,
+    summarise_hold,
+    summarise_result,
+)
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -184,12 +190,24 @@ class CommissionedMachine:
         it.
         """
         rig, _ = assumed_rig(self.rig, recording)
-        summarised = summarise_healthy(recording, rig, file)
+        return self._with_summary(summarise_healthy(recording, rig, file))
+
+    def with_holds(self, path: Path) -> CommissionedMachine:
+        """Return the machine with the healthy hold tests of a file of `sealscope hold --format jsonl`.
+
+        Raises InputError if one states no leak with its pressure or is known, UnreadableFile if the file cannot be
+        read.
+        """
+        machine = self
+        for result in read_hold_results(path):
+            machine = machine._with_summary(summarise_result(result))
+        return machine
+
+    def _with_summary(self, summarised: SummarisedRecording) -> CommissionedMachine:
+        """Return the machine with one more healthy recording; raise InputError if it has the samples of a known one."""
         if known := next((earlier for earlier in self.healthy if earlier.digest == summarised.digest), None):
-            raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({file})")
-        # sorted by date; recordings of unknown date come first
-        healthy = sorted((*self.healthy, summarised), key=lambda entry: (entry.start_s or 0.0, entry.file))
-        return replace(self, healthy=tuple(healthy))
+            raise InputError(f"a healthy recording must be new, got the samples of {known.file} ({summarised.file})")
+        return replace(self, healthy=_sort_by_date((*self.healthy, summarised)))
 
     def _find_confirmed_leak(self, start_s: float, end_s: float) -> JudgedAlarm | None:
         """Find a confirmed leak that was open between `start_s` and `end_s` [s since 1970]; None if there was none.
@@ -352,7 +370,7 @@ def commission(
     Parameters
     ----------
     paths : path-like or sequence of path-like
-        A folder of healthy recordings, or their files.
+        A folder of healthy recordings, or their files, or those with results of hold tests (JSON lines).
     rig : Rig, str or path-like, optional
         Stated parameters of the machine: a Rig, the name of a packaged rig or the path of a TOML file; by default
         nothing is stated, but the recordings may show the circuit (`infer_rig`).
@@ -409,13 +427,17 @@ def commission(
     for number, (label, path) in enumerate(path_of.items()):
         progress(number, n_steps, label)
         try:
+            if is_hold_results(path):
+                machine = machine.with_holds(path)
+                continue
             recording = recording_of.get(label) or machine.read(path)
             machine = machine._with_recording(recording, label)
         except SealscopeError as error:
             problems.append(str(error))
     if not machine.healthy:
         raise InputError(f"a machine must have a healthy recording that can be used, got none: {problems[0]}")
-    if stated_map is not None and not any(_fits_map(recording, stated_map) for recording in machine.healthy):
+    recorded = [entry for entry in machine.healthy if entry.units]  # results of hold tests have no samples
+    if stated_map is not None and recorded and not any(_fits_map(recording, stated_map) for recording in recorded):
         read(files[0], map=stated_map, rate=rate)  # raises the error of the map, without which the others were read
 
     labels = list(path_of)
@@ -426,8 +448,14 @@ def commission(
         recording = recording_of.get(healthy.file) or machine.read(path_of[healthy.file])
         return replace(machine, healthy=reference).diagnose(recording)
 
-    healthy, leaking = cross_check(machine.healthy, judge, keep)
-    return replace(machine, healthy=healthy, left_out=(*problems, *leaking))
+    remaining, leaking = cross_check(recorded, judge, keep)
+    results = [entry for entry in machine.healthy if not entry.units]
+    return replace(machine, healthy=_sort_by_date((*remaining, *results)), left_out=(*problems, *leaking))
+
+
+def _sort_by_date(healthy: Iterable[SummarisedRecording]) -> tuple[SummarisedRecording, ...]:
+    """Sort recordings by date; those of unknown date come first."""
+    return tuple(sorted(healthy, key=lambda entry: (entry.start_s or 0.0, entry.file)))
 
 
 def _read_into_memory(machine: CommissionedMachine, path_of: Mapping[str, Path]) -> dict[str, Recording]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.cross_check import BY_OTHERS
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY
+from sealscope.diagnosis.hold.recorded_holds import HOLD_SUMMARY
 from sealscope.diagnosis.inference.equations.balances import circulation, equations
 from sealscope.diagnosis.inference.equations.signals import Signals
 from sealscope.diagnosis.inference.machine_states import find_rests
@@ -93,6 +94,7 @@ class MachineSummary:
             ("channels", ", ".join(f"{name} [{unit}]" for name, unit in display_units.items())),
             ("machine", _describe_rig(rig)),
             ("duty", _format_duty(healthy, display_units.get("p_A", "bar"))),
+            ("holds", _format_holds(healthy)),
             ("noise", ", ".join(noise)),
             *self._smallest_leak_rows(len(healthy), are_dated=bool(dates), needed=needed),
             ("limit", _describe_limit(healthy, limit)),
@@ -185,6 +187,16 @@ def _format_duty(healthy: Sequence[SummarisedRecording], pressure_unit: str) -> 
             ends = dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))  # equal ends once
             texts.append(f"{' to '.join(ends)} {unit}")
     return ", ".join(texts)
+
+
+def _format_holds(healthy: Sequence[SummarisedRecording]) -> str:
+    """Format number, leaks and pressures of the healthy hold tests; "" without any."""
+    holds = [recording.summaries[HOLD_SUMMARY] for recording in healthy if HOLD_SUMMARY in recording.summaries]
+    figures = ([1e3 * hold["lpm"] for hold in holds], [hold["bar"] for hold in holds])
+    ranges = [
+        " to ".join(dict.fromkeys(f"{end:.3g}" for end in (min(values), max(values)))) for values in figures if holds
+    ]
+    return f"{len(holds)}, leak {ranges[0]} mL/min at {ranges[1]} bar" if holds else ""
 
 
 def describe_recording(recording: Recording, inspection: Inspection) -> dict[str, Any]:

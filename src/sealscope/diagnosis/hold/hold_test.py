@@ -24,7 +24,7 @@ from sealscope.paragraphs import join_names
 from sealscope.recordings.channels import CHAMBERS, COUNTS, FLOW_SOURCES
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
-from sealscope.recordings.quality import inspect
+from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Recording
 
 
@@ -104,7 +104,10 @@ def hold_test(
         raise InputError(f"recording must be a Recording, got {type(recording).__name__}")
     name = os.fspath(file) if file else str(recording.provenance.get("file", "recording"))
     samples = _select_samples(recording)
-    findings = tuple(finding for finding in inspect(recording) if finding.code != "too_short")  # for detectors
+    findings = [finding for finding in inspect(recording) if finding.code != "too_short"]  # for detectors
+    for column in recording.unused_temperatures:
+        text = f"{column} is not read: if it is the oil's temperature, then --map 'T_oil={column}'"
+        findings.append(Finding("unused_temperature", "warning", None, len(recording), None, text))
     moment = recording.provenance.get("start")
     if moment is None and (start_s := start_seconds(recording, name)) is not None:
         moment = np.datetime64(round(start_s - float(samples.t[0])), "s")  # of t = 0

@@ -58,21 +58,25 @@ def find_shown_rate(error: float) -> float:
 
 
 class PlannedHold(NamedTuple):
-    """A planned hold: its `minutes`, and what it shows.
+    """A planned hold: its load `force` [N] and `minutes`, and what it shows.
 
     `pressure` [Pa]: that of the loaded side; `creep` [m/s], `leak` [m^3/s]: smallest ones whose interval excludes zero
-    with the wanted probability; `warming` [K]: standard deviation of an unlogged change of the oil's temperature.
+    with the wanted probability; `warming` [K]: standard deviation of an unlogged change of the oil's temperature;
+    `find` [m^3/s]: leak that was to be shown, 0 if none was stated.
     """
 
+    force: float
     minutes: float
     pressure: float
     creep: float
     leak: float
     warming: float
+    find: float
 
     def as_dict(self) -> dict[str, Any]:
         """Convert the hold to plain JSON values."""
         return {
+            "load_N": self.force,
             "minutes": self.minutes,
             "pressure_Pa": self.pressure,
             "smallest_creep_mm_per_min": self.creep / MM_PER_MINUTE,
@@ -81,13 +85,16 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self) -> str:
-        """Format the planned hold as two lines of text."""
+        """Format the planned hold as two lines of text, and one that says that it does not show the wanted leak."""
         oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else "the oil's temperature logged"
         creep, leak = self.creep / MM_PER_MINUTE, self.leak / ML_PER_MINUTE
-        return (
-            f"hold the load for {self.minutes:g} min at {self.pressure / BAR:.3g} bar, valves shut: `sealscope hold`\n"
-            f"  shows creep of {creep:.2g} mm/min, a leak of {leak:.2g} mL/min, {oil}"
+        text = (
+            f"hold {self.force / 1e3:.3g} kN for {self.minutes:g} min at {self.pressure / BAR:.3g} bar, valves shut: "
+            f"`sealscope hold`\n  shows creep of {creep:.2g} mm/min, a leak of {leak:.2g} mL/min, {oil}"
         )
+        if not 0.0 < self.find < self.leak:
+            return text
+        return f"{text}\n  no hold of up to {self.minutes:g} min shows {self.find / ML_PER_MINUTE:.2g} mL/min"
 
 
 def plan_hold(
@@ -124,7 +131,7 @@ def plan_hold(
         if noise < step / 3.0:  # a position that stays within one step tells the creep by that step alone
             error = math.hypot(error, 1e3 * step / math.sqrt(6.0) / minutes)
         creep = (find_shown_rate(error) + quantile * error) * MM_PER_MINUTE
-        plans.append(PlannedHold(minutes, force / area, creep, creep * area, warming))
+        plans.append(PlannedHold(force, minutes, force / area, creep, creep * area, warming, find or 0.0))
     if find is None:
         return plans[HOLD_MINUTES.index(DEFAULT_MINUTES)]
     return next((plan for plan in plans if plan.leak <= find), plans[-1])

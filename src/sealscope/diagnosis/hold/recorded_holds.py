@@ -1,22 +1,27 @@
-"""Results of hold tests in the diagnosis of a recording of a held load, and read back from JSON lines."""
+"""Results of hold tests in the diagnosis of a recording of a held load, and read back from JSON lines.
+
+Healthy results are part of a commissioned machine, and later ones are compared with them, as recordings are.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from sealscope.diagnosis.estimate.population import ScatterPrior, estimate_variance
-from sealscope.diagnosis.healthy import Summary
+from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.hold.judgement import COOLING, format_estimate
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.diagnosis.verdict.evidence import TotalLeakage
 from sealscope.errors import InputError, UnreadableFile
+from sealscope.recordings.formats.times.timebase import parse_epoch
 from sealscope.storage.plain_values import convert_type, parse_json
 from sealscope.units import BAR
 
@@ -50,11 +55,30 @@ def summarise_hold(holds: Sequence[HoldResult]) -> dict[str, float] | None:
     return {"lpm": leakage.lpm, "half_lpm": 0.5 * (high - low), "bar": leakage.pressure / BAR}
 
 
+def date_hold(result: HoldResult) -> float | None:
+    """Return the time at which a hold begins [s since 1970]; None if its recording states no date."""
+    start = None if result.start is None else parse_epoch(result.start)
+    return None if start is None else start + (result.start_s or 0.0)
+
+
+def summarise_result(result: HoldResult) -> SummarisedRecording:
+    """Summarise the result of a healthy hold test as a recording without channels, for `estimate_growth` alone.
+
+    Raises InputError if it states no leak, no pressure or no duration.
+    """
+    summary, seconds = summarise_hold([result]), (result.end_s or 0.0) - (result.start_s or 0.0)
+    if summary is None or not seconds > 0.0:
+        raise InputError(f"a healthy hold test must state leak and pressure (--area), got neither ({result.file})")
+    digest = sha256(f"{result.start} {result.start_s} {summary}".encode()).hexdigest()
+    summaries = {HOLD_SUMMARY: summary}
+    return SummarisedRecording(result.file, digest, {}, 1.0 / seconds, seconds, date_hold(result), summaries)
+
+
 def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGrowth | None:
     """Compare a hold with `healthy` ones (`summarise_hold`); None if a leak is unknown or the healthy ones have none.
 
-    Leaks per pressure scatter between healthy recordings as in a trend (`between` of its priors): the interval is that
-    of Student's t, with the degrees of freedom of the prior and of the recordings.
+    Leaks per pressure scatter between healthy tests, by their oil and loads (`between.hold_test` of a trend's priors):
+    the interval is that of Student's t, with the degrees of freedom of the prior and of the recordings.
     """
     if hold is None or not healthy:
         return None
@@ -65,7 +89,7 @@ def estimate_growth(hold: Summary | None, healthy: Sequence[Summary]) -> HeldGro
     n, usual, between = len(levels), float(levels.mean()), TREND.between
     if not usual > float(np.sqrt((halves**2).sum())) / n:
         return None  # a ratio to nothing has no value
-    prior = ScatterPrior(between.volume_balance * usual, between.freedom)
+    prior = ScatterPrior(between.hold_test * usual, between.freedom)
     variance, freedom = estimate_variance(float(((levels - usual) ** 2).sum()), n, prior)
     scatter = math.sqrt(variance * (1.0 + 1.0 / n))
     half = math.hypot(float(stdtrit(freedom, 0.975)) * scatter, hold["half_lpm"] / hold["bar"])

@@ -7,6 +7,7 @@ class LevelDeviation(PriorTable):
     """Scatter of a machine's leakage level (conductance or log RMS of wavelet details) between its recordings."""
 
     volume_balance: float  # standard deviation of the conductance, over its usual level
+    hold_test: float  # the same between hold tests, whose duty is not known beyond the pressure
     ringing: float  # standard deviation of the logarithm of the RMS of the pressures' wavelet details (their ringing)
     nodes: int  # number of values of the standard deviation, on a grid, over which results are averaged
     freedom: float  # degrees of freedom of the prior

@@ -18,7 +18,7 @@ from sealscope.diagnosis.detectors.observation import limit_threads
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
-from sealscope.diagnosis.hold.recorded_holds import held_leakage
+from sealscope.diagnosis.hold.recorded_holds import date_hold, held_leakage
 from sealscope.diagnosis.hold.result import HoldResult
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
@@ -38,7 +38,6 @@ from sealscope.errors import InputError
 from sealscope.paragraphs import join_names
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHAMBERS, chambers_of
-from sealscope.recordings.formats.times.timebase import parse_epoch
 from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.oil import oil_temperature
 from sealscope.recordings.quality import Finding
@@ -178,14 +177,13 @@ def _held_level(holds: Sequence[HoldResult]) -> dict[str, Any] | None:
 def hold_reading(result: HoldResult) -> LeakReading:
     """Convert the result of a hold test to a reading of a trend; `problem` says why it states no level, if so."""
     start_s = result.start_s or 0.0
-    date = None if result.start is None else parse_epoch(result.start)
     fields = _held_level([result])
     if fields is None:
         fields = {"problem": "the hold test states no leak in L/min with its pressure (--area, a chamber's pressure)"}
     return LeakReading(
         **{"pressure": math.nan, **fields},
         file=result.file,
-        start=None if date is None else date + start_s,
+        start=date_hold(result),
         duration=(result.end_s or start_s) - start_s,
         states_flow=True,
         area=1e-6 * result.areas_mm2[0] if result.areas_mm2 else None,
@@ -228,8 +226,8 @@ def scatter_prior(basis: Basis, usual: float) -> ScatterPrior:
     between = TREND.between
     if basis == "pressure response":
         return ScatterPrior(PRESSURE.conductance.level, between.freedom)
-    is_flow = basis in ("volume balance", "hold test")
-    scale = between.volume_balance * abs(usual) if is_flow else between.ringing
+    shares = {"volume balance": between.volume_balance, "hold test": between.hold_test}
+    scale = shares[basis] * abs(usual) if basis in shares else between.ringing
     return ScatterPrior(max(scale, float(np.finfo(float).tiny)), between.freedom)  # must be above 0
 
 

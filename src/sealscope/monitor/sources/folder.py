@@ -18,7 +18,8 @@ import numpy as np
 
 from sealscope.diagnosis.commissioned.machine import read_by_map
 from sealscope.diagnosis.commissioned.watched import load_watched
-from sealscope.errors import SealscopeError, escape_text
+from sealscope.diagnosis.hold.recorded_holds import date_hold, is_hold_results, read_hold_results
+from sealscope.errors import InputError, SealscopeError, escape_text
 from sealscope.monitor.settings import ActuatorSettings
 from sealscope.monitor.sources.source_block import (
     UNREADABLE_FILE,
@@ -29,7 +30,7 @@ from sealscope.monitor.sources.source_block import (
     count_bytes,
 )
 from sealscope.monitor.supervisor import DATABASE, PartAway, SupervisedPart, describe_error
-from sealscope.monitor.verdicts import judge_recording
+from sealscope.monitor.verdicts import judge_hold_results, judge_recording
 from sealscope.recordings import Recording
 from sealscope.recordings.corrections.samples import correct_samples, remove_holes
 from sealscope.recordings.joining import file_seconds
@@ -156,8 +157,17 @@ class WatchedFolder:
         return [(file, reading) for _, file, reading in rows]
 
     def _read(self, path: Path) -> _Reading:
-        """Read a file by the actuator's map of columns; after any error return None and the reason."""
+        """Read a file by the actuator's map of columns; after any error return None and the reason.
+
+        Results of hold tests are read as a single time, that of the last test.
+        """
         try:
+            if is_hold_results(path):
+                dates = [(date_hold(result), result.file) for result in read_hold_results(path)]
+                if undated := [file for date, file in dates if date is None]:
+                    raise InputError(f"hold tests in order of time must have dates, got none of {undated[0]} ({path})")
+                about = {"start_epoch_s": max(date or 0.0 for date, _ in dates)}
+                return Recording(np.zeros(1), {}, {}, rate=1.0, provenance=about), ""
             return read_by_map(path, self._channel_map, self._settings.rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
             return None, escape_text(str(error)) or type(error).__name__
@@ -196,6 +206,11 @@ class WatchedFolder:
             watched = load_watched(self._settings.rig)  # read anew, as the file may have changed
         except (SealscopeError, OSError) as error:
             raise PartAway(escape_text(str(error))) from None
+        name, limit_lpm = escape_text(path.name), self._settings.error_lpm
+        if is_hold_results(path):
+            self._newest_s = self._end_s = start
+            trend_verdict = judge_hold_results(watched, read_hold_results(path), name, limit_lpm=limit_lpm)
+            return replace(block, samples=recording.samples(slice(0, 0)), verdict=trend_verdict)
         if _is_midnight_before(start, self._newest_s):
             start = max(start, self._end_s + _GAP_S)
         finite_t = recording.t[np.isfinite(recording.t)]
@@ -203,11 +218,10 @@ class WatchedFolder:
         times = corrected_samples.t + shift
         verdict = None
         try:
-            limit_lpm = self._settings.error_lpm
-            verdict = judge_recording(watched, recording, escape_text(path.name), shift, limit_lpm=limit_lpm)
+            verdict = judge_recording(watched, recording, name, shift, limit_lpm=limit_lpm)
         except Exception as error:  # the samples are still watched
             reason = describe_error(error)
-            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, escape_text(path.name), reason)
+            _log.warning("%s: %s is not judged as a whole: %s", self.actuator, name, reason)
         self._newest_s, self._end_s = start, float(np.nanmax(times, initial=start))
         channels, units = dict(corrected_samples.channels), dict(corrected_samples.units)
         if "T_oil" not in channels and (celsius := oil_temperature(corrected_samples)) is not None:
