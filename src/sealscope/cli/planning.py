@@ -94,5 +94,8 @@ def _plan_hold_alone(
     for name, number, most, unit in (("resolution", 1e3 * step, 10.0, "mm"), ("drift", warming, 100.0, "K")):
         if not 0.0 <= number <= most:
             raise InputError(f"--{name} must be 0 to {most:g} {unit}, got {number:g} {unit}: is its unit right?")
-    planned = plan_hold(force, set_up.areas[0], length, step, warming=warming, find=find, detection=detection)
+    known = HOLD.column.stated if set_up.volumes else HOLD.column.deviation
+    planned = plan_hold(
+        force, set_up.areas[0], length, step, warming=warming, find=find, detection=detection, length_deviation=known
+    )
     echo(json.dumps(planned.as_dict(), allow_nan=False) if output == "json" else planned.text())

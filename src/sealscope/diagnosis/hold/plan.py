@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.estimate.population import Mixture
 from sealscope.diagnosis.hold.hold_equation import ROUNDED
 from sealscope.diagnosis.hold.regression import Column, Noise, leak_prior, predict_deviation
@@ -61,8 +62,9 @@ class PlannedHold(NamedTuple):
     """A planned hold: its load `force` [N] and `minutes`, and what it shows.
 
     `pressure` [Pa]: that of the loaded side; `creep` [m/s], `leak` [m^3/s]: smallest ones whose interval excludes zero
-    with the wanted probability; `warming` [K]: standard deviation of an unlogged change of the oil's temperature;
-    `find` [m^3/s]: leak that was to be shown, 0 if none was stated.
+    with the wanted probability; `warming` [K]: change of the oil's temperature that nobody logs; `per_kelvin` [m^3/s]:
+    what each kelvin of a logged change adds to the leak that is shown; `find` [m^3/s]: leak that was to be shown, 0 if
+    none was stated.
     """
 
     force: float
@@ -71,6 +73,7 @@ class PlannedHold(NamedTuple):
     creep: float
     leak: float
     warming: float
+    per_kelvin: float
     find: float
 
     def as_dict(self) -> dict[str, Any]:
@@ -82,12 +85,14 @@ class PlannedHold(NamedTuple):
             "smallest_creep_mm_per_min": self.creep / MM_PER_MINUTE,
             "smallest_leak_lpm": self.leak / LITRE_PER_MINUTE,
             "unlogged_K": self.warming,
+            "smallest_leak_lpm_per_logged_K": self.per_kelvin / LITRE_PER_MINUTE,
         }
 
     def text(self) -> str:
         """Format the planned hold as two lines of text, and one that says that it does not show the wanted leak."""
-        oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else "the oil's temperature logged"
-        creep, leak = self.creep / MM_PER_MINUTE, self.leak / ML_PER_MINUTE
+        creep, leak, rise = self.creep / MM_PER_MINUTE, self.leak / ML_PER_MINUTE, self.per_kelvin / ML_PER_MINUTE
+        oil = f"the oil's temperature logged (each K of its change adds {rise:.2g} mL/min)"
+        oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else oil
         text = (
             f"hold {self.force / 1e3:.3g} kN for {self.minutes:g} min at {self.pressure / BAR:.3g} bar, valves shut: "
             f"`sealscope hold`\n  shows creep of {creep:.2g} mm/min, a leak of {leak:.2g} mL/min, {oil}"
@@ -107,31 +112,36 @@ def plan_hold(
     warming: float = 0.0,
     find: float | None = None,
     detection: float = 0.9,
+    length_deviation: float = HOLD.column.deviation,
 ) -> PlannedHold:
     """Find the shortest hold that shows a leak of the flow `find` [m^3/s], or what ten minutes show without it.
 
-    `force` [N]: load; `area` [m^2]: of the loaded side; `length` [m]: of its oil column; `step`, `noise` [m]: encoder
-    step and noise of the position; `warming` [K]: as of `PlannedHold`; `detection`: probability that the leak's
-    interval excludes zero. If no duration in `HOLD_MINUTES` suffices, the longest is planned. Raises InputError for a
-    load or an area that is not above 0.
+    `force` [N]: load; `area` [m^2]: of the loaded side; `length` [m]: of its oil column, known to the relative
+    `length_deviation`; `step`, `noise` [m]: encoder step and noise of the position; `warming` [K]: as of `PlannedHold`,
+    of which the test allows what its prior does; `detection`: probability that the leak's interval excludes zero. If no
+    duration in `HOLD_MINUTES` suffices, the longest is planned. Raises InputError for a load or an area that is not
+    above 0.
     """
     for name, value in (("load", force), ("area", area), ("length of the oil column", length)):
         if not value > 0.0:
             raise InputError(f"{name} of a hold must be above 0, got {value:g}")
     quantile = NormalDist().inv_cdf(detection)
     s = max(1e3 * math.hypot(noise, step / math.sqrt(12.0)), 1e-6)
-    plans = []
+    cooling, plans = HOLD.cooling, []
+    allowed = max(warming, *cooling.sizes) if warming else 0.0
+    share = math.hypot(cooling.expansion_deviation, cooling.misfit, length_deviation)
     for minutes in HOLD_MINUTES:
         n_readings = 60.0 * minutes * READINGS_PER_SECOND
         white = Noise(0.0, math.inf, 1.0)
-        error = predict_rate_error(minutes, n_readings, white, s, 60.0 * minutes, 1e3 * length, warming)
+        error = predict_rate_error(minutes, n_readings, white, s, 60.0 * minutes, 1e3 * length, allowed)
         error *= UNKNOWN_NOISE
         if not warming:  # the rounding of the logged temperature
-            error = math.hypot(error, ROUNDED * HOLD.cooling.step * HOLD.cooling.expansion * 1e3 * length / minutes)
+            error = math.hypot(error, ROUNDED * cooling.step * cooling.expansion * 1e3 * length / minutes)
         if noise < step / 3.0:  # a position that stays within one step tells the creep by that step alone
             error = math.hypot(error, 1e3 * step / math.sqrt(6.0) / minutes)
         creep = (find_shown_rate(error) + quantile * error) * MM_PER_MINUTE
-        plans.append(PlannedHold(force, minutes, force / area, creep, creep * area, warming, find or 0.0))
+        per_kelvin = WITHIN_95 * share * cooling.expansion * length * area / (60.0 * minutes)
+        plans.append(PlannedHold(force, minutes, force / area, creep, creep * area, warming, per_kelvin, find or 0.0))
     if find is None:
         return plans[HOLD_MINUTES.index(DEFAULT_MINUTES)]
     return next((plan for plan in plans if plan.leak <= find), plans[-1])
