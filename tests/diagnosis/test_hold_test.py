@@ -86,6 +86,39 @@ def test_the_hold_begins_where_the_motion_ends(end):
     assert low <= 1.0 <= high
 
 
+@pytest.mark.parametrize("speed", [0.5, 2.5, 50.0])  # mm/s
+@pytest.mark.parametrize("rate", [1.0, 100.0])
+def test_slow_strokes_before_and_after_are_no_part_of_the_hold(speed, rate):
+    t = np.arange(0.0, 330.0, 1.0 / rate)
+    x = 0.4 + 1e-3 * speed * (np.minimum(t - 15.0, 0.0) - np.maximum(t - 315.0, 0.0)) - 1e-5 * np.clip(t - 15.0, 0, 300)
+    x += 1e-5 * np.random.default_rng(3).standard_normal(t.size)
+    (result,) = ss.hold_test(ss.Recording(t, {"x": x}, {"x": "m"}, rate=rate))
+    assert 15.0 <= result.start_s <= 18.0 and 311.0 <= result.end_s <= 315.0
+    low, high = result.creep_interval_mm_per_min
+    assert low <= 0.6 <= high
+
+
+def test_slips_are_part_of_the_hold():
+    t = np.arange(0.0, 600.0, 0.1)
+    x = 0.4 - 3e-4 * np.floor(t / 40.0) + 1e-6 * np.random.default_rng(4).standard_normal(t.size)
+    (result,) = ss.hold_test(ss.Recording(t, {"x": x}, {"x": "m"}, rate=10.0))
+    assert (result.start_s, result.end_s) == (0.0, pytest.approx(599.9))
+
+
+def test_a_port_that_opens_ends_the_hold_at_any_pressure():
+    random = np.random.default_rng(6)
+    t = np.arange(0.0, 320.0, 0.1)
+    for held in (4e6, 4e5):
+        p = np.where(t < 300.0, held - 100.0 * t, 0.0) + 2e3 * random.standard_normal(t.size)
+        recording = ss.Recording(t, {"p_A": p}, {"p_A": "Pa"}, rate=10.0)
+        (result,) = ss.hold_test(recording, area=AREAS)  # what follows without a load is no hold
+        assert 296.0 <= result.end_s <= 300.0
+        assert ss.hold_test(recording, area=AREAS, start="100 s")[0].end_s == result.end_s
+        assert ss.hold_test(recording, area=AREAS, start="100 s", end="310 s")[0].end_s == 310.0
+        with pytest.raises(InputError, match="load of 3 bar"):
+            ss.hold_test(recording.between(301.0, 320.0), area=AREAS)
+
+
 def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
     t = np.arange(0.0, 300.0, 0.1)
     random = np.random.default_rng(2)

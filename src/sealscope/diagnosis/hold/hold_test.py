@@ -26,6 +26,7 @@ from sealscope.recordings.joining import start_seconds
 from sealscope.recordings.motion import is_constant
 from sealscope.recordings.quality import Finding, inspect
 from sealscope.recordings.recording import Recording
+from sealscope.units import BAR
 
 
 @checked_call
@@ -174,16 +175,15 @@ def _select_samples(recording: Recording) -> Recording:
 def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
     """Cut the holds out of a log, or out of the part whose start or end is stated; with both, this part is the hold.
 
-    Raises InputError if none is long enough.
+    A part in which the side of the load is at the tank's pressure holds none. Raises InputError if no hold is left.
     """
     extent, shortest = f"in a log of {len(samples)} samples over {samples.duration:.3g} s", HOLD.part.shortest
     low, high = (-np.inf if set_up.start is None else set_up.start), (np.inf if set_up.end is None else set_up.end)
     samples = samples._select((samples.t >= low) & (samples.t <= high), "stated part")
-    t, pressures = samples.t, [samples[name] for name in CHAMBERS if name in samples]
+    t, x, pressures = samples.t, samples.channels.get("x"), [samples[name] for name in CHAMBERS if name in samples]
     parts = [(0, len(t) - 1)] if len(t) else []
-    if parts and ("x" in samples or pressures) and None in (set_up.start, set_up.end):
-        highest = max(pressures, key=lambda p: float(np.median(p)), default=None)
-        parts = find_held_parts(t, samples.channels.get("x"), highest) if len(t) > 2 else []
+    if parts and (x is not None or pressures) and None in (set_up.start, set_up.end):
+        parts = find_held_parts(t, x, pressures) if len(t) > 2 else []
         extent = f"without motion {extent}"
     durations = [float(t[last] - t[first]) for first, last in parts]
     held = [part for part, duration in zip(parts, durations, strict=True) if duration >= shortest]
@@ -191,4 +191,13 @@ def _cut_holds(samples: Recording, set_up: SetUp) -> list[Recording]:
     if not held:
         longest = f"{max(durations):.3g} s at most" if durations else "none"
         raise InputError(f"a hold must last {shortest:g} s with 5 samples or more, got {longest} {extent}")
+    load, tank = max(pressures, key=lambda p: float(np.median(p)), default=None), HOLD.other.tank * BAR
+    # beside a position, a single chamber may be the one without the load
+    if load is not None and (len(pressures) > 1 or x is None or float(np.median(load)) > tank):
+        loads = [float(np.median(load[first : last + 1])) for first, last in held]
+        if max(loads) < tank:
+            raise InputError(
+                f"a hold needs a load of {tank / BAR:g} bar or more, got {max(loads) / BAR:.2g} bar {extent}"
+            )
+        held = [part for part, held_load in zip(held, loads, strict=True) if held_load >= tank]
     return [samples.samples(slice(first, last + 1)) for first, last in held]

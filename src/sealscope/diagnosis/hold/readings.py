@@ -32,7 +32,7 @@ N_BETWEEN = 10
 SMOOTH_DEGREE, SMOOTH_TIMES, MAX_CORRELATION = 4, (0.02, 0.06, 0.2), 0.3
 #: Largest residual of such a course, root mean square over the noise of the means.
 MAX_MISFIT = 1.5
-#: Largest number of bins in which holds are sought, and of readings that tell the noise meanwhile.
+#: Largest number of bins in which holds are sought.
 MAX_BINS = 20_000
 
 
@@ -159,26 +159,34 @@ def smooth_course(t: Array, values: Array) -> tuple[Array, Array]:
     return part_t, means
 
 
-def find_held_parts(t: Array, x: Array | None, p: Array | None) -> list[tuple[int, int]]:
+def find_held_parts(t: Array, x: Array | None, pressures: Sequence[Array] = ()) -> list[tuple[int, int]]:
     """Find the holds of a log: first and last index of the samples between which neither position nor pressure moves.
 
-    `t` [s], `x` [m], `p` [Pa] (n,): samples without gaps, of which x or p may be absent. A hold ends where means over
-    `part.bin` move faster than `part.speed` or `part.pressure` of `priors.toml`.
+    `t` [s], `x` [m], `pressures` [Pa] (n,): samples without gaps, of which some may be absent. What moves differs from
+    the hold about it: means over `part.bin` of `priors.toml` change `part.ratio` times as fast as the slowest quarter
+    of them, within `part.creep` and `part.speed`, or faster than `part.decay` of the highest pressure and
+    `part.pressure`; and together they move by more than slips and settling do (`part.travel`, `part.fall`).
     """
     prior = HOLD.part
     step = float(np.median(np.diff(t)))
     n_bins = int(min(max((t[-1] - t[0]) / max(prior.bin, step), 1.0), MAX_BINS))
+    held = max((float(np.median(p)) for p in pressures), default=0.0)
+    decay = min(prior.pressure * BAR, prior.decay * held) if held > 0.0 else prior.pressure * BAR
+    speeds, decays = (prior.creep * 1e-3, prior.speed * 1e-3), (decay, decay)
     is_moving, bin_t = np.zeros(0, dtype=bool), t
-    limits = ((x, prior.speed * 1e-3, prior.position * 1e-3), (p, prior.pressure * BAR, prior.scatter * BAR))
-    for values, fastest, largest in limits:
-        if values is None:
-            continue
+    limits = (
+        *([] if x is None else [(x, speeds, prior.position * 1e-3, prior.travel * 1e-3)]),
+        *((p, decays, prior.scatter * BAR, prior.fall * held) for p in pressures),
+    )
+    for values, (slowest, fastest), largest, travel in limits:
         bin_t, means = average_parts(t, values, n_bins)
-        changes = np.abs(np.diff(means))
-        rows = np.arange(0, len(values) - 2, max(len(values) // MAX_BINS, 1))
-        bends = values[rows] - 2.0 * values[rows + 1] + values[rows + 2]
-        scatter = 1.4826 * float(np.median(np.abs(bends))) / 6.0**0.5
-        moves = changes > fastest * np.diff(bin_t) + prior.noise * 2.0**0.5 * min(scatter, largest)
+        changes, times = np.diff(means), np.diff(bin_t)
+        scatter = 1.4826 * float(np.median(np.abs(np.diff(means, 2)))) / 6.0**0.5 if len(means) > 2 else 0.0
+        held_rate = float(np.quantile(np.abs(changes) / times, 0.25)) if len(means) > 1 else 0.0
+        rate = min(max(prior.ratio * held_rate, slowest), fastest)
+        moves = np.abs(changes) > rate * times + prior.noise * 2.0**0.5 * min(scatter, largest)
+        for first, length in find_runs(moves).tolist():
+            moves[first : first + length] &= np.abs(changes[first : first + length]).sum() > travel
         is_moving = moves if not is_moving.size else is_moving | moves
     runs = find_runs(~is_moving)
     parts = []

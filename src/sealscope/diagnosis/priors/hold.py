@@ -7,7 +7,12 @@ class HeldPart(PriorTable):
     """The part of a log in which a load is held."""
 
     speed: float  # [mm/s] largest speed of a held piston
+    creep: float  # [mm/s] speed below which every piston is held
+    ratio: float  # speed of a motion, over that of the slower parts of a log
+    travel: float  # [mm] largest slip of a held piston, or its settling
     pressure: float  # [bar/s] largest rate of a held pressure
+    decay: float  # [1/s] the same, over the pressure
+    fall: float  # largest change of a pressure that slips and settling make, over the pressure
     noise: float  # [standard deviations] largest step that is noise
     position: float  # [mm] largest noise of a position
     scatter: float  # [bar] largest noise of a pressure
