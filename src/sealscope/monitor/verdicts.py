@@ -106,7 +106,7 @@ class RecordingVerdict:
             file=file,
             verdict=trend.verdict,
             summary=trend.decision.summary,
-            size=texts["leak"] or texts["total"],
+            size=texts["total"],
             reason="; ".join([trend.reason, *outlook]),
             cause=trend.decision.cause or "",
             state={**trend.state.as_dict(), "since_s": onsets[0] if leaks and onsets else None},

@@ -89,7 +89,7 @@ class PlannedHold(NamedTuple):
         }
 
     def text(self) -> str:
-        """Format the planned hold as two lines of text, and one that says that it does not show the wanted leak."""
+        """Format the planned hold as text, with a last line if no hold shows the leak that was to be found."""
         creep, leak, rise = self.creep / MM_PER_MINUTE, self.leak / ML_PER_MINUTE, self.per_kelvin / ML_PER_MINUTE
         oil = f"the oil's temperature logged (each K of its change adds {rise:.2g} mL/min)"
         oil = f"oil that changes by {self.warming:g} K unlogged" if self.warming else oil

@@ -166,8 +166,8 @@ class WatchedFolder:
                 dates = [(date_hold(result), result.file) for result in read_hold_results(path)]
                 if undated := [file for date, file in dates if date is None]:
                     raise InputError(f"hold tests in order of time must have dates, got none of {undated[0]} ({path})")
-                about = {"start_epoch_s": max(date or 0.0 for date, _ in dates)}
-                return Recording(np.zeros(1), {}, {}, rate=1.0, provenance=about), ""
+                provenance = {"start_epoch_s": max(date or 0.0 for date, _ in dates)}
+                return Recording(np.zeros(1), {}, {}, rate=1.0, provenance=provenance), ""
             return read_by_map(path, self._channel_map, self._settings.rate), ""
         except (SealscopeError, OSError, MemoryError) as error:
             return None, escape_text(str(error)) or type(error).__name__
