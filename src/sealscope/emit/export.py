@@ -173,7 +173,8 @@ def controller_rig(machine: CommissionedMachine) -> Rig:
     assumed one (`scale` of `VolumeBalance.learn`); here the median counts.
     """
     rig = machine.rig or unstated_rig()
-    summaries = [own.summaries.get(VolumeBalance.name, {}) for own in machine.healthy if not measures_flow(own.units)]
+    recordings = [recording for recording in machine.healthy if not measures_flow(recording.units)]
+    summaries = [recording.summaries.get(VolumeBalance.name, {}) for recording in recordings]
     scales = [float(summary["scale"]) for summary in summaries if summary.get("scale", 0.0) > 0.0]
     if rig.states("pump.q_b") or not scales:
         return rig
