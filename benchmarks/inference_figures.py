@@ -14,8 +14,8 @@ import numpy as np
 
 import sealscope as ss
 from sealscope.diagnosis.estimate.change import Information, fit_history, step_test
-from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.blocks import information
+from sealscope.diagnosis.inference.regimes import recorded_blocks
 from sealscope.diagnosis.inference.rows.weak_form import SPAN, peak_weight, row_weight, stride_samples
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Array

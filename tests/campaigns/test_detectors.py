@@ -23,7 +23,7 @@ from sealscope.campaigns.results import judge_simulated_campaign, write_result
 from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.explanations import load_events
 from sealscope.diagnosis.detectors import registry
-from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.detectors.registry import make_observable
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.verdict.evidence import Cause, Evidence
 from sealscope.recordings import read

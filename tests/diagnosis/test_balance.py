@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 import sealscope as ss
 from sealscope.diagnosis.estimate.change import StepTest, step_test
-from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, estimate_offset, information
 from sealscope.diagnosis.inference.equations.balances import equations
+from sealscope.diagnosis.inference.regimes import recorded_blocks
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.parameters import load_rig
 from sealscope.recordings.recording import Recording

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from sealscope.diagnosis.detectors import observation
-from sealscope.diagnosis.detectors.detector import validate_report
-from sealscope.diagnosis.detectors.registry import detectors
+from sealscope.diagnosis.detectors.registry import detectors, validate_report
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.rms_change.rms_detector import RmsChange
 from sealscope.diagnosis.verdict.evidence import Evidence

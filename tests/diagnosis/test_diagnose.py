@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from sealscope.diagnosis.commissioned import machine
 from sealscope.diagnosis.detectors import registry
-from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.detectors.registry import make_observable
 from sealscope.diagnosis.diagnose import Examination, diagnose
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels
 from sealscope.diagnosis.inference.observable import Observable, Observed, Ringing

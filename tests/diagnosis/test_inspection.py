@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.detectors import detector, registry
+from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.inspection import inspect_recording, select_comparable
 from sealscope.diagnosis.verdict.diagnosis import Diagnosis
@@ -227,8 +227,8 @@ def test_where_a_main_detector_fails_nobody_says_no_leak(
     expected = diagnose(healthy[0])
     monkeypatch.setattr(registry, "DETECTORS", {"pressure response": Failing, "rms change": rms_change})
     monkeypatch.setattr(Failing, "error", error, raising=False)
-    detector._log_once.cache_clear()
-    with caplog.at_level(logging.DEBUG, "sealscope.diagnosis.detectors.detector"):
+    registry._log_once.cache_clear()
+    with caplog.at_level(logging.DEBUG, "sealscope.diagnosis.detectors.registry"):
         result = diagnose(healthy[0])
     assert (expected.verdict, result.verdict) == ("no leak", "cannot tell")
     assert (result.score, result.reason) == (expected.score, f"{expected.reason}; {reason}")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from sealscope.diagnosis.detectors import detector, registry
+from sealscope.diagnosis.detectors import registry
 from sealscope.diagnosis.detectors.isolation import call_plug_in
 from sealscope.diagnosis.detectors.registry import DETECTORS, detectors
 from sealscope.diagnosis.diagnose import Examination, diagnose
@@ -35,7 +35,7 @@ class Good:
 """
 #: A detector that reports one change alone.
 ONE_CHANGE = """
-from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.detectors.registry import make_observable
 class Good:
     name = "good"
     def __init__(self, rig): pass
@@ -67,7 +67,7 @@ def install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Install
 
     def forget() -> None:
         registry.plug_ins.cache_clear()
-        detector._log_once.cache_clear()
+        registry._log_once.cache_clear()
 
     before = set(sys.modules)
     yield made
@@ -261,7 +261,7 @@ def test_a_report_has_limits(case: str, install: Install, short: Recording, capl
     source = GOOD.replace(
         'return Observed("good", lack=f"assumed {self.rig}")', f"return Observed('good', {observables})"
     )
-    imports = "import itertools\nfrom sealscope.diagnosis.detectors.detector import make_observable\n"
+    imports = "import itertools\nfrom sealscope.diagnosis.detectors.registry import make_observable\n"
     install("broken", imports + source, {"good": "broken:Good"})
     with caplog.at_level(logging.WARNING, "sealscope"):
         diagnose(short)

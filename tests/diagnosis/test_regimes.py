@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sealscope.diagnosis.inference.balance import recorded_blocks
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.terms import TURNING
 from sealscope.diagnosis.inference.hypotheses import MachineOdds, Valves
 from sealscope.diagnosis.inference.machine_states import AVERAGING_TIME, find_rests, rest_limit
+from sealscope.diagnosis.inference.regimes import recorded_blocks
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance

@@ -10,15 +10,16 @@ from scipy.stats import binom, kstest, norm
 
 from sealscope.diagnosis.estimate.population import Mixture, Population, ScatterPrior
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles, scale_grams
-from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
-from sealscope.diagnosis.inference.comparison.excess import (
+from sealscope.diagnosis.inference.comparison.levels import rise
+from sealscope.diagnosis.inference.comparison.recording_sums import (
+    RecordingSums,
+    Resistance,
     block_weights,
     eliminate_unshared,
     estimate_leak_excess,
+    find_unusual_conditions,
     motion_change,
 )
-from sealscope.diagnosis.inference.comparison.levels import rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, Resistance
 from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.equations.terms import LAG, LEAK, Equation, Term
 from sealscope.diagnosis.inference.volumes.volume_detector import compare_motion

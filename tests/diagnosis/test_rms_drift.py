@@ -13,8 +13,14 @@ from sealscope.diagnosis.decision.decide import decide
 from sealscope.diagnosis.decision.null import HealthyNull
 from sealscope.diagnosis.diagnose import diagnose
 from sealscope.diagnosis.priors.rms_change import RMS_PRIORS
-from sealscope.diagnosis.rms_change.rms_blocks import DUTY, RmsBlocks
-from sealscope.diagnosis.rms_change.rms_detector import RmsChange, estimate_rises, observe_within, subtract_noise
+from sealscope.diagnosis.rms_change.rms_detector import (
+    DUTY,
+    RmsBlocks,
+    RmsChange,
+    estimate_rises,
+    observe_within,
+    subtract_noise,
+)
 from sealscope.diagnosis.verdict.evidence import Evidence
 from sealscope.signals.details import QUANTITIES
 from sealscope.simulation.bench.machines import draw

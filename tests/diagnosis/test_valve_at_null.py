@@ -14,7 +14,7 @@ import sealscope as ss
 from sealscope.diagnosis.inference.balance_samples import bridged_samples
 from sealscope.diagnosis.inference.block_stream import BlockStream
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.excess import estimate_leak_excess
+from sealscope.diagnosis.inference.comparison.recording_sums import estimate_leak_excess
 from sealscope.diagnosis.inference.equations.balances import equations, is_separate_at_rest
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import stdtr
 
-from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.detectors.registry import make_observable
 from sealscope.diagnosis.inference.observable import Observed
 from sealscope.parameters import Rig
 from sealscope.recordings import Recording

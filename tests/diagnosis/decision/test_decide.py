@@ -197,7 +197,7 @@ NAMES = {
     "decision/reasons.py",
     "inference/block_stream.py",
     "inference/blocks.py",
-    "inference/comparison/excess.py",
+    "inference/comparison/recording_sums.py",
     "inference/equations/balances.py",
     "inference/equations/terms.py",
     "live/explanation.py",

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import sealscope as ss
-from sealscope.diagnosis.detectors.detector import make_observable
+from sealscope.diagnosis.detectors.registry import make_observable
 from sealscope.diagnosis.inference.changes.charge_pressure import FALL, LOW
 from sealscope.diagnosis.inference.changes.features import SENSOR_FEATURES, observe_signals, sensor_features
 from sealscope.diagnosis.inference.changes.healthy_levels import DRIFTS, FRICTION, ZEROS
@@ -28,7 +28,7 @@ from sealscope.diagnosis.inference.equations.terms import AIR, BIAS, TURNING, de
 from sealscope.diagnosis.inference.pressures.reduced_rig import PARAMETERS
 from sealscope.diagnosis.inference.volumes.rivals import TURNING_DATA
 from sealscope.diagnosis.priors.changes import CHANGES
-from sealscope.diagnosis.rms_change.rms_blocks import JUDGED
+from sealscope.diagnosis.rms_change.rms_detector import JUDGED
 from sealscope.parameters import load_rig
 from sealscope.parameters.load import rig_names
 from sealscope.signals.details import QUANTITIES

@@ -28,7 +28,7 @@ from sealscope.diagnosis.inference.changes.pressure_bands import MIN_OCTAVES, PA
 from sealscope.diagnosis.inference.circuit.holds.leaks import HeldLeaks
 from sealscope.diagnosis.inference.comparison.recording_sums import Resistance
 from sealscope.diagnosis.inference.equations.terms import LEAK
-from sealscope.diagnosis.rms_change.rms_blocks import DUTY
+from sealscope.diagnosis.rms_change.rms_detector import DUTY
 from sealscope.diagnosis.verdict.evidence import PRESSURE_RESPONSE, RMS_CHANGE, VOLUME_BALANCE
 from sealscope.errors import InputError
 from sealscope.signals.details import QUANTITIES

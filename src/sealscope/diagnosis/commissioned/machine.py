@@ -18,9 +18,8 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.assumed_rig import assumed_rig, infer_rig
 from sealscope.diagnosis.commissioned.cross_check import cross_check
-from sealscope.diagnosis.detectors.detector import log_failure, unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads, stored_surprisals
-from sealscope.diagnosis.detectors.registry import detectors
+from sealscope.diagnosis.detectors.registry import detectors, log_failure, unusable_reason
 from sealscope.diagnosis.diagnose import FALSE_ALARM_PROBABILITY, diagnose
 from sealscope.diagnosis.healthy import SummarisedRecording, Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording

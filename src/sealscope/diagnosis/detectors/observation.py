@@ -18,8 +18,7 @@ import numpy as np
 
 from sealscope.diagnosis.decision.case import step_key
 from sealscope.diagnosis.decision.null import HealthyNull, comparison_key, null_key
-from sealscope.diagnosis.detectors.detector import Detector, log_failure, unusable_reason, validate_report
-from sealscope.diagnosis.detectors.registry import detectors
+from sealscope.diagnosis.detectors.registry import Detector, detectors, log_failure, unusable_reason, validate_report
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
 from sealscope.diagnosis.inference.changes.features import SIGNALS, observe_signals
 from sealscope.diagnosis.inference.changes.healthy_levels import HealthyLevels

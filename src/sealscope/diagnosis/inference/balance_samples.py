@@ -1,6 +1,6 @@
 """Prepare the samples that volume balances read: mark clips and holes, derive the drive, leave out unknown flows.
 
-Called for whole recordings (`balance`, `circuit.without_position`), for each block of a stream (`block_stream`), and
+Called for whole recordings (`regimes`, `circuit.without_position`), for each block of a stream (`block_stream`), and
 for the curves of the workbench.
 """
 

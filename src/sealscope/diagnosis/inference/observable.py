@@ -1,6 +1,6 @@
 """Report of a detector on a recording: observables and measurements of the leak.
 
-An observable is the result of testing one quantity for a change. A detector (`detector.Detector`) estimates quantities
+An observable is the result of testing one quantity for a change. A detector (`registry.Detector`) estimates quantities
 from a recording, without a verdict or a threshold. `decision/events.toml` states what a change of each quantity means,
 and `decision.decide` weighs the reports.
 """

@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from sealscope.diagnosis.assumed_rig import assumed_rig
-from sealscope.diagnosis.detectors.detector import unusable_reason
 from sealscope.diagnosis.detectors.observation import limit_threads
+from sealscope.diagnosis.detectors.registry import unusable_reason
 from sealscope.diagnosis.estimate.interval import WITHIN_95
 from sealscope.diagnosis.healthy import Summary
 from sealscope.diagnosis.hold.hold_test import judge_held_recording
@@ -30,8 +30,7 @@ from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.inspection import inspect_recording
 from sealscope.diagnosis.priors.pressures import PRESSURE
 from sealscope.diagnosis.priors.trend import TREND
-from sealscope.diagnosis.rms_change.rms_blocks import JUDGED, measure_levels
-from sealscope.diagnosis.rms_change.rms_detector import RmsChange
+from sealscope.diagnosis.rms_change.rms_detector import JUDGED, RmsChange, measure_levels
 from sealscope.diagnosis.trend.wear import ScatterPrior
 from sealscope.diagnosis.verdict.machine_sizes import AssumedMachine
 from sealscope.errors import InputError

@@ -9,8 +9,11 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.linear import Gaussian
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.excess import marginal_difference, subtract_reference
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.recording_sums import (
+    RecordingSums,
+    marginal_difference,
+    subtract_reference,
+)
 from sealscope.diagnosis.inference.equations.terms import AIR, LEAK, ORIFICE
 from sealscope.diagnosis.inference.hypotheses import compare_residuals
 from sealscope.recordings.recording import Array

@@ -19,7 +19,7 @@ each width all z are normal about an unknown mean. These effects contribute to t
   Sessions are separated by date; undated recordings form one session.
 - Oil (`oil`): z has an uncertain slope in the temperature or in the viscous drop, so that a recording is the less
   certain the further its oil is from the mean; unknown oil is covered by tau.
-- Conditions (`conditions`): load and speed outside of the known range make a recording less certain.
+- Conditions (`find_unusual_conditions`): load and speed outside of the known range make a recording less certain.
 
 The rise follows the mixture over all of these. The priors are in `priors.toml`.
 
@@ -36,15 +36,15 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.population import NODES, Mixture, Population, number_sessions
 from sealscope.diagnosis.inference.blocks import ColumnRoles
-from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
-from sealscope.diagnosis.inference.comparison.excess import (
+from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
+from sealscope.diagnosis.inference.comparison.recording_sums import (
     ComparedColumns,
+    RecordingSums,
     coefficient_level,
     eliminate_unshared,
     estimate_leak_excess,
+    find_unusual_conditions,
 )
-from sealscope.diagnosis.inference.comparison.oil import OilHypothesis, oil_hypotheses
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
 from sealscope.diagnosis.inference.comparison.rise import Rise, rise_of_mixture
 from sealscope.diagnosis.inference.rows.weak_form import MAX_READING
 from sealscope.diagnosis.priors.inference import INFERENCE

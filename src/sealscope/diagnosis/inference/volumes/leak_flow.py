@@ -175,8 +175,8 @@ def fit_rise(
     """Fit a leak to the rise over healthy recordings and to the changes of the leakage within the recording.
 
     - `blocks`, `columns`: the volume balance and the roles of its columns; `leak`: likelihood of the leak's coefficient
-      in the blocks; `weights` (K,): weight of each block in the rise (`excess.block_weights`); `test`: step test
-      of the coefficient, None if the leak can only be older than the recording;
+      in the blocks; `weights` (K,): weight of each block in the rise (`block_weights`); `test`: step test of the
+      coefficient, None if the leak can only be older than the recording;
     - `rise`: mean rise of the coefficient over the recording [m^3/(s Pa)];
     - `laws`: for each law of `LAWS` the mean flow of an older leak for a rise of 1, and its log probability, up to
       a constant;

@@ -19,7 +19,6 @@ from sealscope.diagnosis.estimate.change import (
 )
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
-from sealscope.diagnosis.inference.balance import RegimeBlocks
 from sealscope.diagnosis.inference.balance_samples import derive_drive_signals
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
@@ -40,8 +39,7 @@ from sealscope.diagnosis.inference.circuit.holds.recorded_hold import (
     find_charge_pressure,
     find_locked_holds,
 )
-from sealscope.diagnosis.inference.comparison.excess import block_weights
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums, block_weights
 from sealscope.diagnosis.inference.delays import DelayChange, DelayTest
 from sealscope.diagnosis.inference.equations.balances import find_rest_limits
 from sealscope.diagnosis.inference.equations.feed import motions_of_side
@@ -51,7 +49,7 @@ from sealscope.diagnosis.inference.hypotheses import Valves
 from sealscope.diagnosis.inference.leak_law import find_leak_step, with_turbulence
 from sealscope.diagnosis.inference.machine_states import extend_rests, find_rests, flag_lowering
 from sealscope.diagnosis.inference.observable import Observable
-from sealscope.diagnosis.inference.regimes import fit_with_robust_covariance, rest_log_odds
+from sealscope.diagnosis.inference.regimes import RegimeBlocks, fit_with_robust_covariance, rest_log_odds
 from sealscope.diagnosis.inference.rows.weak_form import half_width
 from sealscope.diagnosis.inference.volumes.held_pump import estimate_pump_leakage
 from sealscope.diagnosis.inference.volumes.total import StateLoad, StateLoads, TotalFlow, estimate_total_flow
@@ -173,7 +171,7 @@ class RecordedBalance:
     def block_weights(self, healthy: Sequence[RecordingSums]) -> Array:
         """Compute the weights (K,) of `running_blocks` in the rise of the leakage over `healthy` recordings.
 
-        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`excess.block_weights`). The
+        A leak with the coefficient g_k in block k causes the rise sum_k w_k g_k (`recording_sums.block_weights`). The
         weights of all blocks have the sum 1.
         """
         grams = scale_grams(self.blocks, self.columns)

@@ -11,22 +11,23 @@ import numpy as np
 from sealscope.diagnosis.estimate.interval import Estimate
 from sealscope.diagnosis.estimate.population import ScatterPrior
 from sealscope.diagnosis.healthy import Healthy, Summary, healthy_summaries
-from sealscope.diagnosis.inference.balance import RecordedBlocks, RegimeBlocks, recorded_blocks
 from sealscope.diagnosis.inference.balance_samples import READ
 from sealscope.diagnosis.inference.block_stream import min_samples_for_step
 from sealscope.diagnosis.inference.blocks import ColumnRoles
 from sealscope.diagnosis.inference.circuit.without_position import cycle_balances, recorded_oil_loss_tests
-from sealscope.diagnosis.inference.comparison.conditions import find_unusual_conditions
-from sealscope.diagnosis.inference.comparison.excess import motion_change
 from sealscope.diagnosis.inference.comparison.levels import leak_deviations_from_mean, rise
-from sealscope.diagnosis.inference.comparison.recording_sums import RecordingSums
+from sealscope.diagnosis.inference.comparison.recording_sums import (
+    RecordingSums,
+    find_unusual_conditions,
+    motion_change,
+)
 from sealscope.diagnosis.inference.comparison.rise import Rise
 from sealscope.diagnosis.inference.equations.balances import circulation, equations, locked, shut_at_rest
 from sealscope.diagnosis.inference.equations.feed import HoldCounts
 from sealscope.diagnosis.inference.equations.terms import HOLDING, TURNING, Flow
 from sealscope.diagnosis.inference.hypotheses import PRIOR_ODDS, VALVES, MachineOdds, Valves
 from sealscope.diagnosis.inference.observable import Observable, Observed, compare_estimates
-from sealscope.diagnosis.inference.regimes import add_pump_columns
+from sealscope.diagnosis.inference.regimes import RecordedBlocks, RegimeBlocks, add_pump_columns, recorded_blocks
 from sealscope.diagnosis.inference.volumes.balance_leak import BalanceLeak
 from sealscope.diagnosis.inference.volumes.recorded import RecordedBalance
 from sealscope.diagnosis.inference.volumes.rivals import rival_rises
