@@ -21,7 +21,7 @@ def test_the_healthy_sign_counts_no_more_than_a_sensor_that_was_rewired() -> Non
 
 
 def test_the_odds_of_the_valves_add_up_within_what_one_recording_may_tell() -> None:
-    prior, limit, sure = INFERENCE.rest.valves, INFERENCE.rest.alone, INFERENCE.rest.locked
+    prior, limit, sure = INFERENCE.rest.shut_odds, INFERENCE.rest.single_odds_limit, INFERENCE.rest.sure_odds
     assert MachineOdds.from_healthy([{}], 1) == MachineOdds(flow_sign=np.zeros(1))
     doubtful = [{"shut_odds": 0.5}, {"shut_odds": -9.0}, {}]
     assert MachineOdds.from_healthy(doubtful, 1).valves == pytest.approx(prior + 0.5 - limit)

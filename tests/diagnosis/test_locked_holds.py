@@ -174,7 +174,7 @@ def test_the_faster_a_leak_equalises_the_pressures_the_less_its_size_is_known(ex
         leak = next(leak for leak in chambers.piston_fits if leak.exponent == exponent)
         errors.append(chambers.start_error(leak))
     held_s = HELD[1] - HELD[0]
-    assert errors[0] == pytest.approx(INFERENCE.held_oil.settles / held_s / len(chambers.holds) ** 0.5, rel=0.2)
+    assert errors[0] == pytest.approx(INFERENCE.held_oil.shutting_time / held_s / len(chambers.holds) ** 0.5, rel=0.2)
     assert errors[0] < errors[1] < errors[2]
     assert errors[2] > 0.3
 
@@ -273,10 +273,11 @@ def test_motion_that_may_be_of_the_other_side_says_little_of_the_ratio_of_the_ar
     """A press that moves at a bar or two: zeros of the sensors decide which side seems to carry."""
     unsure, unknown = log_area_ratio(1.0, 0.002, is_larger=True), log_area_ratio(0.0, 0.0, is_larger=True)
     prior = INFERENCE.held_oil
-    assert (unknown.value, unknown.deviation) == pytest.approx((prior.sides, prior.sides_deviation), rel=0.02)
-    assert 0.0 < unsure.value < prior.sides
-    assert unsure.deviation > 0.5 * prior.sides_deviation
-    assert log_area_ratio(0.0, 0.0, is_larger=False).value == pytest.approx(-prior.sides, rel=0.02)
+    expected = prior.log_area_ratio, prior.log_area_ratio_deviation
+    assert (unknown.value, unknown.deviation) == pytest.approx(expected, rel=0.02)
+    assert 0.0 < unsure.value < prior.log_area_ratio
+    assert unsure.deviation > 0.5 * prior.log_area_ratio_deviation
+    assert log_area_ratio(0.0, 0.0, is_larger=False).value == pytest.approx(-prior.log_area_ratio, rel=0.02)
 
 
 def test_a_hold_with_a_missing_sample_and_one_that_is_short_are_left_out() -> None:
@@ -395,7 +396,9 @@ def test_a_leak_and_the_oil_are_fitted_as_by_a_general_least_squares(seed: int) 
     column = lost_volumes(chambers, leak, 0.0)
     sums = np.append(column @ regression.regressors, column @ column)
     fit = fit_leak(regression, sums, chambers.n_readings)
-    deviations = np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    deviations = np.array(
+        [prior.deviation, prior.dead_volume_deviation, prior.dead_volume_deviation, prior.air_deviation]
+    )
     unit = np.sqrt(fit.variance)
     scale = np.linalg.norm(regression.displaced) / np.linalg.norm(column)
 
@@ -407,7 +410,7 @@ def test_a_leak_and_the_oil_are_fitted_as_by_a_general_least_squares(seed: int) 
         weights = np.sqrt(regression.inflation) / deviations
         return np.append((lost - numbers[0] * scale * column) / unit, numbers[1:] * weights)
 
-    least_dead = prior.least_dead / prior.dead - 1.0
+    least_dead = prior.least_dead_volume / prior.dead_volume - 1.0
     bounds = ([-np.inf, -np.inf, least_dead, least_dead, -np.inf], np.inf)
     oracle = least_squares(residuals, np.array([0.0, 0.0, 0.0, 0.0, 0.0]), bounds=bounds, xtol=1e-14, ftol=1e-14)
     deviation = math.hypot(fit.by_noise**0.5, fit.by_oil**0.5)
@@ -427,8 +430,10 @@ def test_the_least_squares_of_each_onset_are_those_within_the_limits_of_the_oil(
     columns = random.standard_normal((n_rows, n_onsets))
     sums = np.column_stack([columns.T @ regression.regressors, (columns**2).sum(axis=0)])
     scores = score_onsets(regression.onset_priors(variance=0.5, n_readings=n_readings), sums)
-    least_dead = prior.least_dead / prior.dead - 1.0
-    deviations = np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    least_dead = prior.least_dead_volume / prior.dead_volume - 1.0
+    deviations = np.array(
+        [prior.deviation, prior.dead_volume_deviation, prior.dead_volume_deviation, prior.air_deviation]
+    )
     least = np.expm1(-2.0 * deviations)  # of compressibility and air, whose changes are logarithms
     lowest = np.array([least[0], max(least_dead, least[1]), max(least_dead, least[2]), least[3], 0.0])
     left = regression.displaced - (strained + aired).sum(axis=1)

@@ -243,7 +243,7 @@ def test_a_hold_behind_valves_tells_a_leak_from_a_pump_that_differs_from_day_to_
     ]
     summaries = [detector.learn(recording) for recording in healthy]
     assert all(
-        summary is not None and min(summary["held_odds"], summary["shut_odds"]) > INFERENCE.rest.locked
+        summary is not None and min(summary["held_odds"], summary["shut_odds"]) > INFERENCE.rest.sure_odds
         for summary in summaries
     )
     for leak in (0.0, 5e-14):

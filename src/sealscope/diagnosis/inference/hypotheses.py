@@ -2,10 +2,10 @@
 
 | unknown | alternatives | prior (`priors.toml`) | evidence of a recording | here |
 | --- | --- | --- | --- | --- |
-| valves at rest | `Valves` | `rest.valves` | `regimes.shut_odds` | `VALVES` |
+| valves at rest | `Valves` | `rest.shut_odds` | `regimes.shut_odds` | `VALVES` |
 | sign of the recorded flow | right, reversed | equal | `rows.flow_sign` | `FLOW_SIGN` |
 | held load without a flow | creeps by leakage, a loop holds it | equal | `RecordedBalance.creep_log_odds` | `CREEP` |
-| flow at rest | circulates, holds the load | `feed.circulates` | `feed.flag_circulation` | `HoldCounts` |
+| flow at rest | circulates, holds the load | `feed.circulation_odds` | `feed.flag_circulation` | `HoldCounts` |
 | chambers that a pump feeds | both, one at a time, each by its displacement | `feed` | `feed.FeedSums.find_feed` | |
 | zero of p_A - p_B | near 0, any | `zero` | `pressure_offset` | |
 | law of a leak | exponent of its flow | `size.laminar` | `leak_law`, `comparison.laws` | `LAWS` |
@@ -90,9 +90,9 @@ _STEADY, _GROWING = INFERENCE.growth.steady, INFERENCE.growth.most * (np.arange(
 #: Prior probability of each relative growth of a leak from its onset to the recording's end; first that of none.
 GROWTHS: dict[float, float] = {0.0: _STEADY, **dict.fromkeys(_GROWING.tolist(), (1.0 - _STEADY) / len(_GROWING))}
 
-VALVES = Unknown(INFERENCE.rest.valves, each_limit=INFERENCE.rest.alone)
+VALVES = Unknown(INFERENCE.rest.shut_odds, each_limit=INFERENCE.rest.single_odds_limit)
 FLOW_SIGN = Unknown(total_limit=float(np.log(1.0 / INFERENCE.sense.rewired - 1.0)))
-CREEP = Unknown(each_limit=INFERENCE.rest.alone)
+CREEP = Unknown(each_limit=INFERENCE.rest.single_odds_limit)
 
 
 class MachineOdds(NamedTuple):
@@ -115,14 +115,14 @@ class MachineOdds(NamedTuple):
 
         `n_balances`: number of balances E of the judged recording; healthy recordings with another number tell nothing
         of the signs. `scatter_log_odds`: log odds of shut valves by the scatter of the healthy leakages. The valves
-        hold a load for certain if the mean log odds of all rests, or of the rests under load, exceed `rest.locked`
+        hold a load for certain if the mean log odds of all rests, or of the rests under load, exceed `rest.sure_odds`
         (`priors.toml`).
         """
         by_rests, by_holds, signs, creep, holds = (
             [summary[key] for summary in summaries if key in summary]
             for key in ("shut_odds", "held_odds", "sign_log_odds", "creep_odds", "holds")
         )
-        is_certain = any(odds and float(np.mean(odds)) > INFERENCE.rest.locked for odds in (by_rests, by_holds))
+        is_certain = any(odds and float(np.mean(odds)) > INFERENCE.rest.sure_odds for odds in (by_rests, by_holds))
         counts = np.sum([np.zeros(2), *holds], axis=0)
         return cls(
             valves=np.inf if is_certain else float(VALVES.add(by_rests)) + scatter_log_odds,

@@ -30,7 +30,7 @@ from sealscope.recordings.recording import Array
 from sealscope.signals.smoothing import average_over
 
 #: Averaging time of the speeds from which rests (standstills) are found, and minimum length of a rest [s].
-AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaged, INFERENCE.rest.least
+AVERAGING_TIME, MIN_REST = INFERENCE.rest.averaging_time, INFERENCE.rest.shortest
 #: Quantile of the magnitudes of speeds up to which they count in a mean: glitches are rarer than motion.
 SPEED_QUANTILE = 0.999
 #: Limit of a rest for a pump or piston that never counts as resting: no speed is below it.
@@ -130,7 +130,7 @@ def find_rests(
     return extend_flags(is_rest_start, min_length)
 
 
-def rest_limit(increments: Array, rate: float, fraction: float = INFERENCE.rest.share) -> float:
+def rest_limit(increments: Array, rate: float, fraction: float = INFERENCE.rest.flow_at_rest) -> float:
     """Compute the speed [m/s] or flow [m^3/s] v below which a piston or a pump counts as resting.
 
     It is the larger of two values: a `fraction` of the mean speed in motion, sum(v^2) / sum(abs(v)), and three standard
@@ -166,12 +166,12 @@ def _speed_and_noise(increments: Array, rate: float) -> tuple[float, float]:
 def extend_rests(rests: NDArray[np.bool_], flow: Array, rate: float) -> NDArray[np.bool_]:
     """Extend each rest of the pump back to the time at which its flow has fallen to half of its earlier level.
 
-    Rests are found by the mean flow over the time `rest.averaged` (`priors.toml`), and therefore begin too late, by at
-    most this time. `rests` (n,): flags of the sampling intervals in which the pump rests; `flow` (n,): flow of the pump
-    without the part that moves the piston [m^3/s], since valves do not hold a moving piston, NaN counting as 0; `rate`:
-    sampling rate [Hz].
+    Rests are found by the mean flow over the time `rest.averaging_time` (`priors.toml`), and therefore begin too late,
+    by at most this time. `rests` (n,): flags of the sampling intervals in which the pump rests; `flow` (n,): flow of
+    the pump without the part that moves the piston [m^3/s], since valves do not hold a moving piston, NaN counting as
+    0; `rate`: sampling rate [Hz].
     """
-    window = max(1, round(INFERENCE.rest.averaged * rate))
+    window = max(1, round(INFERENCE.rest.averaging_time * rate))
     magnitude, extended = np.nan_to_num(np.abs(flow)), rests.copy()
     for first, _ in find_runs(rests).tolist():
         earliest = max(first - window, 0)
@@ -194,7 +194,7 @@ def find_lowering_limits(pump_volume: Array, x: Array, pressure_difference: Arra
     np.nan_to_num(np.abs(load, out=load), copy=False)
     return LoweringLimits(
         pump=max_flow,
-        creep=_limit_of_rest(*speed_and_noise, rate, INFERENCE.rest.lowers),
+        creep=_limit_of_rest(*speed_and_noise, rate, INFERENCE.rest.lowering_speed),
         load=float(np.median(load)) if load.size else 0.0,
         noise=_limit_of_rest(*speed_and_noise, rate, fraction=0.0),
         time=len(load) / rate,
@@ -208,10 +208,10 @@ def flag_lowering(
 
     A valve then lowers a load past the pump, or connects the chambers of an actuator that is moved from outside. A leak
     is slower: it passes little of the pump's flow, and less at a smaller load. The piston must therefore be faster than
-    the fraction `rest.lowers` (`priors.toml`) of its mean speed in motion, on average over `MIN_REST`. The fraction is
-    reduced by the root, as the flow of an orifice, of abs(p_A - p_B) over its median while the pump turns; abs(p_A -
-    p_B) is the largest of the last `MIN_REST`. Pauses shorter than `rest.lasting` count as motion. The flags reach
-    `AVERAGING_TIME`, over which speeds are averaged, beyond either end.
+    the fraction `rest.lowering_speed` (`priors.toml`) of its mean speed in motion, on average over `MIN_REST`. The
+    fraction is reduced by the root, as the flow of an orifice, of abs(p_A - p_B) over its median while the pump turns;
+    abs(p_A - p_B) is the largest of the last `MIN_REST`. Pauses shorter than `rest.shortest_hold` count as motion. The
+    flags reach `AVERAGING_TIME`, over which speeds are averaged, beyond either end.
 
     `pump_volume` (n,): increments of the pump's volume [m^3], NaN where missing; `x` (n + 1,): position [m];
     `pressure_difference` (n,): p_A - p_B [Pa] in the middle of each sampling interval, which is overwritten; `rate`:
@@ -250,7 +250,7 @@ def flag_lowering(
     mean_excess, n_turning = (_window_sums(values, window) for values in (excess, is_turning))
     is_lowering = ~is_turning & (excess > 0.0) & extend_flags((mean_excess > 0.0) & (n_turning == 0), window)
     for first, length in find_runs(~is_lowering).tolist():
-        if length < INFERENCE.rest.lasting * rate and not is_turning[first : first + length].any():
+        if length < INFERENCE.rest.shortest_hold * rate and not is_turning[first : first + length].any():
             is_lowering[first : first + length] = True
     return extend_both_ways(is_lowering)
 
@@ -258,17 +258,18 @@ def flag_lowering(
 def find_holds(flow: Array, rate: float, min_limit: float = 0.0) -> NDArray[np.bool_]:
     """Flag the samples (n,) in which the piston is held, i.e. the flow has been near zero for the settling time.
 
-    The flow is averaged over `held.averaged` (`priors.toml`). It is near zero up to the fraction `held.slow` of its
-    largest value, or up to `min_limit` [m^3/s] if this is larger. The settling time is `held.settles`; before the first
-    sample the piston counts as held. `flow` (n,): flow [m^3/s], infinite where the piston is surely not held.
+    The flow is averaged over `held.averaging_time` (`priors.toml`). It is near zero up to the fraction
+    `held.held_speed` of its largest value, or up to `min_limit` [m^3/s] if this is larger. The settling time is
+    `held.settling_time`; before the first sample the piston counts as held. `flow` (n,): flow [m^3/s], infinite where
+    the piston is surely not held.
     """
     window, settling = (
-        max(1, round(INFERENCE.held.averaged * rate)),
-        max(1, round(INFERENCE.held.settles * rate)),
+        max(1, round(INFERENCE.held.averaging_time * rate)),
+        max(1, round(INFERENCE.held.settling_time * rate)),
     )  # [samples]
     mean_flow = np.abs(np.convolve(flow, np.full(window, 1.0 / window), "same"))
     is_finite = np.isfinite(mean_flow)
-    limit = max(INFERENCE.held.slow * mean_flow[is_finite].max(initial=0.0), min_limit)
+    limit = max(INFERENCE.held.held_speed * mean_flow[is_finite].max(initial=0.0), min_limit)
     is_moving = ~is_finite | (mean_flow > limit)
     n_moving = np.convolve(is_moving, np.ones(settling))[: flow.size]  # among the last `settling` samples
     return np.asarray(n_moving == 0)

@@ -162,9 +162,10 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
         (X'X)^-1 X'(y - Z b),    variance = White's variance + J cov(b) J' + k^2 sum (J_c b_c)^2,
 
     where J = d r/db is the first row of -(X'X)^-1 X'Z, and the sum is over the compliances c. This sum allows for a
-    relative error k = `rest.compliance` (`priors.toml`) of each compliance, which air in the oil makes larger at low
-    pressures. It vanishes if the pressures stay the same at rest, for example because a pump replaces the leaking oil.
-    The result is 0 if fewer than `MIN_STATE_BLOCKS` blocks are in motion or at rest, or if a variance is not positive.
+    relative error k = `rest.compliance_error` (`priors.toml`) of each compliance, which air in the oil makes larger at
+    low pressures. It vanishes if the pressures stay the same at rest, for example because a pump replaces the leaking
+    oil. The result is 0 if fewer than `MIN_STATE_BLOCKS` blocks are in motion or at rest, or if a variance is not
+    positive.
     """
     gram, left = blocks.gram[:, 0], roles.left
     turning, holding, moving_bias = (roles.names.index(name) for name in (TURNING, HOLDING, MOVING_BIAS))
@@ -189,7 +190,7 @@ def shut_odds(blocks: Blocks, roles: ColumnRoles) -> float:
     normal, coupling = total[np.ix_(rest_columns, rest_columns)], total[np.ix_(rest_columns, shared_columns)]
     sensitivity = -solve(normal, coupling)[0]  # derivatives of the leakage at rest by the shared coefficients
     by_compliance = (sensitivity * coefficients[shared])[np.isin(shared_columns, roles.compliance)]
-    rest_variance = float(rest_covariance[0, 0] + INFERENCE.rest.compliance**2 * (by_compliance @ by_compliance))
+    rest_variance = float(rest_covariance[0, 0] + INFERENCE.rest.compliance_error**2 * (by_compliance @ by_compliance))
     rest_variance += float(sensitivity @ covariance[np.ix_(shared, shared)] @ sensitivity)
     motion_variance = float(covariance[np.ix_(in_motion, in_motion)].sum())
     common = float(sensitivity @ covariance[np.ix_(shared, in_motion)].sum(axis=1))  # covariance of r and g
@@ -207,14 +208,14 @@ def rest_log_odds(rest: float, motion: float, *, rest_variance: float, differenc
 
         log odds = log N(r; rest_variance + (s g)^2) - log N(r - g; difference_variance + (w g)^2),
 
-    limited to +-`rest.most` (`priors.toml`). The variances are those of the errors of r and of r - g; s and w are the
-    prior scatters of r relative to g (`rest.shut` and `rest.open`). All leakages are conductances [m^3/(s Pa)], or all
-    are flows [m^3/s].
+    limited to +-`rest.odds_limit` (`priors.toml`). The variances are those of the errors of r and of r - g; s and w are
+    the prior scatters of r relative to g (`rest.leakage_if_shut` and `rest.scatter_if_open`). All leakages are
+    conductances [m^3/(s Pa)], or all are flows [m^3/s].
     """
     prior = INFERENCE.rest
-    if_shut = normal_log_density(rest, rest_variance + (prior.shut * motion) ** 2)
-    if_open = normal_log_density(rest - motion, difference_variance + (prior.open * motion) ** 2)
-    return float(np.clip(if_shut - if_open, -prior.most, prior.most))
+    if_shut = normal_log_density(rest, rest_variance + (prior.leakage_if_shut * motion) ** 2)
+    if_open = normal_log_density(rest - motion, difference_variance + (prior.scatter_if_open * motion) ** 2)
+    return float(np.clip(if_shut - if_open, -prior.odds_limit, prior.odds_limit))
 
 
 def fit_with_robust_covariance(gram: Array, columns: list[int], left: int) -> tuple[Array, Array]:
@@ -364,7 +365,7 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
 
     columns = ColumnRoles(stream_balances[0])
     odds = shut_odds(recorded, columns) if may_shut else 0.0
-    has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.lasting
+    has_holds = may_shut and _longest_hold(samples, recording.rate, balances[0]) >= INFERENCE.rest.shortest_hold
 
     def compute_regime_blocks(offset: float, valves: Valves) -> Blocks:
         """Compute the blocks after subtracting `offset` [Pa] from p_A - p_B, for these `valves` at rest."""
@@ -374,14 +375,16 @@ def recorded_blocks(recording: Recording, rig: Rig, healthy_holds: HoldCounts | 
     delays: dict[str, Any] = {"delay_changes": aligned.changes, "delay_tests": aligned.tests}
     # stated areas are exact, to within tolerances
     ratio_deviation: float = (
-        INFERENCE.size.area if rig.states("cylinder.A_A", "cylinder.A_B") else INFERENCE.held_oil.sides_deviation
+        INFERENCE.size.area
+        if rig.states("cylinder.A_A", "cylinder.A_B")
+        else INFERENCE.held_oil.log_area_ratio_deviation
     )
     open_blocks = partial(compute_regime_blocks, valves=Valves.OPEN)
     open_regime = _build_regime(balances, open_blocks, ratio_deviation)._replace(**delays)
     if not may_shut or not has_rests(recorded, columns):
         return RecordedBlocks(open_regime, None, 0.0, stream.sign_log_odds, holds)
     shut_balances = tuple(shut_at_rest(balance) for balance in balances)
-    shut = Valves.SURELY_SHUT if odds > INFERENCE.rest.locked else Valves.SHUT
+    shut = Valves.SURELY_SHUT if odds > INFERENCE.rest.sure_odds else Valves.SHUT
     shut_blocks = partial(compute_regime_blocks, valves=shut)
     shut_regime = _build_regime(shut_balances, shut_blocks, ratio_deviation)._replace(valves=Valves.SHUT, **delays)
     return RecordedBlocks(open_regime, shut_regime, odds, stream.sign_log_odds, holds)

@@ -183,34 +183,40 @@ class HeldOilPriors(PriorTable):
     compressibility: float
     deviation: float
     # dead volume over the recorded stroke's volume: usual value, smallest value, relative standard deviation
-    dead: float
-    least_dead: float
-    dead_deviation: float
+    dead_volume: float
+    least_dead_volume: float
+    dead_volume_deviation: float
     # logarithm of the piston areas' ratio, high pressure side over the other; its standard deviation
-    sides: float
-    sides_deviation: float
-    sides_told: float  # probability that the pressures tell which side carries the load, despite offsets of the sensors
-    unlike: float  # largest plausible ratio of the two piston areas
+    log_area_ratio: float
+    log_area_ratio_deviation: float
+    load_side_probability: (
+        float  # probability that the pressures tell which side carries the load, despite offsets of the sensors
+    )
+    largest_area_ratio: float  # largest plausible ratio of the two piston areas
     weight_of_holds: float  # probability that holds state a leak's flow right if the whole recording states another
     scatter: float  # relative standard deviation of a leak's flow in holds, beyond the errors of its fit
-    agrees: float  # ratio of the conductances from holds and whole recording, the standard deviation of its logarithm
+    agreement: (
+        float  # ratio of the conductances from holds and whole recording, the standard deviation of its logarithm
+    )
     significance: float  # p-value below which a rise of the leakage in the holds counts for the flow of the leak
-    settles: float  # [s] time in which valves shut
-    before: float  # [s] time before a hold in which the flow shows the leakage of the pump
+    shutting_time: float  # [s] time in which valves shut
+    time_before: float  # [s] time before a hold in which the flow shows the leakage of the pump
     pump_session: float  # relative standard deviation of this leakage between sessions with the same oil
     shortest: float  # [s] shortest hold
-    equalises: float  # [s] time in which a leak equalises the pressures of a hold
-    loaded: float  # log odds from which a pressure difference is surely a load, not an offset of the sensors
-    independent: float  # number of independent readings of one side in a hold
+    equalising_time: float  # [s] time in which a leak equalises the pressures of a hold
+    load_odds: float  # log odds from which a pressure difference is surely a load, not an offset of the sensors
+    independent_readings: float  # number of independent readings of one side in a hold
     misfit: float  # fraction of the compressed volume that this model of the oil does not describe
-    from_start: float  # fraction of the leaks that exist from the start of a recording
+    share_from_start: float  # fraction of the leaks that exist from the start of a recording
     gain: float  # relative difference between the gains of two pressure sensors
-    charge: float  # above the charge pressure by this fraction of it and `resolved`, no check valve feeds a side
-    tank: float  # [Pa] gauge pressure in a line to the tank, a standard deviation
-    open: float  # probability that the side without the load is open to the charge line
-    above: float  # usual fraction of a hold in which an open side is above the charge pressure
-    resolved: float  # [Pa] difference of pressures that a sensor hardly resolves
-    steady: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
+    charge_margin: (
+        float  # above the charge pressure by this fraction of it and `resolution`, no check valve feeds a side
+    )
+    tank_pressure: float  # [Pa] gauge pressure in a line to the tank, a standard deviation
+    open_probability: float  # probability that the side without the load is open to the charge line
+    time_above_charge: float  # usual fraction of a hold in which an open side is above the charge pressure
+    resolution: float  # [Pa] difference of pressures that a sensor hardly resolves
+    averaging_time: float  # [s] time over which a pressure is averaged before it is compared with the charge pressure
     # volume fraction of free air in the oil, and the standard deviation of its logarithm
     air: float
     air_deviation: float
@@ -241,47 +247,51 @@ class HealthyPriors(PriorTable):
 class HeldPriors(PriorTable):
     """A piston without a recorded position, which a control loop holds or returns."""
 
-    half: float  # [s] half the width of a test function (weight of samples in one equation) of a held piston
-    settles: float  # [s] time in which pressures settle after a motion
-    slow: float  # largest speed of a held piston over its highest speed
-    averaged: float  # [s] time over which the speed is averaged
-    share: float  # smallest leakage of a pump over its mean flow
-    elsewhere: float  # fraction of a test function's weight in which noise may change the sign of p_A - p_B
-    creep: float  # [m/s] largest speed of a load that shut valves hold
+    half_width: float  # [s] half the width of a test function (weight of samples in one equation) of a held piston
+    settling_time: float  # [s] time in which pressures settle after a motion
+    held_speed: float  # largest speed of a held piston over its highest speed
+    averaging_time: float  # [s] time over which the speed is averaged
+    least_leakage: float  # smallest leakage of a pump over its mean flow
+    ambiguous_share: float  # fraction of a test function's weight in which noise may change the sign of p_A - p_B
+    creep_speed: float  # [m/s] largest speed of a load that shut valves hold
 
 
 class FeedPriors(PriorTable):
     """Chambers that a pump feeds."""
 
-    one: float  # log odds, before any recording, that the pump feeds one chamber at a time
-    asymmetric: float  # the same, that the flows of an asymmetric pump have the ratio of the piston areas
-    sided: float  # [Pa] magnitude of p_A - p_B from which it tells the side whose area the pump's flow moves
+    one_chamber_odds: float  # log odds, before any recording, that the pump feeds one chamber at a time
+    asymmetric_odds: float  # the same, that the flows of an asymmetric pump have the ratio of the piston areas
+    side_pressure: float  # [Pa] magnitude of p_A - p_B from which it tells the side whose area the pump's flow moves
     scatter: float  # relative scatter of the ratio of flow to speed in either direction, a standard deviation
     # of a pump that turns while the piston rests
-    circulates: float  # log odds, before any recording, that its flow circulates to the tank
-    held: float  # mean flow if it holds the load, over that in motion: the median of a log-normal distribution
+    circulation_odds: float  # log odds, before any recording, that its flow circulates to the tank
+    holding_flow: float  # mean flow if it holds the load, over that in motion: the median of a log-normal distribution
     spread: float  # standard deviation of the logarithm of this fraction
 
 
 class RestPriors(PriorTable):
     """A pump at rest, from which valves may cut off the cylinder; flows are divided by the mean flow in motion."""
 
-    averaged: float  # [s] time over which the flow is averaged
-    least: float  # [s] shortest rest
-    share: float  # largest flow at rest, averaged over `averaged`
-    lasting: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
-    holding: float  # mean flow of a pump that holds a load
+    averaging_time: float  # [s] time over which the flow is averaged
+    shortest: float  # [s] shortest rest
+    flow_at_rest: float  # largest flow at rest, averaged over `averaging_time`
+    shortest_hold: float  # [s] shortest time for which a pump that turns slowly is taken to hold a load
+    holding_flow: float  # mean flow of a pump that holds a load
     # smallest mean flow of a block in motion; also the largest flow of a meter, or speed over the mean speed, at rest
     motion_fraction: float
-    lowers: float  # smallest speed at the mean load, over the mean speed, of a piston that passes a resting pump
-    shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
-    open: float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
-    compliance: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation
+    lowering_speed: (
+        float  # smallest speed at the mean load, over the mean speed, of a piston that passes a resting pump
+    )
+    leakage_if_shut: float  # leakage at rest over that in motion if valves cut the pump off, a standard deviation
+    scatter_if_open: (
+        float  # relative difference of the leakage at rest and in motion if no valve shuts, a standard deviation
+    )
+    compliance_error: float  # relative error of a compliance at rest that is fitted in motion, a standard deviation
     # log odds that valves cut the pump off
-    valves: float  # before any recording
-    most: float  # limit of the log odds that the rests of a recording give
-    alone: float  # narrower limit, for the judged recording alone and in sums over healthy recordings
-    locked: float  # mean over the healthy recordings above which the valves surely hold the pressures
+    shut_odds: float  # before any recording
+    odds_limit: float  # limit of the log odds that the rests of a recording give
+    single_odds_limit: float  # narrower limit, for the judged recording alone and in sums over healthy recordings
+    sure_odds: float  # mean over the healthy recordings above which the valves surely hold the pressures
 
 
 class InferencePriors(PriorTable):

@@ -57,8 +57,8 @@ def recognise_circuit(rig: Rig, recordings: Sequence[Recording]) -> str | None:
 
     odds = {
         "closed": 0.0,
-        OPEN_CIRCUIT.value: log_odds(INFERENCE.feed.one, open_circuit_log_factor),
-        ASYMMETRIC_CIRCUIT.value: log_odds(INFERENCE.feed.asymmetric, asymmetric_pump_log_factor),
+        OPEN_CIRCUIT.value: log_odds(INFERENCE.feed.one_chamber_odds, open_circuit_log_factor),
+        ASYMMETRIC_CIRCUIT.value: log_odds(INFERENCE.feed.asymmetric_odds, asymmetric_pump_log_factor),
     }
     return max(odds, key=odds.__getitem__)
 
@@ -130,15 +130,15 @@ def asymmetric_pump_log_factor(equation: Equation, signals: Signals) -> float:
         r = log(a_A / (1 + k_A)) - log(a_B / (1 + k_B)),
 
     a closed circuit has r = log(A_A / A_B), an asymmetric pump r = 0. The variance of r is `feed.scatter`^2, and those
-    of a and k. Motion has the weight 1 - exp(-dp^2 / (2 s^2)), with s = `feed.sided`; the rest of it gets an a of its
-    own. The result is 0 unless the piston moves under both loads and the flow has both signs, or if the displacement is
-    not that of a pump.
+    of a and k. Motion has the weight 1 - exp(-dp^2 / (2 s^2)), with s = `feed.side_pressure`; the rest of it gets an a
+    of its own. The result is 0 unless the piston moves under both loads and the flow has both signs, or if the
+    displacement is not that of a pump.
     """
     oil, terms, step = INFERENCE.held_oil, {term.name: term for term in equation.terms}, signals.step("x")
     if not ("theta" in signals or "omega" in signals):
         return 0.0
     by_A = interval_means(signals.carried_by_A)
-    certainty = -np.expm1(-0.5 * (signals.pressure_difference / INFERENCE.feed.sided) ** 2)
+    certainty = -np.expm1(-0.5 * (signals.pressure_difference / INFERENCE.feed.side_pressure) ** 2)
     motions = [certainty * by_A * step, certainty * (1.0 - by_A) * step, (1.0 - certainty) * step]
     further_columns = [terms[name].increments(signals) for name in (LEAK, BIAS, LAG)]
     # rises of pressure while x grows, if A grows with x, and the position
@@ -161,7 +161,7 @@ def asymmetric_pump_log_factor(equation: Equation, signals: Signals) -> float:
     variances = OVERLAP * np.var(volume - columns @ fitted[:, 2]) * np.diag(inverse)[:2]
     variance = INFERENCE.feed.scatter**2 + float((variances / flow_per_speed**2).sum())
     low, high = np.nanquantile(signals["x"], (_END_QUANTILE, 1.0 - _END_QUANTILE))
-    dead, ratio = oil.dead * (high - low), float(np.log(flow_per_speed[0] / flow_per_speed[1]))
+    dead, ratio = oil.dead_volume * (high - low), float(np.log(flow_per_speed[0] / flow_per_speed[1]))
     for side, (rise, sign) in enumerate(((rise_A, 1.0), (rise_B, -1.0))):
         stiffness = fitted[side, side]  # dp/dx
         weights = np.abs(columns[:, side] * rise)
@@ -170,7 +170,7 @@ def asymmetric_pump_log_factor(equation: Equation, signals: Signals) -> float:
         length = dead + (position - low if sign * stiffness > 0.0 else high - position)
         compressed = oil.compressibility * length * abs(stiffness)
         ratio -= sign * float(np.log1p(compressed))
-        relative_variance = oil.deviation**2 + (oil.dead_deviation * dead / length) ** 2
+        relative_variance = oil.deviation**2 + (oil.dead_volume_deviation * dead / length) ** 2
         variance += relative_variance * (compressed / (1.0 + compressed)) ** 2
     in_closed_circuit = -float(np.log(equation.area_ratio))
     return ((ratio - in_closed_circuit) ** 2 - ratio**2) / (2.0 * variance)

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 
 _PRIORS = INFERENCE.held
 #: Half-width of the test functions over holds [s].
-HOLD_HALF_WIDTH: float = _PRIORS.half
+HOLD_HALF_WIDTH: float = _PRIORS.half_width
 #: Channels that these balances read: none of their terms needs the pressures at the ports.
 _READ = tuple(name for name in READ if name not in ("p_1", "p_2"))
 
@@ -104,7 +104,7 @@ def cycle_balances(recording: Recording, rig: Rig) -> list[CycleBalance]:
     # behind shut valves the piston is held while the command is constant; a control loop may hold it at any command
     may_hold = is_known & (signals.step("u") == 0.0) if is_locked and "u" in channels else is_known
     # fastest flow of a piston that creeps behind shut valves; a flow up to this limit counts as a hold
-    max_creep = _PRIORS.creep * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
+    max_creep = _PRIORS.creep_speed * max(rig.cylinder.A_A, rig.cylinder.A_B) if is_locked else 0.0
     is_held = is_known & find_holds(np.where(may_hold, flow, np.inf), recording.rate, min_limit=max_creep)
     if is_locked and "u" not in channels and not is_held.all():
         first_motion = int(np.argmin(is_held))
@@ -137,7 +137,7 @@ def _build_blocks(
     if one_sided:
         # weighted fraction of each row's window in which A has the higher pressure; the rows are rates, hence `/ rate`
         share_A = _integrate_rows([signals.carried_by_A[1:] / rate], is_used, half_width, rate).values[:, 0]
-        rows = rows._replace(whole=rows.whole & (np.minimum(share_A, 1.0 - share_A) < _PRIORS.elsewhere))
+        rows = rows._replace(whole=rows.whole & (np.minimum(share_A, 1.0 - share_A) < _PRIORS.ambiguous_share))
     # rows are half of `half_width` apart; a block has the rows of one cycle (`half_width`) or, for holds and shorter
     # cycles, of `MAX_BLOCK_TIME`
     rows_per_block = 2 if half_width > HOLD_HALF_WIDTH else round(2.0 * MAX_BLOCK_TIME / half_width)

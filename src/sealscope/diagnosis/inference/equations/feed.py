@@ -167,20 +167,20 @@ class HoldCounts(NamedTuple):
 
     @classmethod
     def measure(cls, is_held: NDArray[np.bool_], circulates: NDArray[np.bool_], rate: float) -> HoldCounts:
-        """Count the holds that last for `rest.lasting` (`priors.toml`) or longer.
+        """Count the holds that last for `rest.shortest_hold` (`priors.toml`) or longer.
 
         `is_held`, `circulates` (n - 1,): flags of the sampling intervals, the latter by `flag_circulation`; `rate`:
         sampling rate [Hz].
         """
-        min_length = INFERENCE.rest.lasting * rate
+        min_length = INFERENCE.rest.shortest_hold * rate
         runs = find_runs(is_held).tolist()
         states = [bool(circulates[first]) for first, length in runs if length >= min_length]
         return cls(connected=states.count(False), circulating=states.count(True))
 
     @property
     def log_odds(self) -> float:
-        """Log odds that the flow circulates in a further hold; those of `feed.circulates` count as one hold."""
-        share = 1.0 / (1.0 + np.exp(-INFERENCE.feed.circulates))
+        """Log odds that the flow circulates in a further hold; those of `feed.circulation_odds` count as one hold."""
+        share = 1.0 / (1.0 + np.exp(-INFERENCE.feed.circulation_odds))
         return float(np.log((self.circulating + share) / (self.connected + 1.0 - share)))
 
 
@@ -192,12 +192,11 @@ def flag_circulation(
     Valves of an open circuit may be in neutral while the pump turns and the piston rests. Otherwise the pump holds the
     load, and its flow is what leaks and compresses the oil. The two are told apart for each hold by its mean flow, as a
     fraction f of that in motion. A flow that circulates has any fraction up to 1. That of a pump that holds the load is
-    a log-normal one, with the median `feed.held` and the spread `feed.spread` (`priors.toml`); or, with the probability
-    `size.present`, it has any fraction up to 1 as well, since a leak stalls the piston. The log odds of a flow that
-    circulates are those of `healthy_holds`, the holds of the healthy recordings. Holds that are shorter than
-    `rest.lasting`, in which a pump builds up a pressure, have no leak and the prior odds. Nothing is flagged if f is
-    unknown.
-    Each block of a stream judges a hold by the part of it that the block's samples contain. `mean_flow`:
+    a log-normal one, with the median `feed.holding_flow` and the spread `feed.spread` (`priors.toml`); or, with the
+    probability `size.present`, it has any fraction up to 1 as well, since a leak stalls the piston. The log odds of a
+    flow that circulates are those of `healthy_holds`, the holds of the healthy recordings. Holds that are shorter than
+    `rest.shortest_hold`, in which a pump builds up a pressure, have no leak and the prior odds. Nothing is flagged if f
+    is unknown. Each block of a stream judges a hold by the part of it that the block's samples contain. `mean_flow`:
     `FeedSums.mean_flow`.
     """
     prior, healthy_log_odds = INFERENCE.feed, (healthy_holds or HoldCounts()).log_odds
@@ -211,10 +210,10 @@ def flag_circulation(
         if not flow_held.any():
             continue
         fraction = float(flow_held.mean()) / mean_flow
-        deviation = np.log(fraction / prior.held) / prior.spread
+        deviation = np.log(fraction / prior.holding_flow) / prior.spread
         density = np.exp(-0.5 * deviation**2) / (fraction * prior.spread * np.sqrt(2.0 * np.pi))
-        is_lasting = length >= INFERENCE.rest.lasting * signals.rate
-        leaks, log_odds = (INFERENCE.size.present, healthy_log_odds) if is_lasting else (0.0, prior.circulates)
+        is_lasting = length >= INFERENCE.rest.shortest_hold * signals.rate
+        leaks, log_odds = (INFERENCE.size.present, healthy_log_odds) if is_lasting else (0.0, prior.circulation_odds)
         # the density of f is 1 if the flow circulates or leaks, also for a few f above 1
         circulates[hold] = log_odds - np.log(max((1.0 - leaks) * density + leaks, np.finfo(float).tiny)) > 0.0
     return circulates

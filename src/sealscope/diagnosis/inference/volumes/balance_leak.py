@@ -387,7 +387,7 @@ class BalanceLeak(LeakMeasure):
         rise_after = None if leaks is None else held_rise(sums, self.healthy)
         if rise_after is not None:
             # after the onset the holds show the whole step; `agrees`: standard deviation of log(rise / step)
-            return LeakRise(total_rise, rise_after.log_ratio(step.fitted.value, INFERENCE.held_oil.agrees))
+            return LeakRise(total_rise, rise_after.log_ratio(step.fitted.value, INFERENCE.held_oil.agreement))
         is_after = balance.running_blocks.time >= step.onset().value
         # the weight of a block may be negative
         mean_rise = step.fitted.value * float(np.clip(self._block_weights[is_after].sum(), 0.0, 1.0))

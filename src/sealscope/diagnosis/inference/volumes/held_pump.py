@@ -1,7 +1,7 @@
 """Leakage of a pump that is still connected to a loaded cylinder, just before shut valves take over the load.
 
 A press builds up its pressure, the pump maintains it for some tenths of a second, and then the valves shut. In this
-time nearly all of the pump's flow q leaks. In the time `held_oil.before` (`priors.toml`) before each hold,
+time nearly all of the pump's flow q leaks. In the time `held_oil.time_before` (`priors.toml`) before each hold,
 
     q = G (p_A - p_B) + A v + C d(p_A - p_B)/dt,
 
@@ -46,7 +46,7 @@ def estimate_pump_leakage(
     is_known = np.isfinite(flow) & np.isfinite(speed) & np.isfinite(pressure_rate)
     windows, last_end = [], -np.inf
     for hold in holds:
-        begin = max(last_end, hold.t[0] - INFERENCE.held_oil.before)  # not within the previous hold
+        begin = max(last_end, hold.t[0] - INFERENCE.held_oil.time_before)  # not within the previous hold
         first, last = int(np.searchsorted(t, begin, side="right")), int(np.searchsorted(t, hold.t[0]))
         samples = first + np.flatnonzero(is_known[first:last])
         windows.append(samples[:: max(1, int(rate / MAX_RATE))])

@@ -326,18 +326,19 @@ class RecordedBalance:
     def _is_pump_off(self, hold: LockedHold) -> bool:
         """Return True if the pump's mean flow in a hold is probably too small to hold the load, False if it is missing.
 
-        To hold a load, a pump is assumed to deliver the fraction `rest.holding` (`priors.toml`) of its flow in motion.
+        To hold a load, a pump is assumed to deliver the fraction `rest.holding_flow` (`priors.toml`) of its flow in
+        motion.
         """
         recording = self.recording
         # time in which the pump's flow may still fall: the first interval, and the longest extension by `extend_rests`
-        falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaged
+        falling = hold.t[hold.edges[1]] - hold.t[0] + INFERENCE.rest.averaging_time
         begin, end = np.searchsorted(recording.t, [hold.t[0] + falling, hold.t[-1]])
         flow = self._pumped[begin:end] * recording.rate
         flow = flow[np.isfinite(flow)]
         if not flow.size:
             return False
         variance = float(flow.var()) / flow.size  # variance of the mean flow
-        holding_flow = INFERENCE.rest.holding * self.blocks.moving_flow  # counts as exact
+        holding_flow = INFERENCE.rest.holding_flow * self.blocks.moving_flow  # counts as exact
         log_odds = rest_log_odds(
             abs(float(flow.mean())), holding_flow, rest_variance=variance, difference_variance=variance
         )
@@ -351,11 +352,11 @@ class RecordedBalance:
         """
         oil, t = INFERENCE.held_oil, self.recording.t
         # just before the hold the pump stops and the valves shut
-        first, last = np.searchsorted(t, hold.t[0] - np.array([oil.settles, 0.0]))
+        first, last = np.searchsorted(t, hold.t[0] - np.array([oil.shutting_time, 0.0]))
         before = slice(first, last + 1)
         difference_before = np.nanmedian(np.abs(self.recording["p_A"][before] - self.recording["p_B"][before]))
         pressure = float(np.nanmax([np.abs(hold.mean(hold.p_A - hold.p_B)).max(), difference_before]))
-        return float(self._load_log_odds(np.array([pressure]))[0]) > oil.loaded
+        return float(self._load_log_odds(np.array([pressure]))[0]) > oil.load_odds
 
     def _load_log_odds(self, pressure: Array) -> Array:
         """Compute the log odds (n,) that a load causes abs(p_A - p_B) = `pressure` (n,) [Pa], not a sensor offset.
@@ -401,7 +402,7 @@ class RecordedBalance:
         lows, highs = zip(stroke, self.known_stroke or stroke, strict=True)
         low, high = min(lows), max(highs)
         (area_A, deviation_A), (area_B, deviation_B) = self._signed_areas()
-        max_area_ratio: float = INFERENCE.held_oil.unlike
+        max_area_ratio: float = INFERENCE.held_oil.largest_area_ratio
         if not (area_A and high > low and 1.0 / max_area_ratio < area_A / area_B < max_area_ratio):
             return None
         return CylinderSides(area_A, area_B, low, high, deviation_A, deviation_B)
@@ -460,7 +461,7 @@ class RecordedBalance:
         recording = self.recording
         difference = recording["p_A"] - recording["p_B"] - self.pressure_offset
         speed = Signals(dict(recording.channels), recording.rate).speed
-        is_load = self._load_log_odds(np.abs(difference)) > INFERENCE.held_oil.loaded
+        is_load = self._load_log_odds(np.abs(difference)) > INFERENCE.held_oil.load_odds
         shares = []
         for is_loaded in (difference > 0.0, difference <= 0.0):  # A, B
             squares = np.where(is_loaded & np.isfinite(speed * difference), speed**2, 0.0)
@@ -626,7 +627,10 @@ class RecordedBalance:
         A loop replaces the oil that leaks: the piston displaces hardly any flow, not that of a typical machine's
         leakage. The result is 0 if the recording does not determine the flow.
         """
-        holding_flow, roles = INFERENCE.rest.holding * self.mean_flow, self.columns[0]  # [m^3/s] of typical leakage
+        holding_flow, roles = (
+            INFERENCE.rest.holding_flow * self.mean_flow,
+            self.columns[0],
+        )  # [m^3/s] of typical leakage
         # conductance: displaced volume over the integral of p_A - p_B, the chambers' compliance being neglected
         conductance, conductance_variance = fit_with_robust_covariance(self.blocks.gram[:, 0], [roles.leak], roles.left)
         flow = float(conductance[0]) * self.mean_pressure()
@@ -653,19 +657,19 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
     `measured`: fitted ratio, without information if it is not positive; the area of the second side is well known. Only
     a fraction w of the motion that was attributed to the first side belongs to it, and the rest to the second side.
     Thus log `measured` = w r, with the standard error `size.area` (`priors.toml`). The unknown w is 1 with the
-    probability `held_oil.sides_told`; otherwise log w is uniform between 0 and log `loaded_share`, the fraction of that
-    motion in which the first side surely carries the load. r is normal about `held_oil.sides` if the first side is
-    probably the larger one (`is_larger`), else about minus this value, with the standard deviation
-    `held_oil.sides_deviation`.
+    probability `held_oil.load_side_probability`; otherwise log w is uniform between 0 and log `loaded_share`, the
+    fraction of that motion in which the first side surely carries the load. r is normal about `held_oil.log_area_ratio`
+    if the first side is probably the larger one (`is_larger`), else about minus this value, with the standard deviation
+    `held_oil.log_area_ratio_deviation`.
     """
     prior = INFERENCE.held_oil
-    mean, deviation = prior.sides if is_larger else -prior.sides, prior.sides_deviation
+    mean, deviation = prior.log_area_ratio if is_larger else -prior.log_area_ratio, prior.log_area_ratio_deviation
     ratios = mean + np.linspace(-4.0, 4.0, N_RATIOS) * deviation
     log_weights = np.broadcast_to(-0.5 * ((ratios - mean) / deviation) ** 2, (N_SHARES, N_RATIOS))
     if measured > 0.0:
         shares = np.geomspace(max(loaded_share, MIN_SHARE), 1.0, N_SHARES)
-        share_weights = np.full(N_SHARES, (1.0 - prior.sides_told) / N_SHARES)
-        share_weights[-1] += prior.sides_told  # w = 1
+        share_weights = np.full(N_SHARES, (1.0 - prior.load_side_probability) / N_SHARES)
+        share_weights[-1] += prior.load_side_probability  # w = 1
         misfit = (np.log(measured) - np.outer(shares, ratios)) / INFERENCE.size.area
         log_weights = log_weights + np.log(share_weights)[:, None] - 0.5 * misfit**2
     weights = np.exp(log_weights - log_weights.max()).sum(axis=0)

@@ -11,10 +11,10 @@ All coefficients of the volume balance are constants of the recording here. A dr
 a leakage that the machine shows at a few moments only, as a press does while it builds up its pressure. The covariance
 of the fit is the larger of two: that of equal, independent errors of the rows, and that of errors which differ from
 block to block and are correlated between neighbours. The conductances while the pump moves the piston and while it
-holds a load differ by the relative standard deviation `rest.open` (`priors.toml`); a leak that begins within the
-recording adds one conductance to all states. Conductances are measured at the pressures at which they show. Where these
-differ from the others, the fraction `healthy.turbulent` of a leakage that flows as through an orifice makes the total
-uncertain. Terms and rows leave some flow unexplained, the fraction `total.misfit` of the pump's flow.
+holds a load differ by the relative standard deviation `rest.scatter_if_open` (`priors.toml`); a leak that begins within
+the recording adds one conductance to all states. Conductances are measured at the pressures at which they show. Where
+these differ from the others, the fraction `healthy.turbulent` of a leakage that flows as through an orifice makes the
+total uncertain. Terms and rows leave some flow unexplained, the fraction `total.misfit` of the pump's flow.
 
 Source: W. K. Newey, K. D. West, Econometrica 55 (1987) 703 (covariance of correlated errors).
 """
@@ -212,6 +212,6 @@ def _prior_precision(roles: ColumnRoles, total: Array, columns: list[int], state
         common = data.transform(joint).mean[pair[0] - (pair[1] < pair[0])]
         difference = np.zeros(len(columns))
         difference[pair] = 1.0, -1.0
-        deviation = max(INFERENCE.rest.open * abs(float(common)), _TINY**0.25)
+        deviation = max(INFERENCE.rest.scatter_if_open * abs(float(common)), _TINY**0.25)
         precision += np.outer(difference, difference) * variance / deviation**2
     return precision

@@ -58,9 +58,9 @@ def compensates_leakage(balance: RecordedBalance) -> bool:
     """Return True if the pump replaces the oil that leaks, as a control loop holds the piston or returns it.
 
     The balance then shows at least the leakage of the pump itself: the lower end of the 95 % interval of the leakage
-    must exceed the fraction `held.share` (`priors.toml`) of the pump's mean flow.
+    must exceed the fraction `held.least_leakage` (`priors.toml`) of the pump's mean flow.
     """
-    min_fraction: float = INFERENCE.held.share
+    min_fraction: float = INFERENCE.held.least_leakage
     return balance.conductance.low * balance.mean_pressure() > min_fraction * balance.mean_flow
 
 

@@ -127,7 +127,7 @@ class HeldChambers:
     @property
     def n_readings(self) -> float:
         """Effective number of independent readings (means of neighbouring samples) of both sides in all holds."""
-        independent: float = INFERENCE.held_oil.independent
+        independent: float = INFERENCE.held_oil.independent_readings
         return independent * 2.0 * len(self.holds)
 
     @cached_property
@@ -173,37 +173,40 @@ class HeldChambers:
     def _supply_log_prior(self, supplies: SideSupplies, *, drains: bool) -> float:
         """Compute the log prior of the sides' supplies; `drains`: true if the side without the load gains oil.
 
-        An open side has the probability `held_oil.open` (`priors.toml`), any other choice 1 minus this. This side is
-        above the charge pressure, by more than the back pressure `held_oil.tank` of its line, only while it empties:
-        for the fraction a = `held_oil.above` of a hold. Each hold with a larger fraction f multiplies the probability
-        by exp(-(f - a) / a). If both have check valves, a side that gains oil drains to the tank: the charge pressure
-        is then that of a tank line, which is normal about 0 gauge with the standard deviation `held_oil.tank`.
+        An open side has the probability `held_oil.open_probability` (`priors.toml`), any other choice 1 minus this.
+        This side is above the charge pressure, by more than the back pressure `held_oil.tank_pressure` of its line,
+        only while it empties: for the fraction a = `held_oil.time_above_charge` of a hold. Each hold with a larger
+        fraction f multiplies the probability by exp(-(f - a) / a). If both have check valves, a side that gains oil
+        drains to the tank: the charge pressure is then that of a tank line, which is normal about 0 gauge with the
+        standard deviation `held_oil.tank_pressure`.
         """
         prior = INFERENCE.held_oil
         if SideSupply.OPEN in supplies:
             return self._open_log_prior
-        log_prior = math.log1p(-prior.open)
+        log_prior = math.log1p(-prior.open_probability)
         if drains and supplies == BOTH:
-            log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank) ** 2
+            log_prior -= 0.5 * ((self.charge - P_ATM) / prior.tank_pressure) ** 2
         return log_prior
 
     @cached_property
     def _open_log_prior(self) -> float:
         """Log prior of an open unloaded side (`_supply_log_prior`)."""
         prior, is_A = INFERENCE.held_oil, self._unloaded_open[0] is SideSupply.OPEN
-        above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank) for hold in self.holds]
-        excess = [max(float(flags.mean()) - prior.above, 0.0) for flags in above]  # in each hold
-        return math.log(prior.open) - sum(excess) / prior.above
+        above = [self._is_closed(hold, hold.p_A if is_A else hold.p_B, prior.tank_pressure) for hold in self.holds]
+        excess = [max(float(flags.mean()) - prior.time_above_charge, 0.0) for flags in above]  # in each hold
+        return math.log(prior.open_probability) - sum(excess) / prior.time_above_charge
 
     def _is_closed(self, hold: LockedHold, p: Array, back_pressure: float = 0.0) -> NDArray[np.bool_]:
         """Flag the samples (n,) of a hold in which no check valve refills a chamber.
 
         The averaged absolute pressure `p` (n,) [Pa] then exceeds the charge pressure by a relative and an absolute
-        margin, `held_oil.charge` and `held_oil.resolved` (`priors.toml`), and by `back_pressure` [Pa].
+        margin, `held_oil.charge_margin` and `held_oil.resolution` (`priors.toml`), and by `back_pressure` [Pa].
         """
         prior = INFERENCE.held_oil
-        steady_pressure = average_over(prior.steady, p, 1.0 / float(np.diff(hold.t).mean()))
-        return np.asarray(steady_pressure > self.charge * (1.0 + prior.charge) + prior.resolved + back_pressure)
+        steady_pressure = average_over(prior.averaging_time, p, 1.0 / float(np.diff(hold.t).mean()))
+        return np.asarray(
+            steady_pressure > self.charge * (1.0 + prior.charge_margin) + prior.resolution + back_pressure
+        )
 
     @cached_property
     def _above_charge(self) -> NDArray[np.bool_]:
@@ -271,11 +274,11 @@ class HeldChambers:
 
         Once a leak has equalised the pressures, small differences d are errors of the sensors, whose integral may
         exceed that of the large difference before. In such holds d is multiplied by the `small_difference_factor` of
-        `held_oil.resolved`.
+        `held_oil.resolution`.
         """
         (offsets,), _, (is_equalised,) = self._hold_offsets(np.array([offset]))
         difference = self._samples.difference - np.repeat(offsets, self._samples.sizes)
-        factor = small_difference_factor(difference, INFERENCE.held_oil.resolved)
+        factor = small_difference_factor(difference, INFERENCE.held_oil.resolution)
         return np.asarray(np.where(np.repeat(is_equalised, self._samples.sizes), difference * factor, difference))
 
     def _unit_piston_leak(self, leak: PistonLeak) -> UnitLeak:
@@ -303,7 +306,7 @@ class HeldChambers:
         hold_offsets = self._hold_offsets(np.array([offset]))[0][0]
         for hold, hold_offset in zip(self.holds, hold_offsets, strict=True):
             # `hold.t` leaves out the end of the rest, in which the valves open and over which the flow was averaged
-            begin, end = hold.t[0], hold.t[-1] + prior.settles + INFERENCE.rest.averaged
+            begin, end = hold.t[0], hold.t[-1] + prior.shutting_time + INFERENCE.rest.averaging_time
             offsets[slice(*np.searchsorted(t, [begin, np.nextafter(end, np.inf)]))] = hold_offset
         return np.asarray(difference - offsets)
 
@@ -362,9 +365,9 @@ class HeldChambers:
         """Estimate the relative standard error of a piston leak's coefficient due to the uncertain start of each hold.
 
         The coefficient is the volume that has left a chamber, over the time integral of the flow u of a leak with a
-        coefficient of 1 without growth. The time at which the valves shut is known to within s = `held_oil.settles`
-        (`priors.toml`), and a large leak equalises the pressures about as fast. With the largest flow u_0 in the first
-        interval of each hold, the error is
+        coefficient of 1 without growth. The time at which the valves shut is known to within s =
+        `held_oil.shutting_time` (`priors.toml`), and a large leak equalises the pressures about as fast. With the
+        largest flow u_0 in the first interval of each hold, the error is
 
                     s sqrt(sum of u_0^2) / (sum of the integrals of u), summed over the holds after the leak's onset.
         """
@@ -374,7 +377,7 @@ class HeldChambers:
             unit_flow = np.where(hold.t >= leak.onset, np.abs(pressure) ** leak.exponent, 0.0)
             start_flows.append(float(unit_flow[: hold.edges[1]].max()))
             integrals.append(float(np.trapezoid(unit_flow, hold.t)))
-        time_error: float = INFERENCE.held_oil.settles
+        time_error: float = INFERENCE.held_oil.shutting_time
         return time_error * float(np.linalg.norm(start_flows)) / max(sum(integrals), float(np.finfo(float).tiny))
 
     def leaks_since(self, onset: float) -> Array | None:
@@ -437,8 +440,8 @@ class HeldChambers:
 
     @cached_property
     def _onset_log_priors(self) -> Array:
-        """Log prior probability (o,) of each of `onsets`: `held_oil.from_start` for the first; the others are equal."""
-        from_start, n_later = INFERENCE.held_oil.from_start, len(self.onsets) - 1  # each hold has later ones
+        """Log prior probability (o,) of `onsets`: `held_oil.share_from_start` for the first; the others are equal."""
+        from_start, n_later = INFERENCE.held_oil.share_from_start, len(self.onsets) - 1  # each hold has later ones
         return np.asarray(np.log(np.append(from_start, np.full(n_later, (1.0 - from_start) / n_later))))
 
     def _sum_products(self, leak: UnitLeak, onsets: Array, growth: float = 0.0) -> Array:
@@ -497,7 +500,7 @@ class HeldChambers:
         regression, priors = self._regressions[leak.supplies], self._onset_priors[leak.supplies]
         hold_offsets, _, is_equalised = self._hold_offsets(offsets)
         scores = self._onset_log_priors + score_offsets(
-            priors, self._samples, hold_offsets, is_equalised, leak.exponent, INFERENCE.held_oil.resolved,
+            priors, self._samples, hold_offsets, is_equalised, leak.exponent, INFERENCE.held_oil.resolution,
             self._closed_samples[leak.supplies], self.onsets, regression.regressors,
         )  # fmt: skip
         # the variance of readings, which is too small by this share, must be no evidence for sides that are not closed
@@ -645,7 +648,7 @@ class HeldChambers:
     @property
     def probability_after_holds(self) -> float:
         """Prior probability that a leak, if there is one, begins after the last hold, so that no hold shows it."""
-        time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.from_start
+        time_after, begins_within = self.end - float(self.holds[-1].t[-1]), 1.0 - INFERENCE.held_oil.share_from_start
         return begins_within * time_after / max(self.end - self.begin, np.finfo(float).tiny)
 
     @cached_property

@@ -112,13 +112,13 @@ class OilRegression:
 def _oil_deviations() -> Array:
     """Return prior standard deviations (4,) of the changes of compressibility, dead volumes A and B, and free air."""
     prior = INFERENCE.held_oil
-    return np.array([prior.deviation, prior.dead_deviation, prior.dead_deviation, prior.air_deviation])
+    return np.array([prior.deviation, prior.dead_volume_deviation, prior.dead_volume_deviation, prior.air_deviation])
 
 
 def _lowest_changes() -> Array:
     """Return lower limits (4,) of the changes of compressibility, dead volumes A and B, and free air."""
     prior = INFERENCE.held_oil
-    lowest_volume_change = prior.least_dead / prior.dead - 1.0
+    lowest_volume_change = prior.least_dead_volume / prior.dead_volume - 1.0
     return np.array([-np.inf, lowest_volume_change, lowest_volume_change, -np.inf])
 
 
@@ -167,7 +167,7 @@ def build_regression(
         stroke_end = sides.low if area > 0.0 else sides.high  # where the chamber is smallest
         volumes = np.zeros((len(positions), 3))  # of each hold: volume in the stroke, dead volumes of A and B
         volumes[:, 0] = abs(area) * np.abs(positions - stroke_end)
-        volumes[:, 1 + index] = abs(area) * prior.dead * stroke
+        volumes[:, 1 + index] = abs(area) * prior.dead_volume * stroke
         volumes = np.repeat(volumes, counts, axis=0)
         # changes while the side is closed, as displaced and compressed volumes count only then
         moved, compressed_by, expanded_by = (

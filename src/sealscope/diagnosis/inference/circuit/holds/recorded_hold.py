@@ -73,10 +73,10 @@ class LockedHold:
     def steepest_time(self) -> float:
         """Find the start [s] of the window in which p_A - p_B changes most.
 
-        Its length is `held_oil.equalises` (`priors.toml`), the time in which a large leak equalises the pressures.
-        Every hold is longer.
+        Its length is `held_oil.equalising_time` (`priors.toml`), the time in which a large leak equalises the
+        pressures. Every hold is longer.
         """
-        n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalises))  # [samples]
+        n_equalising = int(np.searchsorted(self.t, self.t[0] + INFERENCE.held_oil.equalising_time))  # [samples]
         difference = self.difference
         return float(self.t[np.abs(difference[n_equalising:] - difference[:-n_equalising]).argmax()])
 
@@ -111,7 +111,7 @@ def find_charge_pressure(lower_pressure: Array, rests: NDArray[np.bool_], rate: 
     `lower_pressure` (n,): lower chamber pressure [Pa]; `rests` (n - 1,): flags of the intervals in which the pump
     rests; `rate`: sampling rate [Hz].
     """
-    steady_pressure = average_over(INFERENCE.held_oil.steady, lower_pressure, rate)
+    steady_pressure = average_over(INFERENCE.held_oil.averaging_time, lower_pressure, rate)
     if not rests.any():
         return float(np.nanquantile(steady_pressure, LOWEST))
     # the pressure of a sampling interval is that of the sample at its start
@@ -132,7 +132,9 @@ def find_locked_holds(channels: Sequence[Array], rests: NDArray[np.bool_], rate:
     decimation = max(1, int(rate / MAX_RATE))  # number of samples that are averaged to one
     # samples of the first interval, and samples to omit at the end: those in which the valves open, and those over
     # which the flow was averaged to find the rest
-    settling, opening = (max(1, round(s * rate)) for s in (prior.settles, prior.settles + INFERENCE.rest.averaged))
+    settling, opening = (
+        max(1, round(s * rate)) for s in (prior.shutting_time, prior.shutting_time + INFERENCE.rest.averaging_time)
+    )
     for first, n_intervals in find_runs(rests).tolist():
         if n_intervals + 1 < prior.shortest * rate:
             continue
