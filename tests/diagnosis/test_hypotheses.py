@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.hypotheses import MachineOdds, compare_residuals, temper
 from sealscope.diagnosis.priors.inference import INFERENCE
 
@@ -44,3 +45,10 @@ def test_a_model_is_believed_no_further_than_it_is_exact() -> None:
     assert (np.diff(tempered) > 0.0).all() and tempered[-1] < 0.5 / 0.01
     assert tempered[:2] == pytest.approx(ratios[:2], rel=1e-4)
     np.testing.assert_array_equal(temper(ratios, 5.0, 0.0), ratios)
+
+
+def test_alternatives_have_probabilities_whatever_they_have_in_common() -> None:
+    log_weights = np.log([[0.1, 0.2], [0.3, 0.4]])
+    for common in (0.0, 1e4, -1e4):
+        np.testing.assert_allclose(weigh_alternatives(log_weights + common), [[0.1, 0.2], [0.3, 0.4]], rtol=1e-10)
+    np.testing.assert_array_equal(weigh_alternatives(np.array([-np.inf, 5.0])), [0.0, 1.0])

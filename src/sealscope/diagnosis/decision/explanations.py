@@ -30,6 +30,7 @@ from itertools import combinations, product
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.changes.volumes import VOLUMES
 from sealscope.diagnosis.inference.comparison.rise import RISE
 from sealscope.diagnosis.inference.hypotheses import temper
@@ -154,8 +155,7 @@ def explain(
     groups += [group for size in range(2, MAX_EVENTS + 1) for group in combinations(supported, size)]
     posteriors = [_explain_by_group(group, gains_of) for group in groups]
     logarithms = np.array([logarithm for logarithm, _ in posteriors])
-    weights = np.exp(logarithms - logarithms.max())
-    weights /= weights.sum()
+    weights = weigh_alternatives(logarithms)
     order = np.argsort(-weights, kind="stable")
     # odds against the empty set of events, whose logarithm is 0: its prior is 1, and it explains no change
     odds = np.exp(np.minimum(logarithms, MAX_LOG_ODDS))

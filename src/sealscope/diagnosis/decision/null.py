@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.observable import Observable
 from sealscope.diagnosis.priors.decision import DECISION
 from sealscope.evaluation.scalar_search import find_root
@@ -78,8 +79,7 @@ def _inflation_posterior(surprisals: Sequence[float]) -> tuple[Array, Array]:
     prior[1:] *= priors.fails / prior[1:].sum()  # `fails`: fraction of machines with wrong p-values
     prior[0] = 1.0 - priors.fails
     log_posterior = np.log(prior) - len(surprisals) * log_inflation - float(np.sum(surprisals)) / inflation
-    weights = np.exp(log_posterior - log_posterior.max())
-    return weights / weights.sum(), inflation
+    return weigh_alternatives(log_posterior), inflation
 
 
 def null_key(observable: Observable) -> str:

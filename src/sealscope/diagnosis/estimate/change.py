@@ -64,7 +64,7 @@ from numpy.typing import NDArray
 
 from sealscope.compiled import kernel, law
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
-from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
 from sealscope.diagnosis.estimate.special import log_scaled_tail
 from sealscope.evaluation.scalar_search import find_root
 from sealscope.recordings.recording import Array
@@ -161,8 +161,7 @@ class StepTest:
     @cached_property
     def weights(self) -> Array:
         """Probability of each tried onset (o,), given that there is a step; a priori all are equally probable."""
-        weights = np.exp(self.likelihood - self.likelihood.max())
-        return np.asarray(weights / weights.sum())
+        return weigh_alternatives(self.likelihood)
 
     def onset(self) -> Interval:
         """Return the most likely onset of the step [s] with its 95 % interval.

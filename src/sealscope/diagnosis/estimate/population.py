@@ -58,6 +58,15 @@ N_FACTORS, LEAST_WEIGHT = 15, 1e-5
 ROOT_HALF, ROOT_PI = math.sqrt(0.5), math.sqrt(math.pi)
 
 
+def weigh_alternatives(log_weights: Array) -> Array:
+    """Compute the probabilities of alternatives, of which one is true, from log weights of any sum and shape.
+
+    A log weight is the log prior plus the log likelihood or evidence, up to a constant that all have in common.
+    """
+    weights = np.exp(log_weights - log_weights.max())
+    return np.asarray(weights / weights.sum())
+
+
 class Mixture(NamedTuple):
     """Mixture of k normal distributions: their `weights`, of sum 1, standard `deviations` and `centres`, (k,) each.
 
@@ -70,10 +79,9 @@ class Mixture(NamedTuple):
 
     def normalise(self) -> Mixture:
         """Convert a mixture with log weights of any sum and shape to one with weights of sum 1, (k,)."""
-        weights = np.exp(self.weights - self.weights.max()).ravel()
         shape = self.weights.shape
         deviations, centres = (np.broadcast_to(part, shape).ravel() for part in (self.deviations, self.centres))
-        return Mixture(weights / weights.sum(), deviations, centres)
+        return Mixture(weigh_alternatives(self.weights).ravel(), deviations, centres)
 
     @property
     def mean(self) -> float:

@@ -90,11 +90,10 @@ def find_leak_step(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Informa
     return min(tests, key=lambda test: (test.chance, -test.score), default=None)
 
 
-def mixture_flow(weights: Array, flows: Array, deviations: Array) -> Estimate:
+def mixture_flow(probabilities: Array, flows: Array, deviations: Array) -> Estimate:
     """Compute mean and standard deviation of a mixture of k estimates of a flow [m^3/s] or another quantity.
 
-    `weights` (k,): of any sum; `flows`, `deviations` (k,): estimates and their standard errors.
+    `probabilities`, `flows`, `deviations` (k,): those of the estimates, and these with their standard errors.
     """
-    probabilities = weights / weights.sum()
     value = float(probabilities @ flows)
     return Estimate(value, float(np.sqrt(probabilities @ (deviations**2 + (flows - value) ** 2))))

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import ChangeScores, ChangeSums, filter_changes, score_in_time
 from sealscope.diagnosis.estimate.interval import Interval
-from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
 from sealscope.diagnosis.estimate.special import SD_PER_MEDIAN
 from sealscope.diagnosis.priors.trend import TREND
 from sealscope.recordings.recording import Array
@@ -287,9 +287,9 @@ class _Draws(NamedTuple):
         mean, variance = sums.size(scale)
         log_ratio = sums.log_mean_ratio(scale, signed=signed)
         log_weight = np.array([[node.log_null[-1]] for node in nodes]) + log_ratio + changes.log_weight
-        weight = np.exp(log_weight - log_weight.max())
+        weight = weigh_alternatives(log_weight)
         # draw a point of the grid and a change together
-        flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel() / weight.sum())
+        flat_index = random.choice(weight.size, _N_DRAWS, p=weight.ravel())
         node_number, change = np.unravel_index(flat_index, weight.shape)
         mean, sd = mean[node_number, change], np.sqrt(variance[node_number, change])
         # by the inverse distribution function, of random probabilities; without `signed`, only numbers above 0

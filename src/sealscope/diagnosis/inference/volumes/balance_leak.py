@@ -9,7 +9,7 @@ import numpy as np
 
 from sealscope.diagnosis.estimate.change import StepTest, bound_steps, fit_history
 from sealscope.diagnosis.estimate.interval import UPPER_95, WITHIN_95, Estimate, Interval
-from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, Mixture, weigh_alternatives
 from sealscope.diagnosis.inference.circuit.holds.chambers import HeldChambers
 from sealscope.diagnosis.inference.circuit.holds.leaks import growth_factor
 from sealscope.diagnosis.inference.comparison.laws import compare_laws
@@ -235,7 +235,6 @@ class BalanceLeak(LeakMeasure):
         (`HeldChambers.start_error`).
         """
         recording, rows = self.balance.recording, []
-        best_log_weight = max(fit.log_weight for fit in chambers.law_fits)
         for leak, fit, log_weight in chambers.law_fits:
             after_onset = recording.t >= leak.onset
             t = recording.t[after_onset]
@@ -244,9 +243,9 @@ class BalanceLeak(LeakMeasure):
             growth = growth_factor(t, leak.growth, leak.onset, chambers.end)
             unit_flow = float(np.nanmean(pressure**leak.exponent * growth))
             deviation = np.linalg.norm([fit.deviation, fit.by_oil, chambers.start_error(leak) * fit.value])
-            rows.append((np.exp(log_weight - best_log_weight), unit_flow, fit.value * unit_flow, deviation * unit_flow))
+            rows.append((log_weight, unit_flow, fit.value * unit_flow, deviation * unit_flow))
         laws = np.array(rows).T
-        laws[0] *= probability / laws[0].sum()
+        laws[0] = probability * weigh_alternatives(laws[0])
         return laws
 
     def _rise_laws(self) -> list[tuple[float, float]]:

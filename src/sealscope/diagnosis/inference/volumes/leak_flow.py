@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.change import Information, StepTest, bound_steps, step_shapes, step_sizes
 from sealscope.diagnosis.estimate.interval import Estimate
-from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY
+from sealscope.diagnosis.estimate.population import BOUND_PROBABILITY, weigh_alternatives
 from sealscope.diagnosis.inference.blocks import Blocks, ColumnRoles
 from sealscope.diagnosis.inference.hypotheses import GROWTHS, LAWS
 from sealscope.diagnosis.inference.leak_law import (
@@ -105,7 +105,7 @@ def estimate_step_flow(blocks: Blocks, columns: Sequence[ColumnRoles], leak: Inf
     log_weights = np.concatenate([fit.log_prior + fit.log_ratio for fit in fits])
     flows = np.concatenate([fit.size * fit.unit_flow for fit in fits])
     deviations = np.concatenate([fit.error * fit.unit_flow for fit in fits])
-    return mixture_flow(np.exp(log_weights - log_weights.max()), flows, deviations)
+    return mixture_flow(weigh_alternatives(log_weights), flows, deviations)
 
 
 class RiseFits(NamedTuple):
@@ -138,7 +138,7 @@ class RiseFits(NamedTuple):
 
     def _mean_flow(self, is_counted: NDArray[np.bool_]) -> Estimate:
         """Average the flow [m^3/s] over the hypotheses flagged in `is_counted` (h,)."""
-        weights = np.exp(self.log_weights[is_counted] - self.log_weights[is_counted].max())
+        weights = weigh_alternatives(self.log_weights[is_counted])
         return mixture_flow(weights, self.flows[is_counted], self.deviations[is_counted])
 
     @property
@@ -150,8 +150,7 @@ class RiseFits(NamedTuple):
         from scipy.special import ndtr
 
         log_weights = np.append(np.where(self.by_rise, self.log_weights, -np.inf), self.log_none)
-        weights = np.exp(log_weights - log_weights.max())
-        weights = weights[:-1] / weights.sum()
+        weights = weigh_alternatives(log_weights)[:-1]
         flows, deviations = self.parts * self.flows, np.maximum(self.parts * self.deviations, _TINY)
         chance, tail = float(weights.sum()), 1.0 - BOUND_PROBABILITY  # of a leak, and of one above the bound
         if chance <= tail:

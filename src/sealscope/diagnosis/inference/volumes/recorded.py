@@ -19,6 +19,7 @@ from sealscope.diagnosis.estimate.change import (
 )
 from sealscope.diagnosis.estimate.interval import WITHIN_95, Estimate, Interval
 from sealscope.diagnosis.estimate.linear import Gaussian
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.balance_samples import derive_drive_signals
 from sealscope.diagnosis.inference.blocks import (
     Blocks,
@@ -672,8 +673,7 @@ def log_area_ratio(measured: float, loaded_share: float, *, is_larger: bool) -> 
         share_weights[-1] += prior.load_side_probability  # w = 1
         misfit = (np.log(measured) - np.outer(shares, ratios)) / INFERENCE.size.area
         log_weights = log_weights + np.log(share_weights)[:, None] - 0.5 * misfit**2
-    weights = np.exp(log_weights - log_weights.max()).sum(axis=0)
-    weights /= weights.sum()
+    weights = weigh_alternatives(log_weights).sum(axis=0)
     value = float(weights @ ratios)
     return Estimate(value, float(np.sqrt(weights @ (ratios - value) ** 2)))
 

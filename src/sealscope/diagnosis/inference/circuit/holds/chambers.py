@@ -37,6 +37,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sealscope.diagnosis.estimate.interval import Estimate, Interval
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.blocks import offset_cost
 from sealscope.diagnosis.inference.circuit.holds.hold_oil import (
     CylinderSides,
@@ -598,8 +599,7 @@ class HeldChambers:
         fits = [(best.fit.scale(unit_ratio, float(np.logaddexp.reduce(log_weights))), index)]
         fits += [self._fit_growing_leak(leak) for leak in leaks]
         log_posteriors = np.array([fit.log_likelihood + self._onset_log_priors[index] for fit, index in fits])
-        probabilities = np.exp(log_posteriors - log_posteriors.max())
-        probabilities /= probabilities.sum()
+        probabilities = weigh_alternatives(log_posteriors)
         fractions_after = (self.end - self.onsets) / max(self.end - self.begin, np.finfo(float).tiny)
         return [
             LeakHypothesis(float(probability), float(fractions_after[index]), fit)
@@ -659,8 +659,8 @@ class HeldChambers:
         time between two holds.
         """
         posteriors = np.logaddexp.reduce([posteriors for _, _, posteriors in self._laws])
-        weights = np.exp(posteriors - posteriors.max())
-        first, best, last = np.searchsorted(np.cumsum(weights) / weights.sum(), [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
+        up_to = np.cumsum(weigh_alternatives(posteriors))  # probability of an onset up to each
+        first, best, last = np.searchsorted(up_to, [0.5 * TAIL, 0.5, 1.0 - 0.5 * TAIL])
         if first < 2:  # the onset may be the beginning of the recording or the first one within a hold
             return None
         lows, highs = self._onset_ranges

@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import Estimate
+from sealscope.diagnosis.estimate.population import weigh_alternatives
 from sealscope.diagnosis.inference.leak_law import mixture_flow
 from sealscope.recordings.recording import Array
 
@@ -132,4 +133,4 @@ def flow_of_side(flow: Array, is_A: bool) -> Array:
 def average_fits(fits: Sequence[LeakFit]) -> Estimate:
     """Average alternative fits of a leak by their likelihoods; the deviation includes noise and uncertain oil."""
     values, deviations, by_oil, log_likelihoods = np.array(fits).T
-    return mixture_flow(np.exp(log_likelihoods - log_likelihoods.max()), values, np.hypot(deviations, by_oil))
+    return mixture_flow(weigh_alternatives(log_likelihoods), values, np.hypot(deviations, by_oil))
