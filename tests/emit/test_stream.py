@@ -14,13 +14,14 @@ from sealscope.diagnosis.live.sequential import StepDetector
 from sealscope.diagnosis.verdict.machine_sizes import unstated_rig
 from sealscope.emit.c_export import parts_a_sample, render_c
 from sealscope.emit.compiler import find_compiler
-from sealscope.emit.export import controller_inputs, controller_rig
+from sealscope.emit.export import absolute_offsets, controller_inputs, controller_rig
 from sealscope.emit.run_program import CompiledStream
 from sealscope.emit.single_precision import iter_blocks
 from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import stream_program
 from sealscope.errors import InputError
 from sealscope.recordings.recording import Recording
+from sealscope.units import P_ATM
 
 from ..diagnosis import test_lowered_loads as lowered_loads
 from ..diagnosis.balance_machine import machine, step
@@ -90,25 +91,33 @@ def test_structured_text_computes_what_c_computes():
 
 
 @pytest.mark.parametrize(
-    ("rig", "flow", "rate"),
+    ("rig", "flow", "rate", "low"),
     [
-        ("thesis", "theta", 16.0),
-        pytest.param("thesis", "omega", 22.0, marks=pytest.mark.slow),
-        pytest.param("thesis", "q_pump", 25.0, marks=pytest.mark.slow),
-        pytest.param("single-rod-eha", "theta", 25.0, marks=pytest.mark.slow),
-        pytest.param("asymmetric pump", "omega", 20.0, marks=pytest.mark.slow),
+        ("thesis", "theta", 16.0, 0.0),
+        pytest.param("thesis", "theta", 20.0, 12e5, marks=pytest.mark.slow, id="sensor-reads-too-low"),
+        pytest.param("thesis", "omega", 22.0, 0.0, marks=pytest.mark.slow),
+        pytest.param("thesis", "q_pump", 25.0, 0.0, marks=pytest.mark.slow),
+        pytest.param("single-rod-eha", "theta", 25.0, 0.0, marks=pytest.mark.slow),
+        pytest.param("asymmetric pump", "omega", 20.0, 0.0, marks=pytest.mark.slow),
     ],
 )
-def test_a_watch_and_a_controller_state_the_same_bits(rig, flow, rate):
-    """Conductance, deviation and score of each block, with lost readings and an encoder the other way round."""
+def test_a_watch_and_a_controller_state_the_same_bits(rig, flow, rate, low):
+    """Conductance, deviation and score of each block, with lost readings and an encoder the other way round.
+
+    Also where p_B reads `low` [Pa] too low, below a vacuum.
+    """
     rig = ASYMMETRIC if rig == "asymmetric pump" else ss.load_rig(rig)
     recording = machine(3, G=step(0.0, 4e-13, at=75.0), duration=100.0, rate=rate)
     speed = np.gradient(recording["theta"], 1.0 / rate)
     flows = {"theta": -recording["theta"], "omega": speed, "q_pump": speed * rig.pump.q_b / (2.0 * np.pi)}
     names = ("p_A", "p_B", flow, "x")
     samples = np.stack([{**recording.channels, **flows}[name] for name in names], axis=1)
+    samples[:, 1] -= low
     samples = lose(samples, np.random.default_rng(round(rate)))
-    unit = stream_program(StreamSettings.from_rig(rig, rate, flow, 1000.0))
+    settings = StreamSettings.from_rig(rig, rate, flow, 1000.0)
+    settings = settings._replace(to_absolute=absolute_offsets(samples, settings))
+    assert (settings.to_absolute[1] > P_ATM) == (low > 0.0)
+    unit = stream_program(settings)
     stream, scores = c_stream(unit), {}
     blocks = dict(iter_blocks(stream, samples))
     stream.initialise()

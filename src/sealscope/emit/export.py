@@ -13,7 +13,9 @@ import numpy as np
 from sealscope.calls import checked_call
 from sealscope.diagnosis.commissioned.machine import CommissionedMachine
 from sealscope.diagnosis.healthy import Healthy
+from sealscope.diagnosis.inference.balance_samples import absolute_offset
 from sealscope.diagnosis.inference.equations.balances import PUMP_VOLUMES
+from sealscope.diagnosis.inference.rows.row_weights import SUPPORT
 from sealscope.diagnosis.inference.volumes.volume_detector import VolumeBalance
 from sealscope.diagnosis.live.joining import SampleRun
 from sealscope.diagnosis.live.kernel.stream import RESULTS, StreamSettings
@@ -27,7 +29,8 @@ from sealscope.emit.st_export import render_st
 from sealscope.emit.stream_program import StreamProgram, stream_program
 from sealscope.errors import InputError
 from sealscope.parameters import Rig, load_rig
-from sealscope.recordings.channels import COUNTS
+from sealscope.recordings.channels import CHANNEL_UNITS, COUNTS
+from sealscope.recordings.quality import sensor_limit
 from sealscope.recordings.recording import Array, Recording
 from sealscope.storage.atomic import atomic_write
 
@@ -134,6 +137,8 @@ def export_controller(
         "alarm_rate": false_alarms_per_1000_h,
     }
     samples = [_samples_of(recording, unit) for recording in learn]
+    if samples:
+        unit = stream_program(unit.settings._replace(to_absolute=absolute_offsets(samples[0], unit.settings)))
     learned: Sequence[float] = ()
     blocks, error = 0, None
     if samples:
@@ -208,6 +213,15 @@ def _samples_of(recording: Recording, unit: StreamProgram) -> Array:
     if abs(recording.rate / settings.rate - 1.0) > 1e-3:
         raise InputError(f"a recording to learn from must have the rate {settings.rate:g} Hz, got {recording.rate:g}")
     return np.stack([recording[name] for name in settings.channels], axis=1)
+
+
+def absolute_offsets(samples: Array, settings: StreamSettings) -> tuple[float, float]:
+    """Compute absolute minus gauge pressures p_A and p_B [Pa] from the first blocks, as a stream in Python does."""
+    n_stride, block_strides, _ = settings.counts
+    first_blocks = samples[: SUPPORT * n_stride * block_strides]
+    limits = [sensor_limit(CHANNEL_UNITS[name]) for name in settings.channels]
+    present = first_blocks[(np.abs(first_blocks) <= limits).all(axis=1)]
+    return absolute_offset(present[:, 0]), absolute_offset(present[:, 1])
 
 
 def _learn(unit: StreamProgram, recordings: Sequence[Array], words: Mapping[str, Any]) -> tuple[CompiledStream, int]:

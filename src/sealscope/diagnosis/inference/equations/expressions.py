@@ -133,14 +133,18 @@ def _call(node: ast.expr) -> tuple[str, ast.expr]:
 
 
 def build_increments(
-    expressions: Sequence[str], channels: Mapping[str, int], limits: Mapping[str, float]
+    expressions: Sequence[str],
+    channels: Mapping[str, int],
+    limits: Mapping[str, float],
+    to_absolute: Mapping[str, float],
 ) -> Callable[..., None]:
     """Write a function that evaluates expressions over one interval of the last samples, for `compiled.large_law`.
 
     The function's arguments are `ring` (channels, width), in whose columns sample k stands at k modulo the width; the
     interval k, from sample k to k + 1; `half`, the samples on either side of the central difference that shows the
     direction of motion; `rate` [Hz]; `displacement` [m^3/rad]; and `out`, which receives the increments. `channels`:
-    rows of `ring` by name; `limits`: `MAX_READING`, beyond which a reading is missing, and `BEYOND`, a missing one.
+    rows of `ring` by name; `limits`: `MAX_READING`, beyond which a reading is missing, and `BEYOND`, a missing one;
+    `to_absolute`: absolute minus gauge pressure [Pa] by channel, by default atmospheric pressure.
     """
     lines = [
         "def compute_increments(ring: Any, k: int, half: int, rate: float, displacement: float, out: Any) -> None:",
@@ -163,7 +167,7 @@ def build_increments(
             conditions = f"is_outward == {outward} and A_carries == {by_A}"
             lines += [f"        if {conditions}:", f"            {word} += 0.5"]
     for column, text in enumerate(expressions):
-        lines.append(f"    out[{column}] = {_interval_text(parse_expression(text), 'k', channels)}")
+        lines.append(f"    out[{column}] = {_interval_text(parse_expression(text), 'k', channels, to_absolute)}")
     if words & set(DIRECTIONS):  # without a direction the interval counts as one with a missing reading
         lines += ["    if not is_known:", "        out[0] = BEYOND"]
     source = "\n".join([*lines, ""])
@@ -174,35 +178,39 @@ def build_increments(
     return namespace["compute_increments"]  # type: ignore[no-any-return]
 
 
-def _interval_text(node: ast.expr, interval: str, channels: Mapping[str, int]) -> str:
+def _interval_text(node: ast.expr, interval: str, channels: Mapping[str, int], to_absolute: Mapping[str, float]) -> str:
     """Write an expression over an interval, from the sample of this name to the next."""
     if isinstance(node, ast.Constant):
         return repr(float(node.value))  # type: ignore[arg-type]
     if isinstance(node, ast.BinOp):
-        sides = (_interval_text(side, interval, channels) for side in (node.left, node.right))
+        sides = (_interval_text(side, interval, channels, to_absolute) for side in (node.left, node.right))
         return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
     if isinstance(node, ast.Name):
         if node.id == "pressure_difference":
             difference = ast.parse("mean(p_A) - mean(p_B)", mode="eval").body
-            return _interval_text(difference, interval, channels)
+            return _interval_text(difference, interval, channels, to_absolute)
         return "(1.0 / rate)" if node.id == "dt" else node.id
     name, value = _call(node)
     if name == "gradient":
-        after, before = (_interval_text(value, k, channels) for k in ("later", "earlier"))
+        after, before = (_interval_text(value, k, channels, to_absolute) for k in ("later", "earlier"))
         return f"(({after} - {before}) / (later - earlier))"
-    first, second = (_point_text(value, sample, channels) for sample in (interval, f"({interval} + 1)"))
+    points = (_point_text(value, sample, channels, to_absolute) for sample in (interval, f"({interval} + 1)"))
+    first, second = points
     return f"({second} - {first})" if name == "change" else f"(0.5 * ({second} + {first}))"
 
 
-def _point_text(node: ast.expr, sample: str, channels: Mapping[str, int]) -> str:
+def _point_text(node: ast.expr, sample: str, channels: Mapping[str, int], to_absolute: Mapping[str, float]) -> str:
     """Write an expression at the sample of this name."""
     if isinstance(node, ast.Constant):
         return repr(float(node.value))  # type: ignore[arg-type]
     if isinstance(node, ast.Name):
         return f"ring[{channels[node.id]}, {sample} % width]"
     if isinstance(node, ast.BinOp):
-        sides = (_point_text(side, sample, channels) for side in (node.left, node.right))
+        sides = (_point_text(side, sample, channels, to_absolute) for side in (node.left, node.right))
         return f"({next(sides)} {_OPERATORS[type(node.op)]} {next(sides)})"  # type: ignore[index]
     name, value = _call(node)
-    inner = _point_text(value, sample, channels)
-    return f"max({inner} + {P_ATM!r}, {MIN_ABSOLUTE_PRESSURE!r})" if name == "absolute" else f"math.log({inner})"
+    inner = _point_text(value, sample, channels, to_absolute)
+    if name != "absolute":
+        return f"math.log({inner})"
+    assert isinstance(value, ast.Name)
+    return f"max({inner} + {to_absolute.get(value.id, P_ATM)!r}, {MIN_ABSOLUTE_PRESSURE!r})"

@@ -92,6 +92,7 @@ from sealscope.errors import InputError
 from sealscope.parameters import Rig
 from sealscope.recordings.channels import CHANNEL_UNITS
 from sealscope.recordings.quality import sensor_limit
+from sealscope.units import P_ATM
 
 #: Number of blocks of a mean.
 WINDOW = 20
@@ -204,6 +205,8 @@ class StreamSettings(NamedTuple):
     size_error: float  # relative standard error of the leakage due to the machine's displacement and piston area
     log_threshold: float  # of the score
     basis: Basis | None = None  # for single precision
+    # absolute minus gauge pressures p_A and p_B [Pa], more than atmospheric pressure for a sensor that reads too low
+    to_absolute: tuple[float, float] = (P_ATM, P_ATM)
 
     @classmethod
     def from_rig(
@@ -408,9 +411,12 @@ def stream_kernels(settings: StreamSettings) -> SimpleNamespace:
     constant, combination, prediction, leak_scale, left_scale = basis or ((), (), (), 1.0, 1.0)
     unit = 1.0 if basis is None else basis.conductance_unit
     limits = {"MAX_READING": MAX_READING, "BEYOND": BEYOND}
+    to_absolute = dict(zip(("p_A", "p_B"), settings.to_absolute, strict=True))
     n_increments, n_nuisances = len(settings.increments), n_columns - 2  # all columns but the leak and the left side
     piston = settings.piston
-    increments = build_increments(settings.increments, {name: k for k, name in enumerate(channels)}, limits)
+    increments = build_increments(
+        settings.increments, {name: k for k, name in enumerate(channels)}, limits, to_absolute
+    )
     compute_increments = large_law(increments)
 
     @law
