@@ -128,7 +128,7 @@ def test_a_locked_chamber_leaks_by_the_fall_of_its_pressure():
     for p_B, causes in ((2e6 + 1e3 * t, ("piston",)), (2e6 + 0.0 * t, ("load-holding valve", "line"))):
         noise = 1e4 * random.standard_normal(t.size)
         recording = ss.Recording(t, {"p_A": p_A, "p_B": p_B + noise}, {"p_A": "Pa", "p_B": "Pa"}, rate=10.0)
-        (result,) = ss.hold_test(recording, area=AREAS, volume=("1 L", "1 L"), oil="40 degC steady")
+        (result,) = ss.hold_test(recording, area=AREAS, volume=("1 L", "1 L"), oil="40 degC steady", capped="B")
         low, high = result.leak_interval_lpm
         assert low <= true_lpm <= high
         assert result.causes == causes
@@ -203,6 +203,43 @@ def test_a_flow_meter_shows_the_mean_flow_also_while_the_pressure_falls():
         low, high = result.leak_interval_lpm
         assert low <= 6e4 * float(flow.mean()) <= high
         assert high - low < 0.1 * result.leak_lpm
+
+
+def test_a_creep_beyond_its_limit_never_passes():
+    for cooling in (2.0, 5.0):
+        (result,) = ss.hold_test(record_hold(0.0, cooling=cooling), area=AREAS, limit="0.02 mm/min")
+        assert result.creep_interval_mm_per_min[0] > 0.02
+        assert result.result == "undecided"
+
+
+def test_a_release_between_two_slow_samples_ends_the_hold():
+    t = np.arange(0.0, 900.0, 5.0)
+    p_A = np.where(t < 800.0, 20e5 - 100.0 * t, 0.0) + 1e3 * np.random.default_rng(4).standard_normal(t.size)
+    (result, *_) = ss.hold_test(ss.Recording(t, {"p_A": p_A}, {"p_A": "Pa"}, rate=0.2), area=AREAS)
+    assert 780.0 <= result.end_s <= 800.0
+
+
+def test_a_leak_that_has_equalised_the_sides_is_converted_by_its_pressure():
+    t = np.arange(0.0, 1200.0, 1.0)
+    random = np.random.default_rng(7)
+    difference = 1e7 * np.exp(-t / 120.0)
+    p_A, p_B = (1e7 + sign * 0.5 * difference + 1e3 * random.standard_normal(t.size) for sign in (1.0, -1.0))
+    recording = ss.Recording(t, {"p_A": p_A, "p_B": p_B}, {"p_A": "Pa", "p_B": "Pa"}, rate=1.0)
+    stated = {"area": AREAS, "volume": ("1 L", "1 L"), "oil": "steady", "reference": "100 bar"}
+    (result,) = ss.hold_test(recording, loaded="A", **stated)
+    # 1 L of oil of 1.25 GPa at half the rate of the difference, by a laminar leak
+    true_lpm = 0.5e-3 * 8e-10 * 1e7 / 120.0 * 6e4
+    low, high = result.leak_at_interval_lpm
+    assert low <= true_lpm <= high
+    assert result.leak_at_lpm > 3.0 * result.leak_lpm
+
+
+def test_equal_pressures_without_noise_give_finite_intervals():
+    t = np.arange(0.0, 600.0, 1.0)
+    p_A = 5e6 + np.round(20.0 * np.exp(-t / 60.0)) * 1e5
+    recording = ss.Recording(t, {"p_A": p_A, "p_B": np.full_like(t, 5e6)}, {"p_A": "Pa", "p_B": "Pa"}, rate=1.0)
+    (result,) = ss.hold_test(recording, area=AREAS, loaded="A")
+    assert np.isfinite(result.leak_interval_lpm).all()
 
 
 def test_collected_oil_needs_no_log():

@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.estimate.population import Mixture
+from sealscope.diagnosis.estimate.population import Mixture, pool_mixtures
 from sealscope.diagnosis.hold.readings import (
     N_PARTS,
     Readings,
@@ -60,13 +60,19 @@ STEADY_PRESSURE = 1.02
 #: Start of the last part of a hold, over its duration, and the smallest difference of pressures that it resolves, in
 #: standard deviations of the noise of parts.
 LAST_PART, RESOLVED = 0.97, 4.0
+#: Least noise [Pa] of a difference of pressures, which rounding may hide.
+LEAST_NOISE = 1.0
 #: Degree of the polynomial that smooths a logged temperature.
 SMOOTH_DEGREE = 3
 #: Time constants [durations of the hold] of the exponentials that such a smooth course has as well, and the number of
 #: its passages from step to step, or of its means, that are needed for them.
 COURSE_TIMES, MIN_PASSAGES = (0.2,), 24
+#: Time [s] by which a logged temperature is moved to find its slope.
+DELAY = 1.0
 #: Number of time constants of what settles that are tried, to find the best.
 N_TIMES = 30
+#: Least driving pressure from which a flow is converted, in deviations of the zero of the sensors.
+LEAST_DRIVE = 0.2
 #: Factor by which the travel equivalent to a pressure's fall exceeds a piston's travel, where that is at a stop.
 AT_STOP = 3.0
 #: Error of the change of a rounded temperature over a hold, in steps.
@@ -82,20 +88,34 @@ _MM = 1e3
 class LeakClock(NamedTuple):
     """Time weighted by the flow of a leak under one law: prior `weight`, `minutes` (m,) of mean `flow` (m,) 1.
 
-    `spare` (m,): how much of it is due to the sensors' offset in a hold whose pressures a leak has equalised.
+    `spare` (m,): how much of it is due to the sensors' offset in a hold whose pressures a leak has equalised;
+    `conversions`: probability, factor to the flow at the reference pressure, and deviation of its logarithm.
     """
 
     weight: float
     minutes: Array
     flow: Array
     spare: Array | None = None
+    conversions: tuple[tuple[float, float, float], ...] = ()
+
+    def convert(self, rate: Mixture) -> Mixture | None:
+        """Convert a rate to the reference pressure; None without one."""
+        if not self.conversions:
+            return None
+        shares = np.array([share for share, _, _ in self.conversions])
+        rates = [rate.scale(factor, deviation).condense() for _, factor, deviation in self.conversions]
+        return pool_mixtures(rates, shares / shares.sum()).condense()
 
 
 class LeakEstimate(NamedTuple):
-    """Leak of a hold: `rate` [mm/min] of the piston that it equals, without cooling, and its `flow` [m^3/s]."""
+    """Leak of a hold: `rate` [mm/min] of the piston that it equals, without cooling, and its `flow` [m^3/s].
+
+    `converted` [m^3/s]: flow at the reference pressure, None without one.
+    """
 
     rate: Mixture | None
     flow: Mixture | None
+    converted: Mixture | None = None
     curve: HoldCurve | None = None
     fit: RateFit | None = None
 
@@ -105,14 +125,22 @@ def _compress_oil(p: Array) -> Array:
     return relative_compression(np.maximum(p, LOWEST))
 
 
-def _exponential(readings: Readings, time: float, size: float, mean: float = 0.0) -> tuple[Column, Column]:
+def _exponential(
+    readings: Readings, time: float, size: float, mean: float = 0.0, span: float = math.inf
+) -> tuple[Column, Column]:
     """Build the columns of an exponential with an amplitude of the given `mean` and deviation `size`.
 
     The second column is its derivative by the logarithm of the time constant, which the grid of these leaves open.
+    `span`: duration [s] of a hold without mean speed, by the chord of each column; infinite to leave it.
     """
-    course = readings.decay(time) - 1.0
-    slope = (readings.decay(time * SLIGHTLY) - readings.decay(time / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
-    return Column(course, mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
+
+    def course(ratio: float) -> Array:
+        """Compute the exponential of `ratio` times the time constant."""
+        chord = math.expm1(-span / (ratio * time)) / span if math.isfinite(span) else 0.0
+        return readings.decay(ratio * time) - 1.0 - chord * readings.t
+
+    slope = (course(SLIGHTLY) - course(1.0 / SLIGHTLY)) / (2.0 * math.log(SLIGHTLY))
+    return Column(course(1.0), mean, size), Column(slope, 0.0, math.hypot(size, mean) * GRID_DEVIATION)
 
 
 def _refine_times(readings: Readings, times: Sequence[float]) -> list[float]:
@@ -203,12 +231,21 @@ class HeldLoad:
         return None if p is None else float(np.mean(p))
 
     def _settling(self, readings: Readings, sizes: Sequence[float]) -> list[Alternative]:
-        """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude."""
+        """List what may settle in `readings` after the valve has shut; `sizes`: deviations of its amplitude.
+
+        Without a pressure, a leak that falls off bends the readings, too, which takes nothing of its mean.
+        """
         prior = HOLD.settling
         times = _refine_times(readings, [time for time in prior.times if time <= prior.longest * self.duration])
         weight = prior.present / max(len(times) * len(sizes), 1)
         terms = [_exponential(readings, time, size) for time in times for size in sizes]
-        return [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
+        settling = [Alternative(1.0 - prior.present), *(Alternative(weight, term) for term in terms)]
+        if self.mean_pressure is not None:
+            return settling
+        share, size = HOLD.other.locked / len(prior.emptying), max(float(np.ptp(readings.values)), LEAST_BEND)
+        bends = [_exponential(readings, time * self.duration, size, span=self.duration) for time in prior.emptying]
+        held = [entry._replace(weight=(1.0 - HOLD.other.locked) * entry.weight) for entry in settling]
+        return held + [Alternative(share, bend) for bend in bends]
 
     def _thermal_columns(self, t: Array) -> list[Column]:
         """Build the columns [mm] of a logged temperature at times `t`; none without a log."""
@@ -222,14 +259,22 @@ class HeldLoad:
         times = COURSE_TIMES if n_exact >= MIN_PASSAGES else ()
         basis = weights[:, None] * course_basis(logged.t / self.duration, degree, times)
         coefficients = np.linalg.lstsq(basis, weights * logged.values, rcond=None)[0]
+        residual = (logged.values - basis @ coefficients / weights)[logged.loose == 0.0]
+        error = float(np.sqrt(np.mean(residual**2) * basis.shape[1] / max(len(residual), 1))) if n_exact else 0.0
         length, deviation = self.column
         scale = -HOLD.cooling.expansion * length
         change = course_basis(t / self.duration, degree, times) - course_basis(np.zeros(1), degree, times)
         travel = scale * np.asarray(change @ coefficients)
+        later = (
+            course_basis((t + DELAY) / self.duration, degree, times) - change - course_basis(np.zeros(1), degree, times)
+        )
+        delayed = scale * np.asarray(later @ coefficients) / DELAY  # [mm/s]
         uncertainty = math.hypot(deviation, HOLD.cooling.expansion_deviation)
-        size = math.hypot(HOLD.cooling.misfit * float(np.ptp(travel)), 0.5 * scale * ROUNDED * logged.quantum)
+        unread = scale * math.hypot(0.5 * ROUNDED * logged.quantum, error)
+        size = math.hypot(HOLD.cooling.misfit * float(np.ptp(travel)), unread)
         misfit = [Column(np.exp(-t / (time * self.duration)), 0.0, size) for time in times]
-        return [Column(travel, 1.0, uncertainty), *self._misfit(t, t, size), *misfit]
+        lag = Column(delayed, *HOLD.cooling.lag)
+        return [Column(travel, 1.0, uncertainty), lag, *self._misfit(t, t, size), *misfit]
 
     def _misfit(self, t: Array, course: Array, size: float) -> list[Column]:
         """Build the slope, of a standard deviation `size` [mm], and bends that a correction leaves at times `t` [s].
@@ -240,11 +285,18 @@ class HeldLoad:
         courses = 2.0 * t / self.duration - 1.0, 1.5 * z**2 - 0.5, 2.5 * z**3 - 1.5 * z  # Legendre polynomials
         return [Column(values, 0.0, size) for values in courses]
 
-    def _cooling(self, readings: Readings) -> list[Alternative]:
-        """List the alternatives for the travel [mm] due to oil that nobody logs, in `readings`."""
+    def _cooling(self, readings: Readings, span: float = math.inf) -> list[Alternative]:
+        """List the alternatives for the travel [mm] due to the oil's temperature in `readings`.
+
+        `span`: as of `_exponential`, for oil that nobody logs. Where the pressure of the other side is not logged, it
+        may be locked: the travel by a logged temperature then has either sign.
+        """
         prior, set_up = HOLD.cooling, self.set_up
-        if self._thermal_columns(readings.t):
-            return [Alternative(1.0)]
+        if logged := self._thermal_columns(readings.t):
+            if self.travel is None or self._pressure(self.unloaded) is not None:
+                return [Alternative(1.0, tuple(logged))]
+            locked = logged[0]._replace(mean=0.0, deviation=1.0), *logged[1:]
+            return [Alternative(1.0 - HOLD.other.locked, tuple(logged)), Alternative(HOLD.other.locked, locked)]
         sizes = [(0.0, size) for size in prior.sizes]
         if set_up.oil_course == "steady":
             sizes = [(0.0, prior.steady)]
@@ -256,7 +308,9 @@ class HeldLoad:
             sizes = [((1.0 if set_up.oil_course == "falling" else -1.0) * mean * excess, deviation * excess)]
         factor = prior.expansion * self.column[0]
         weight = 1.0 / (len(sizes) * len(prior.times))
-        terms = [_exponential(readings, time, factor * d, -factor * mean) for time in prior.times for mean, d in sizes]
+        terms = [
+            _exponential(readings, time, factor * d, -factor * mean, span) for time in prior.times for mean, d in sizes
+        ]
         return [Alternative(weight, term) for term in terms]
 
     @property
@@ -276,7 +330,8 @@ class HeldLoad:
         differences = [p - P_ATM] if other is None else [p - other, p - P_ATM]
         courses = [smooth_course(self.t, difference) for difference in differences]
         if all(course.max() < STEADY_PRESSURE * course.min() for _, course in courses):
-            return [steady]
+            conversions = [self._convert(course, *law) for _, course in courses for law in LAWS.items()]
+            return [steady._replace(conversions=tuple(filter(None, conversions)))]
         clocks = []
         for k, (part_t, course) in enumerate(courses):
             driving = course
@@ -286,12 +341,27 @@ class HeldLoad:
                 offset, _, is_equalised = estimate_hold_offsets(float(p[last].mean()), float(other[last].mean()), 0.0)
                 if is_equalised:
                     noise = float(np.std(p[last] - other[last])) / math.sqrt(max(len(p) / N_PARTS, 1.0))
-                    driving = (course - offset) * small_difference_factor(course - offset, RESOLVED * noise)
+                    driving = (course - offset) * small_difference_factor(
+                        course - offset, RESOLVED * noise + LEAST_NOISE
+                    )
             for exponent, weight in LAWS.items():
                 minutes, flow = self._weigh_time(readings, part_t, driving, exponent)
                 spare = minutes - self._weigh_time(readings, part_t, course, exponent)[0]
-                clocks.append(LeakClock(weight / len(differences), minutes, flow, None if driving is course else spare))
+                clock = LeakClock(weight / len(differences), minutes, flow, None if driving is course else spare)
+                conversion = self._convert(driving, exponent, 1.0)
+                clocks.append(clock._replace(conversions=(conversion,) if conversion else ()))
         return clocks
+
+    def _convert(self, driving: Array, exponent: float, weight: float) -> tuple[float, float, float] | None:
+        """Convert a mean flow by the `driving` pressure (k,) to the reference (`LeakClock.conversions`), if any.
+
+        The zero of the sensors makes a small pressure uncertain.
+        """
+        if (reference := self.set_up.reference_pressure) is None:
+            return None
+        offset = HOLD.other.offset * BAR
+        mean = max(float(np.mean(np.abs(driving) ** exponent)) ** (1.0 / exponent), LEAST_DRIVE * offset)
+        return weight, (reference / mean) ** exponent, exponent * offset / mean
 
     def _weigh_time(self, readings: Readings, t: Array, difference: Array, exponent: float) -> tuple[Array, Array]:
         """Compute times [min] of `readings` weighted by a power of a pressure `difference` at `t`, and the weights.
@@ -319,14 +389,9 @@ class HeldLoad:
         elif self.set_up.oil_course:
             thermal = [Alternative((1.0 - stopped) * weight, columns) for weight, columns in self._cooling(readings)]
         else:
-            thermal, resting = resting, []
-            ends = Readings(np.array([0.0, self.duration]), np.zeros(2), np.zeros(2), 0.0)
-            for (weight, columns), (_, at_ends) in zip(self._cooling(readings), self._cooling(ends), strict=True):
-                bends = tuple(
-                    column._replace(values=self._bend(t, column.values, float(np.diff(end.values)[0])))
-                    for column, end in zip(columns, at_ends, strict=True)
-                )
-                thermal.append(Alternative((1.0 - stopped) * weight, bends))
+            bends = self._cooling(readings, self.duration)
+            thermal = resting + [Alternative((1.0 - stopped) * weight, columns) for weight, columns in bends]
+            resting = []
         settling = self._settling(readings, HOLD.settling.travel)
         fits = [self._regression.fit_rate(base, [settling, terms]) for terms in (thermal, resting) if terms]
         logs = [fit.log_evidence for fit in fits]
@@ -415,7 +480,7 @@ class HeldLoad:
         thermal = [Alternative(0.5), *(Alternative(0.5 * weight, columns) for weight, columns in closed)]
         sizes = [_MM * length * strain for strain in HOLD.settling.strain]
         alternatives = [self._settling(compression, sizes), thermal]
-        clocks = self._clocks(compression)[: len(LAWS)]
+        clocks = [clock._replace(conversions=()) for clock in self._clocks(compression)[: len(LAWS)]]
         if len(clocks) > 1:  # a steady gain, too, whatever its law
             clocks.append(LeakClock(clocks[0].weight, t / 60.0, np.ones_like(t)))
         fit = self._fit_laws(RateRegression(compression, self.duration), base, alternatives, clocks)
@@ -438,26 +503,15 @@ class HeldLoad:
             )
             if leak.rate is None:
                 return leak
-            leak = leak._replace(rate=leak.rate.multiply(leak_prior()))
+            rates = leak.rate.multiply(leak_prior()), leak.converted and leak.converted.multiply(leak_prior())
             if area is None:
-                return leak
-            return leak._replace(flow=None if leak.rate is None else leak.rate.scale(MM_PER_MINUTE * area))
-        return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow)
-
-    @cached_property
-    def creep_interval(self) -> tuple[float, float] | None:
-        """95 % interval of the creep [mm/min]; None without a position."""
-        return None if self.creep is None else self.creep.rate.interval
-
-    @cached_property
-    def leak_intervals(self) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
-        """95 % intervals of the leak's rate [mm/min] and flow [m^3/s]; None for what is unknown."""
-        rate, flow, area = self.leak.rate, self.leak.flow, self.set_up.area(self.loaded)
-        rate_ends = None if rate is None else rate.interval
-        if flow is None or rate_ends is None or area is None:
-            return rate_ends, None if flow is None else flow.interval
-        low, high = rate_ends
-        return rate_ends, (MM_PER_MINUTE * area * low, MM_PER_MINUTE * area * high)
+                return leak._replace(rate=rates[0], converted=None)
+            flows = [rate and rate.scale(MM_PER_MINUTE * area) for rate in rates]
+            return leak._replace(rate=rates[0], flow=flows[0], converted=flows[1])
+        clocks = self._clocks(Readings(np.zeros(1), np.zeros(1), np.zeros(1), 0.0)) if self.t.size else []
+        converted = [entry for clock in clocks if (entry := clock.convert(flow)) is not None]
+        at_reference = pool_mixtures(converted, np.array([clock.weight for clock in clocks])) if converted else None
+        return LeakEstimate(None if area is None else flow.scale(1.0 / (MM_PER_MINUTE * area)), flow, at_reference)
 
     def _metered_flow(self, meter: Array) -> Mixture:
         """Estimate the mean flow [m^3/s] of a leakage flow meter, whose gain is uncertain, under each law of a leak."""
@@ -478,7 +532,7 @@ class HeldLoad:
         readings = self._travel_readings
         base = [Column(np.ones_like(readings.t)), *self._compression_columns()]
         fit = self._fit_leak(self._regression, base, HOLD.settling.travel)
-        return LeakEstimate(fit.rate, None, self._make_curve("x", "mm", readings, fit, 1.0), fit)
+        return LeakEstimate(fit.rate, None, fit.converted, self._make_curve("x", "mm", readings, fit, 1.0), fit)
 
     def _leak_by_pressure(self) -> LeakEstimate:
         """Estimate the leak from the fall of the pressure of a chamber whose piston stands still."""
@@ -489,23 +543,24 @@ class HeldLoad:
         pressures, compression, base = self._read_compression(p, -length)
         sizes = [length * strain for strain in HOLD.settling.strain]
         fit = self._fit_leak(RateRegression(compression, self.duration), base, sizes)
-        rate = fit.rate.scale(1.0, math.hypot(deviation, INFERENCE.held_oil.deviation))
+        width = math.hypot(deviation, INFERENCE.held_oil.deviation)
+        rate, converted = fit.rate.scale(1.0, width), fit.converted and fit.converted.scale(1.0, width)
         if self.creep is not None:
             rate = rate.add_error(self.creep.rate.deviation)
         # the fit is drawn as a pressure, by the slope of the compression over the hold
         travelled, fallen = np.ptp(compression.values), np.ptp(pressures.values) / BAR
         in_bar = pressures._replace(values=(pressures.values - P_ATM) / BAR)
         slope = -float(fallen / travelled) if travelled > 0.0 else 0.0
-        return LeakEstimate(rate, None, self._make_curve(f"p_{self.loaded}", "bar", in_bar, fit, slope), fit)
+        return LeakEstimate(rate, None, converted, self._make_curve(f"p_{self.loaded}", "bar", in_bar, fit, slope), fit)
 
     @cached_property
     def _is_at_stop(self) -> bool:
         """True if the piston stands still while the loaded chamber's pressure changes."""
         p = self._pressure(self.loaded)
-        if p is None or self.creep is None or self.creep_interval is None:
+        if p is None or self.creep is None:
             return False
         _, compression = average_parts(self.t, _compress_oil(p).sum(axis=0), 10)
-        low, high = self.creep_interval
+        low, high = self.creep.rate.interval
         travel = abs(self.creep.rate.mean) * self.duration / 60.0
         return low <= 0.0 <= high and float(np.ptp(compression)) * self.column[0] > AT_STOP * travel
 
@@ -526,6 +581,7 @@ class HeldLoad:
             if bend > LEAST_BEND:
                 law += self._misfit(t, clock.minutes, INFERENCE.held_oil.misfit * bend)
             fits.append(regression.fit_rate([Column(clock.minutes), *base, *law], alternatives))
+            fits[-1] = fits[-1]._replace(converted=clock.convert(fits[-1].rate))
             logs.append(math.log(clock.weight) + fits[-1].log_evidence)
         return pool_fits(fits, logs)
 
@@ -533,10 +589,10 @@ class HeldLoad:
         """Fit the rate of a leak [mm/min] under each law, with temperature and what settles."""
         readings = regression.readings
         alternatives = [self._settling(readings, sizes), self._cooling(readings)]
-        columns = [*base, *self._thermal_columns(readings.t)]
-        fit = self._fit_laws(regression, columns, alternatives, self._clocks(readings))
+        fit = self._fit_laws(regression, base, alternatives, self._clocks(readings))
         # oil that cools unlogged follows an exponential but for a share, which is as straight as a leak
-        misfit = HOLD.cooling.misfit * float(np.ptp(fit.last)) / (self.duration / 60.0)
+        is_logged = bool(self._thermal_columns(readings.t[:1]))
+        misfit = 0.0 if is_logged else HOLD.cooling.misfit * float(np.ptp(fit.last)) / (self.duration / 60.0)
         return fit._replace(rate=fit.rate.add_error(misfit))
 
     def _make_curve(self, channel: str, unit: str, readings: Readings, fit: RateFit, factor: float) -> HoldCurve:

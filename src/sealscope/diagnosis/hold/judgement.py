@@ -9,12 +9,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from sealscope.diagnosis.estimate.interval import WITHIN_95
-from sealscope.diagnosis.estimate.population import Mixture, pool_mixtures
+from sealscope.diagnosis.estimate.population import Mixture
 from sealscope.diagnosis.hold.hold_equation import HeldLoad
 from sealscope.diagnosis.hold.limits import decide_result
 from sealscope.diagnosis.hold.plan import predict_rate_error
 from sealscope.diagnosis.hold.result import HoldResult
-from sealscope.diagnosis.inference.hypotheses import LAWS
 from sealscope.diagnosis.priors.hold import HOLD
 from sealscope.paragraphs import join_names
 from sealscope.units import BAR, LITRE_PER_MINUTE, ML_PER_MINUTE, MM_PER_MINUTE
@@ -31,12 +30,15 @@ _CLOSE = "close the line at the valve: if it still sinks, the line leaks"
 def judge_hold(hold: HeldLoad) -> HoldResult:
     """Judge a hold against the limit that the caller states, if any."""
     set_up, leak, limit = hold.set_up, hold.leak, hold.set_up.limit
-    creep, creep_ends = None if hold.creep is None else hold.creep.rate, hold.creep_interval
-    (rate_ends, flow_ends), pressure = hold.leak_intervals, hold.mean_pressure
-    reference = limit.pressure if limit is not None and limit.pressure is not None else set_up.reference
-    converted = None if reference is None or leak.flow is None else _convert_flow(leak.flow, pressure, reference)
+    creep, pressure = None if hold.creep is None else hold.creep.rate, hold.mean_pressure
+    creep_ends, rate_ends, flow_ends = (rate and rate.interval for rate in (creep, leak.rate, leak.flow))
+    # a creep must be within its limit as it is seen; it fails by the part that no cooling explains
+    seen_ends = rate_ends
+    if rate_ends is not None and creep_ends is not None:
+        seen_ends = min(rate_ends[0], creep_ends[0]), max(rate_ends[1], creep_ends[1])
+    reference, converted = set_up.reference_pressure, leak.converted
     converted_ends = None if converted is None else converted.interval
-    compared, interval, scale = leak.rate, rate_ends, MM_PER_MINUTE
+    compared, interval, scale = leak.rate, seen_ends, MM_PER_MINUTE
     if limit is not None and limit.kind == "flow":
         compared, interval, scale = leak.flow, flow_ends, 1.0
         if limit.pressure is not None:
@@ -92,14 +94,6 @@ def _convert_ends(ends: tuple[float, float] | None) -> tuple[float, float] | Non
     return None if ends is None else (ends[0] / LITRE_PER_MINUTE, ends[1] / LITRE_PER_MINUTE)
 
 
-def _convert_flow(flow: Mixture, pressure: float | None, reference: float) -> Mixture | None:
-    """Convert a flow at the held `pressure` [Pa] to a `reference` pressure, by laws between laminar and orifice."""
-    if pressure is None or not pressure > 0.0:
-        return None
-    ratio = reference / pressure
-    return pool_mixtures([flow.scale(ratio**exponent) for exponent in LAWS], np.array([*LAWS.values()]))
-
-
 def _list_causes(hold: HeldLoad) -> tuple[str, ...]:
     """List the parts that may leak, by the other side's pressure and the stated set-up."""
     set_up, loaded, other = hold.set_up, hold.loaded, hold.unloaded
@@ -124,13 +118,14 @@ def _weigh_piston(hold: HeldLoad) -> int:
 
     A closed other side gains what passes the piston. Its pressure rises by it, and falls as the piston sinks.
     """
-    gain, leak, (rate_ends, _) = hold.gain, hold.leak, hold.leak_intervals
-    if gain is None or leak.rate is None or rate_ends is None:
+    gain, leak = hold.gain, hold.leak
+    if gain is None or leak.rate is None:
         return 0
     low, high = gain.interval
     prior, is_material = HOLD.other, abs(gain.mean) > HOLD.other.material * abs(leak.rate.mean)
     p = hold.recording[f"p_{hold.unloaded}"] if hold.recording is not None else np.zeros(1)
-    is_closed = hold.unloaded in hold.set_up.capped or float(np.median(p)) > prior.tank * BAR
+    is_shut = hold.unloaded in hold.set_up.capped
+    is_closed = is_shut or float(np.median(p)) > prior.tank * BAR
     if is_closed and is_material and low > 0.0:
         return 1
     area, other_area = hold.set_up.area(hold.loaded), hold.set_up.area(hold.unloaded)
@@ -139,7 +134,7 @@ def _weigh_piston(hold: HeldLoad) -> int:
     gained = ratio * (travel.mean + gain.mean)
     error = ratio * math.hypot(travel.deviation, gain.deviation)
     falls = is_material and high < 0.0
-    if (is_closed or falls) and gained + WITHIN_95 * error < rate_ends[0]:
+    if (is_shut or falls) and gained + WITHIN_95 * error < leak.rate.interval[0]:
         return -1
     return 0
 
@@ -201,28 +196,29 @@ def _describe(
     """Describe the result of a hold in a sentence or two."""
     parts, leak = [], hold.leak
     place = "" if hold.mean_pressure is None else f" at {hold.mean_pressure / BAR:.3g} bar"
-    if hold.creep is not None and hold.creep_interval is not None:
-        mean, (low, high) = hold.creep.rate.mean, hold.creep_interval
+    if hold.creep is not None:
+        mean, (low, high) = hold.creep.rate.mean, hold.creep.rate.interval
         if high < 0.0:
             parts.append(f"rises by {format_estimate(-mean, -high, -low)} mm/min{place}")
         else:
             parts.append(f"sinks by {format_estimate(mean, low, high)} mm/min{place}")
-    _, flow_ends = hold.leak_intervals
-    if leak.flow is not None and flow_ends is not None:
-        mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in flow_ends)
+    if leak.flow is not None:
+        mean, (low, high) = leak.flow.mean / ML_PER_MINUTE, (end / ML_PER_MINUTE for end in leak.flow.interval)
         if low > 0.0:
             words = f"leak {format_estimate(mean, low, high)} mL/min"
         else:
             words = f"no leak above {max(high, 0.0):.2g} mL/min"
-        parts.append(words + ("" if hold.creep is not None else place))
+        stop = ", the piston taken to rest on its stop" if leak.fit is not None else ""
+        parts.append(words + ("" if hold.creep is not None else place + stop))
     text = "; ".join(parts) or "neither creep nor leak can be estimated"
     if lacks_area:
         text += "; the limit needs the piston's area (--area)"
-    wait = f", or hold for {minutes:.0f} min more" if minutes is not None else ""
+    advice = ["log the oil's temperature"] if hold.warming else []
+    advice += [] if minutes is None else [f"hold for {minutes:.0f} min more"]
     if COOLING in causes and hold.creep is not None:
         length, _ = hold.column
         kelvin = hold.creep.rate.mean * hold.duration / 60.0 / (HOLD.cooling.expansion * length)
-        text += f"; cooling by {kelvin:.2g} K would do the same: log the oil's temperature{wait}"
+        text += f"; cooling by {kelvin:.2g} K would do the same{': ' if advice else ''}{', or '.join(advice)}"
     elif result == "undecided" and not lacks_area:
         text += f"; too close to the limit{f': hold for {minutes:.0f} min more' if minutes is not None else ''}"
     elif causes:

@@ -91,9 +91,10 @@ def list_noises(duration: float) -> list[Noise]:
 def leak_prior() -> Mixture:
     """Build the prior of a leak's rate [mm/min], of a tight cylinder or of a leak of unknown size (`[tight]`)."""
     prior = HOLD.tight
-    sizes = np.array([prior.rate, *prior.leaks])
-    weights = np.array([prior.present, *([(1.0 - prior.present) / len(prior.leaks)] * len(prior.leaks))])
-    return Mixture(weights, sizes, np.zeros(len(sizes)))
+    leaks, lifts = np.array(prior.leaks), np.array(prior.lifts)
+    shares = (prior.present, 1), (1.0 - prior.present - prior.fed, len(leaks)), (prior.fed, len(lifts))
+    weights = np.concatenate([np.full(n, share / n) for share, n in shares])
+    return Mixture(weights, np.array([prior.rate, *(0.5 * leaks), *lifts]), np.array([0.0, *leaks, *(0.0 * lifts)]))
 
 
 class RateFit(NamedTuple):
@@ -106,6 +107,7 @@ class RateFit(NamedTuple):
     noise: Noise  # of the most probable alternative
     s: float  # standard deviation of its white part
     log_evidence: float
+    converted: Mixture | None = None  # the rate at a reference pressure
 
 
 def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
@@ -113,7 +115,9 @@ def pool_fits(fits: Sequence[RateFit], logs: Sequence[float]) -> RateFit:
     weights = np.exp(np.array(logs) - max(logs))
     weights /= weights.sum()
     rate = pool_mixtures([fit.rate for fit in fits], weights).condense()
-    return fits[int(weights.argmax())]._replace(rate=rate)
+    converted = [fit.converted for fit in fits if fit.converted is not None]
+    pooled = pool_mixtures(converted, weights).condense() if converted else None
+    return fits[int(weights.argmax())]._replace(rate=rate, converted=pooled)
 
 
 class RateRegression:

@@ -35,6 +35,11 @@ class SetUp(NamedTuple):
     start: float | None
     end: float | None
 
+    @property
+    def reference_pressure(self) -> float | None:
+        """Pressure [Pa] to which the leak is converted: that of the limit, or the stated one; None without either."""
+        return self.reference if self.limit is None or self.limit.pressure is None else self.limit.pressure
+
     def area(self, side: str) -> float | None:
         """Return the area of a side [m^2]; None if it is not stated."""
         return None if not self.areas else self.areas[-1 if side == "B" else 0]

@@ -27,6 +27,7 @@ class SettlingPriors(PriorTable):
 
     present: float  # probability that something settles within the hold
     times: tuple[float, ...]  # [s] time constants
+    emptying: tuple[float, ...]  # [durations of the hold] in which a leak falls off whose pressure is not logged
     longest: float  # [durations of the hold] longest of them
     stopped: float  # probability that oil that cools does not bend the travel, as of a piston at its stop
     travel: tuple[float, ...]  # [mm] standard deviations of the amplitude of a position
@@ -41,6 +42,7 @@ class CoolingPriors(PriorTable):
     stated: tuple[float, float]  # mean and standard deviation of the change of stated oil, over its excess
     ambient: float  # [degC] temperature that stated oil approaches
     step: float  # [K] step of a constant temperature
+    lag: tuple[float, float]  # [s] mean and standard deviation of a thermometer's delay
     misfit: float  # share of the effect of a logged temperature that its column leaves
     steady: float  # [K] standard deviation of the change of oil that is stated to be steady
     expansion: float  # [1/K] thermal expansion of oil in a cylinder
@@ -62,7 +64,9 @@ class TightHolds(PriorTable):
 
     present: float  # their probability
     rate: float  # [mm/min] standard deviation of their creep
-    leaks: tuple[float, ...]  # [mm/min] standard deviations of the creep of the others
+    leaks: tuple[float, ...]  # [mm/min] means of the creep of the others, of twice its standard deviation
+    fed: float  # probability of a creep of either sign
+    lifts: tuple[float, ...]  # [mm/min] standard deviations of that
 
 
 class NoisePriors(PriorTable):
@@ -84,6 +88,8 @@ class OtherSide(PriorTable):
     """Pressure of the side without the load, and chances from which something is named."""
 
     sure: float  # largest chance of no leak of one that is named, where the oil is not logged
+    locked: float  # probability that a side whose pressure is not logged is locked
+    offset: float  # [bar] standard deviation of the zero of a pressure
     material: float  # least gain of the side over the leak
     tank: float  # [bar] largest pressure of a side that may be open to the tank
 
