@@ -288,12 +288,12 @@ class HeldLoad:
     def _cooling(self, readings: Readings, span: float = math.inf) -> list[Alternative]:
         """List the alternatives for the travel [mm] due to the oil's temperature in `readings`.
 
-        `span`: as of `_exponential`, for oil that nobody logs. Where the pressure of the other side is not logged, it
-        may be locked: the travel by a logged temperature then has either sign.
+        `span`: as of `_exponential`, for oil that nobody logs. Where no pressure is logged, the other side may be
+        locked: the travel by a logged temperature then has either sign.
         """
         prior, set_up = HOLD.cooling, self.set_up
         if logged := self._thermal_columns(readings.t):
-            if self.travel is None or self._pressure(self.unloaded) is not None:
+            if self.travel is None or self.mean_pressure is not None:
                 return [Alternative(1.0, tuple(logged))]
             locked = logged[0]._replace(mean=0.0, deviation=1.0), *logged[1:]
             return [Alternative(1.0 - HOLD.other.locked, tuple(logged)), Alternative(HOLD.other.locked, locked)]
